@@ -1,8 +1,6 @@
-"""Intervals for scores of curves whose samples depend on their neighbours, and of several recordings."""
+"""The stationary bootstrap: intervals for curves whose samples depend on their neighbours. SciPy has none."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +11,6 @@ Interval = tuple[float, float]
 RESAMPLES = 1000
 LEAST_SAMPLES = 8
 LEVEL = 0.95
-LEAST_GROUPS = 5
-"""Of fewer, a 95% interval is little more than the two that are furthest apart."""
 
 
 def block_length(x: Curve) -> float:
@@ -65,29 +61,6 @@ def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) 
         drawn[:, k] = np.where(fresh[:, k], starts[:, k], (drawn[:, k - 1] + 1) % n)
     flat = (drawn + n * np.arange(resamples)[:, None]).ravel()
     return np.bincount(flat, minlength=resamples * n).reshape(resamples, n).astype(np.float64)
-
-
-def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
-    """Interval of the mean over recordings, whole groups (specimens) being resampled.
-
-    Args:
-        values: one a recording; NaN are left out.
-        groups: the specimen of each.
-        rng: source of the resamples.
-
-    Returns:
-        The interval; NaN of fewer than `LEAST_GROUPS`.
-    """
-    by: dict[str, list[float]] = {}
-    for value, group in zip(values, groups, strict=True):
-        if np.isfinite(value):
-            by.setdefault(group, []).append(value)
-    if len(by) < LEAST_GROUPS:
-        return (float("nan"), float("nan"))
-    sums = np.array([float(np.sum(v)) for v in by.values()])
-    sizes = np.array([float(len(v)) for v in by.values()])
-    picks = rng.integers(0, len(sums), (RESAMPLES, len(sums)))
-    return interval(sums[picks].sum(axis=1) / sizes[picks].sum(axis=1))
 
 
 def interval(values: Curve) -> Interval:

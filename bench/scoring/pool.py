@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.bootstrap import LEAST_GROUPS, over_groups
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import MOST_LOST
+from learn.evaluation.statistics import LEAST_GROUPS, over_groups
 from synth.errors import UserError
 from synth.publish.svg import svg
 from synth.system import checked_file
@@ -144,10 +144,10 @@ def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
 
 def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
     """Mean of the finite values and its interval; None for what is undefined, or of too few specimens."""
-    good = [value for value in values if math.isfinite(value)]
-    low, high = over_groups(values, list(specimens), np.random.default_rng(0))
-    ends = {"low": low if math.isfinite(low) else None, "high": high if math.isfinite(high) else None}
-    return {"mean": float(np.mean(good)) if good else None, **ends, "n": len(good)}
+    found = over_groups(values, specimens, np.random.default_rng(0))
+    ends = {name: getattr(found, name) for name in ("mean", "low", "high")}
+    plain = {name: value if math.isfinite(value) else None for name, value in ends.items()}
+    return {**plain, "n": int(np.isfinite(values).sum())}
 
 
 def _number(value: float | None) -> float:

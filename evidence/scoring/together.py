@@ -18,13 +18,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.bootstrap import over_groups
 from bench.methods.comparison import MAIN, PHYSICS, TOGETHER
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.methods.together import Together
 from evidence import cache, report, status
+from learn.evaluation.statistics import interval
 from learn.inference.shipped import find_model
 from synth.dataset.store import Dataset
 from synth.dataset.store import Sequence as Stored
@@ -121,8 +121,8 @@ def _row(case: Case, tissue: str, name: str, found: Sequence[dict[str, Any]]) ->
     row: dict[str, Any] = {"eyes": case.eyes, "told": case.told, "tissue": tissue, "method": name}
     row["sequences"] = len(found)
     for key, values in scores.items():
-        ends = over_groups(values, [str(k) for k in range(len(values))], np.random.default_rng(0))
-        row[key] = [float(np.mean(values)), *map(float, ends)]
+        over = interval(np.array(values), np.random.default_rng(0))
+        row[key] = [over.mean, over.low, over.high]
     return row
 
 

@@ -6,25 +6,29 @@ ten times too narrow.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from learn.evaluation.metrics import agreement, agreements
+from learn.evaluation.metrics import agreements
 from synth.errors import UserError
 
 Floats = NDArray[np.float64]
 
-_LEVEL = 0.95
+LEAST_GROUPS = 5
+"""Of fewer, a 95% interval is little more than the two that are furthest apart."""
 _DRAWS = 4000
 _SIGNS = 10_000
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over sequences with its interval."""
+    """A mean over sequences with its 95% interval."""
 
     mean: float
     low: float
@@ -38,14 +42,7 @@ def interval(values: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> I
     `values`: (n,), any unit. With fewer than three values, or none that differ, there is no interval (NaN).
     """
     v = np.asarray(values, np.float64)
-    v = v[np.isfinite(v)]
-    nan = float("nan")
-    if v.size == 0:
-        return Interval(nan, nan, nan, 0)
-    if v.size < 3 or np.ptp(v) == 0:
-        return Interval(float(v.mean()), nan, nan, int(v.size))
-    boot = v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1)
-    return _bca(float(v.mean()), boot, (v.sum() - v) / (v.size - 1))
+    return _bootstrap(np.mean, (v[np.isfinite(v)],), rng, draws)
 
 
 def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
@@ -54,26 +51,55 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
     `moments`: (n, 7), `learn.evaluation.metrics.moments` of each sequence. With fewer than three sequences
     there is no interval (NaN).
     """
-    m = np.asarray(moments, np.float64)
-    total, count = m.sum(axis=0), len(m)
-    if count < 3:
-        return Interval(agreement(total).r2, float("nan"), float("nan"), count)
-    times = rng.multinomial(count, np.full(count, 1 / count), draws)
-    return _bca(agreement(total).r2, agreements(times @ m)["r2"], agreements(total - m)["r2"])
+
+    def r2(*sums: Floats, axis: int) -> Floats:
+        return agreements(np.stack([one.sum(axis) for one in sums], axis=-1))["r2"]
+
+    return _bootstrap(r2, tuple(np.asarray(moments, np.float64).T), rng, draws)
 
 
-def _bca(value: float, boot: Floats, left_out: Floats) -> Interval:
-    """The interval of a statistic from its bootstrap draws and its leave-one-out values."""
-    draws = len(boot)
-    # Ties count half, else few sequences or a spike of equal values tilt the bias correction.
-    below = (boot < value).mean() + 0.5 * (boot == value).mean()
-    z0 = stats.norm.ppf(np.clip(below, 1 / draws, 1 - 1 / draws))
-    d = left_out.mean() - left_out
-    spread = float((d**2).sum())
-    acceleration = float((d**3).sum() / (6 * spread**1.5)) if spread > 0 else 0.0
-    z = z0 + stats.norm.ppf([(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    low, high = np.quantile(boot, stats.norm.cdf(z0 + z / (1 - acceleration * z)))
-    return Interval(value, float(low), float(high), len(left_out))
+def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
+    """Mean over recordings and its percentile interval, whole groups (specimens) being resampled.
+
+    Args:
+        values: one a recording; NaN are left out.
+        groups: the specimen of each.
+        rng: source of the resamples.
+
+    Returns:
+        The mean; its interval is NaN of fewer than `LEAST_GROUPS`.
+    """
+    v = np.asarray(values, np.float64)
+    known = np.isfinite(v)
+    of = np.unique(np.asarray(groups)[known], return_inverse=True)[1]
+    sums, sizes = np.bincount(of, v[known]), np.bincount(of)
+
+    def mean(sums: Floats, sizes: Floats, axis: int) -> Floats:
+        return np.asarray(sums.sum(axis) / sizes.sum(axis))
+
+    return _bootstrap(mean, (sums, sizes), rng, _DRAWS, "percentile", LEAST_GROUPS)
+
+
+def _bootstrap(
+    statistic: Callable[..., Any],
+    data: tuple[NDArray[Any], ...],
+    rng: np.random.Generator,
+    draws: int,
+    method: Literal["BCa", "percentile"] = "BCa",
+    least: int = 3,
+) -> Interval:
+    """A statistic of (n,) columns, and its interval, their rows being resampled together."""
+    low = high = float("nan")
+    n = len(data[0])
+    value = float(statistic(*data, axis=-1)) if n else low
+    if n >= least and np.isfinite(value):
+        with warnings.catch_warnings(), np.errstate(invalid="ignore"):
+            warnings.simplefilter("ignore", stats.DegenerateDataWarning)  # all are alike: NaN
+            found = stats.bootstrap(
+                data, statistic, paired=True, vectorized=True, n_resamples=draws, method=method, rng=rng
+            ).confidence_interval
+        low, high = float(found.low), float(found.high)
+    return Interval(value, low, high, n)
 
 
 @dataclass(frozen=True)
@@ -100,10 +126,9 @@ def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
     d = d[np.isfinite(d)]
     if d.size == 0:
         raise UserError("paired test: no sequence has a value from both models")
-    if d.size <= 13:
-        signs = 1 - 2 * ((np.arange(2**d.size)[:, None] >> np.arange(d.size)) & 1)
-        p = float((np.abs(signs @ d) >= abs(d.sum()) * (1 - 1e-12)).mean())
-    else:
-        signs = rng.choice([-1.0, 1.0], (_SIGNS, d.size))
-        p = float((1 + (np.abs(signs @ d) >= abs(d.sum()) * (1 - 1e-12)).sum()) / (1 + _SIGNS))
-    return Paired(interval(d, rng), p, float((d > 0).mean() + 0.5 * (d == 0).mean()))
+    p = 1.0  # of a single sequence, which both signs make as extreme
+    if d.size > 1:
+        p = stats.permutation_test(
+            (d,), np.mean, permutation_type="samples", vectorized=True, n_resamples=_SIGNS, rng=rng
+        ).pvalue
+    return Paired(interval(d, rng), float(p), float((d > 0).mean() + 0.5 * (d == 0).mean()))

@@ -53,17 +53,6 @@ def test_coverage_of_the_bias_of_dependent_errors() -> None:
     assert blind / trials < 0.65  # what pretending independence would have promised as 95%
 
 
-def test_specimens_are_resampled_whole() -> None:
-    rng = np.random.default_rng(0)
-    values = [1.0] * 10 + [3.0] * 10
-    low, high = bootstrap.over_groups(values, [*"abcde" * 4], rng)
-    assert (low, high) == (2.0, 2.0)  # every specimen has both
-    low, high = bootstrap.over_groups([1.0] * 16 + [6.0] * 4, [*"aaaabbbbccccddddeeee"], rng)
-    assert (low, high) == (1.0, 4.0)  # no more than three of five are the odd one, in 19 of 20 draws
-    few = bootstrap.over_groups(values, [*"abcd" * 5], rng)
-    assert np.isnan(few).all()
-
-
 def test_paired_difference_sees_what_unpaired_cannot() -> None:
     rng = np.random.default_rng(1)
     truth = np.zeros(300)

@@ -5,21 +5,11 @@ import pytest
 from scipy import stats
 
 from learn.evaluation.metrics import moments
-from learn.evaluation.statistics import interval, paired, pooled_r2
+from learn.evaluation.statistics import interval, over_groups, paired, pooled_r2
 
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-def test_bca_is_scipys() -> None:
-    values = np.random.default_rng(1).gamma(1.0, 2.0, 25)
-    ours = interval(values, rng(), draws=20000)
-    theirs = stats.bootstrap((values,), np.mean, n_resamples=20000, method="BCa", rng=rng())
-    assert ours.low == pytest.approx(theirs.confidence_interval.low, rel=0.03)
-    assert ours.high == pytest.approx(theirs.confidence_interval.high, rel=0.03)
-    # Skewed data: the interval reaches further to the long side.
-    assert ours.high - ours.mean > ours.mean - ours.low
 
 
 def test_the_interval_holds_the_truth_about_as_often_as_it_says() -> None:
@@ -47,7 +37,18 @@ def test_exact_p_by_hand() -> None:
     assert paired(np.zeros(3), np.array([1.0, 2.0, 3.0]), rng()).p == pytest.approx(0.25)
 
 
-def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_scipy() -> None:
+def test_specimens_are_resampled_whole() -> None:
+    values = [1.0] * 10 + [3.0] * 10
+    i = over_groups(values, [*"abcde" * 4], rng())
+    assert (i.low, i.high) == (2.0, 2.0)  # every specimen has both
+    i = over_groups([1.0] * 16 + [6.0] * 4, [*"aaaabbbbccccddddeeee"], rng())
+    assert (i.low, i.high) == (1.0, 4.0)  # no more than three of five are the odd one, in 19 of 20 draws
+    few = over_groups(values, [*"abcd" * 5], rng())
+    assert few.mean == 2
+    assert np.isnan([few.low, few.high]).all()
+
+
+def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_whole_sequences() -> None:
     draw = np.random.default_rng(5)
     true = [draw.normal(size=50) * scale for scale in draw.gamma(2, 1, 20)]
     said = [t + draw.normal(size=50) * 0.5 for t in true]
