@@ -139,7 +139,7 @@ def check(
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print("\n".join(hang(f"{finding.state:<5}{finding.what:<11}", printable(finding.said))))
+            print("\n".join(hang(f"{finding.state:<5}{finding.what:<11}", printable(finding.message))))
     if not checking.is_usable(found):
         raise typer.Exit(2)
 
@@ -362,7 +362,7 @@ def live(
         )
     summary = stream.summary()
     for one in stream.findings:
-        typer.echo(f"{one.state}: {one.what}: {one.said}", err=True)
+        typer.echo(f"{one.state}: {one.what}: {one.message}", err=True)
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
     if out is not None:

@@ -1,4 +1,4 @@
-from .inference.force_reader import predict_force as predict_force
+from .inference.force_estimator import predict_force as predict_force
 from .inference.predict import ForceMap as ForceMap
 from .inference.predict import Predictor as Predictor
 from .inference.predict import load_model as load_model

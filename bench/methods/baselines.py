@@ -55,7 +55,7 @@ class Baseline:
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        """See `InSpace`."""
+        """See `Uses3D`."""
         if not self._space:
             return self(flow, confidence, scene, picture)
         return self._answer(moved.motion, certainty(moved.deviation), scene)

@@ -17,7 +17,7 @@ MAIN = "D2FNet"
 """Name under which the given model stands in every table."""
 PHYSICS = "physics"
 """The same of the inverse."""
-TOGETHER = "network and physics"
+FUSION = "network and physics"
 """The same of the one answer that both make."""
 
 
@@ -37,7 +37,7 @@ def simpler_methods(train: Path | None, model: Path | None, two_eyes: bool = Fal
     """
     methods = untrained()
     others = plugins.installed()
-    if taken := {TOGETHER, MAIN, *methods, baselines.RIDGE} & set(others):
+    if taken := {FUSION, MAIN, *methods, baselines.RIDGE} & set(others):
         raise UserError(f"method {min(taken)}: a plug-in's name is taken by one of ours; rename it")
     methods |= others
     if train is None or model is None:

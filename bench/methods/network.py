@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from bench.methods.force_mixture import ForceMixture
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 from learn import Predictor, load_model
-from learn.inference.force_reader import ForceReader
+from learn.inference.force_estimator import ForceEstimator
 from learn.inference.shipped import find_name
 from learn.uncertainty.intervals import LEVEL
 from synth.flow.stereo.track import Moved
@@ -24,7 +24,7 @@ class Model:
     def __init__(self, model: Path | Predictor) -> None:
         """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
-        self._reader: tuple[MethodContext, ForceReader] | None = None
+        self._estimator: tuple[MethodContext, ForceEstimator] | None = None
 
     @property
     def identity(self) -> str:
@@ -55,7 +55,7 @@ class Model:
     @property
     def notes(self) -> list[str]:
         """What is to be known of how the last recording was read, once it is."""
-        return [] if self._reader is None else self._reader[1].notes + self._reader[1].interval_notes
+        return [] if self._estimator is None else self._estimator[1].notes + self._estimator[1].interval_notes
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
@@ -64,16 +64,16 @@ class Model:
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        """See `InSpace`; a network of one eye reads flow all the same."""
+        """See `Uses3D`; a network of one eye reads flow all the same."""
         return self._answer(flow, confidence, moved, scene, picture)
 
     def _answer(
         self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        if self._reader is None or self._reader[0] is not scene:
+        if self._estimator is None or self._estimator[0] is not scene:
             about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
-            self._reader = scene, ForceReader(self.predictor, *about)
-        found = self._reader[1].read(FrameMotion(flow, confidence, motion=moved))
+            self._estimator = scene, ForceEstimator(self.predictor, *about)
+        found = self._estimator[1].estimate(FrameMotion(flow, confidence, motion=moved))
         answer = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
         if not found.bands:
             return answer

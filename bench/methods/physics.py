@@ -22,7 +22,7 @@ from bench.methods.baselines import GRID
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
-from bench.methods.protocol import Field, ForceEstimate, MethodContext, allow_creep
+from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
 from learn.data.clips import assumed_young
 from learn.data.grid import GridView
 from synth.flow.confidence import deviation
@@ -78,18 +78,18 @@ class Physics:
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        """See `InSpace`."""
+        """See `Uses3D`."""
         return self._add(moved.motion, moved.deviation, scene, picture)
 
-    def revise(self, quiet: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         """See `Revising`."""
         assert self._scene is not None
-        own = [one for one, free in zip(self._seen, quiet, strict=True) if free and one.size_mm > 0]
+        own = [one for one, free in zip(self._seen, contact_free, strict=True) if free and one.size_mm > 0]
         components = len(self._seen[0].moved)
         basis = posterior.load_basis(components, grid_of(self._scene)[0])
         self._film = weigh_tissues(self._scene, self._seen, posterior.own_motion(basis, own))
-        self._quiet = int(quiet.sum())
-        return allow_creep([self._answer(one, False) for one in self._seen])
+        self._contact_free = int(contact_free.sum())
+        return widen_small_forces([self._answer(one, False) for one in self._seen])
 
     @property
     def notes(self) -> list[str]:
@@ -98,7 +98,7 @@ class Physics:
             return []
         own = self._film.own_mm
         said = f"the tissue moves by itself by {', '.join(f'{one:.2g}' for one in own)} mm along x, y, z"
-        if not self._quiet:
+        if not self._contact_free:
             said = (
                 "no span without contact is known on the film's clock (sensor.free_s, or pulse.free_s where "
                 "clocks are found by correlation): what the tissue does by itself is taken for loads"
@@ -109,7 +109,7 @@ class Physics:
         if self._scene is not scene:
             self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
             self._seen: list[Observation] = []
-            self._quiet, self._weighed = 0, 0.0
+            self._contact_free, self._weighed = 0, 0.0
             self._film = Film(grid_of(scene)[:1], np.ones(1), np.zeros(moved.shape[2]), _INTACT)
         mean = self._view.resample.mean
         moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))

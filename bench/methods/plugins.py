@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Field, ForceEstimate, InSpace, Method, MethodContext, Revising
+from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext, Revising, Uses3D
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
@@ -25,9 +25,9 @@ class Plugged:
 
     def __init__(self, method: Any, label: str) -> None:
         self._method, self._label = method, label
-        if isinstance(method, InSpace):
+        if isinstance(method, Uses3D):
             self.in_space = partial(self._asked, method.in_space)
-            """See `InSpace`."""
+            """See `Uses3D`."""
         if isinstance(method, Revising):
             self.revise = self._revised
             """See `Revising`."""
@@ -42,11 +42,11 @@ class Plugged:
         """See `Method`."""
         return self._asked(self._method, flow, confidence, scene, picture)
 
-    def _revised(self, quiet: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def _revised(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         with as_user_error(self._label):
-            answers = list(self._method.revise(quiet.copy()))
-            if len(answers) != len(quiet):
-                raise TypeError(f"revises {len(answers)} frames of {len(quiet)}")
+            answers = list(self._method.revise(contact_free.copy()))
+            if len(answers) != len(contact_free):
+                raise TypeError(f"revises {len(answers)} frames of {len(contact_free)}")
         return [self._checked(one, None) for one in answers]
 
     def _asked(self, ask: Any, *told: Any) -> ForceEstimate:

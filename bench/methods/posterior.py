@@ -42,7 +42,7 @@ _PRESSES = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
 forces across, which it sees, are not."""
 _CORRELATED, _MISFIT, _UNMET = 3.0, 0.1, 2.0
 """Variances count so much more as errors at neighbouring points go together; what of the displacement the
-compliance cannot explain; how much larger the tissue's own motion is than few quiet frames show."""
+compliance cannot explain; how much larger the tissue's own motion is than few frames without contact show."""
 LEAST_MM = 0.005
 """Of flow's deviation, whatever is stated."""
 _DRAWN = 128
@@ -152,17 +152,17 @@ def polynomials(points: Floats) -> Floats:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
-def own_motion(basis: LoadBasis, quiet: list[Observation]) -> Floats:
-    """(C,) mm, sizes of what the tissue does by itself: of the polynomials' coefficients in quiet frames.
+def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
+    """(C,) mm, sizes of the tissue's own motion: of the polynomials' coefficients in frames without contact.
 
-    What flow's errors alone would make of them is taken off (a moment estimate); of no frames they are 0.
+    What flow's errors alone would make of them is subtracted (a moment estimate); of no frames they are 0.
     """
     components = len(basis.motion) // len(basis.known.points)
     found = np.zeros(components)
     terms = polynomials(basis.known.points)
-    for axis in range(components if quiet else 0):
+    for axis in range(components if contact_free else 0):
         excess = []
-        for seen in quiet:
+        for seen in contact_free:
             weight = 1 / (_CORRELATED * (seen.deviation[axis] ** 2 + LEAST_MM**2))
             gram = terms.T @ (terms * weight[:, None])
             if np.linalg.cond(gram) < 1e8:

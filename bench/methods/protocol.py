@@ -41,7 +41,7 @@ class MethodContext:
 
 @dataclass(frozen=True)
 class ForceEstimate:
-    """What a method says of one frame."""
+    """A method's estimate of one frame."""
 
     force_mn: NDArray[np.float64]
     """(3,) force on the tissue in camera axes [mN]; a method of magnitudes only puts it into x, rest NaN."""
@@ -59,17 +59,18 @@ class ForceEstimate:
         return float(np.sqrt(np.nansum(self.force_mn**2)))
 
 
-def allow_creep(answers: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
-    """A film's answers, intervals of those below a share of the largest reaching down to 0.
+def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
+    """Estimates of a video, intervals of those below a share of the largest force reaching down to 0.
 
-    Tissue creeps: what a press leaves behind moves, and is no force.
+    Tissue creeps: what a press leaves behind moves without a force. The share, a twentieth, is set by hand;
+    docs/results/learn/foreign has what intervals then hold on videos of other simulators and renderers.
     """
-    largest = max((one.size_mn for one in answers), default=0.0)
-    return [replace(one, low_mn=0.0) if one.size_mn < share * largest else one for one in answers]
+    largest = max((one.size_mn for one in estimates), default=0.0)
+    return [replace(one, low_mn=0.0) if one.size_mn < share * largest else one for one in estimates]
 
 
 class Method(Protocol):
-    """Displacement to force, frame by frame. One that has `notes: list[str]` is asked for them at the end."""
+    """Displacement to force, frame by frame. Its `notes: list[str]`, if it has any, are read at the end."""
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Force of one frame.
@@ -84,8 +85,8 @@ class Method(Protocol):
 
 
 @runtime_checkable
-class InSpace(Protocol):
-    """A method that can also read motion in three dimensions, where a recording has a second eye or depth."""
+class Uses3D(Protocol):
+    """A method that also uses motion in three dimensions, where a recording has a right or a depth camera."""
 
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
@@ -96,27 +97,27 @@ class InSpace(Protocol):
 
 @runtime_checkable
 class Revising(Protocol):
-    """A method that, once a film is over, answers for all its frames anew."""
+    """A method that, once a video is over, estimates all its frames anew."""
 
-    def revise(self, quiet: NDArray[np.bool_]) -> list[ForceEstimate]:
-        """As many answers as frames were asked about since the recording began; no `density` is needed.
+    def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
+        """An estimate for each frame since the recording began; no `density` is needed.
 
-        `quiet`: (T,) whether nothing touches the tissue, as far as anybody says.
+        `contact_free`: (T,) whether nothing touches the tissue, as far as is known.
         """
         ...
 
 
 @runtime_checkable
-class Combining(Protocol):
-    """A method that answers from what others of the table say."""
+class FusedEstimate(Protocol):
+    """A method whose estimate is made of those of others in the table."""
 
     @property
     def parts(self) -> tuple[str, ...]:
         """Their names; the first's `density` is the picture."""
         ...
 
-    def combine(
+    def fuse(
         self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
     ) -> list[ForceEstimate]:
-        """The force of each of a film's frames from what the others say of it; `eyes`: 1 or 2 that saw it."""
+        """The force of each of a video's frames from the others' estimates; `eyes`: 1 monocular, 2 stereo."""
         ...

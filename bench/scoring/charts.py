@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.comparison import PHYSICS, TOGETHER
+from bench.methods.comparison import FUSION, PHYSICS
 from bench.scoring import metrics
 from bench.scoring.result import Curve, Result
 from bench.sensor.clock_sync import Offset
@@ -33,7 +33,7 @@ def draw_force(result: Result, others: bool = False) -> str:
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
     # What physics has a part in knows how unsure E is; scale is in no interval.
-    holds_young = method.low_mn is not None and result.main in (PHYSICS, TOGETHER)
+    holds_young = method.low_mn is not None and result.main in (PHYSICS, FUSION)
     spread = 1.96 * (2 * result.scale.uncertainty if holds_young else result.relative_uncertainty)
 
     def draw(figure: Figure) -> None:

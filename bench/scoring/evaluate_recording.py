@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.protocol import Combining, Method
+from bench.methods.protocol import FusedEstimate, Method
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta, Span
 from bench.recording.pixel_scale import PixelScale
@@ -148,7 +148,7 @@ def _against_sensor(
     forces = []
     if recording.meta.young_kpa is not None:
         # What combines others is no further witness.
-        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Combining))]
+        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, FusedEstimate))]
         every = [np.array(tracked.force_mn[name]) for name in alone]
         forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from bench.bootstrap import Interval
-from bench.methods.comparison import MAIN, TOGETHER
+from bench.methods.comparison import FUSION, MAIN
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
 from learn.uncertainty.out_of_distribution import UNSEEN
@@ -48,7 +48,7 @@ def headline(result: Result) -> Headline:
     With a separate press those after its gain come first. Without a known E, or with the press alone, the
     curve's shape follows: what no gain changes. Nothing of it where too many frames were lost.
     """
-    odd = tuple(one.said for one in result.findings if one.state == "odd")
+    odd = tuple(one.message for one in result.findings if one.state == "odd")
     if result.refused:
         return Headline(result.refused, (), odd)
     main = result.methods[result.main]
@@ -81,7 +81,7 @@ def _trust(result: Result) -> str:
     """Lost frames, motion unlike the network's training, and what of tissue and scale was taken as given."""
     meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
     parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
-    network = MAIN if result.main == TOGETHER else result.main
+    network = MAIN if result.main == FUSION else result.main
     asked = result.methods.get(network)  # without intervals nothing is known of what it was trained on
     if network in result.settings.get("networks", {}) and asked is not None and asked.low_mn is not None:
         unlike = any(note.startswith(f"{network}: {UNSEEN}") for note in result.notes)

@@ -10,11 +10,11 @@ from types import NoneType
 from typing import Any
 
 from bench.methods import comparison, plugins
-from bench.methods.comparison import MAIN, PHYSICS, TOGETHER
+from bench.methods.comparison import FUSION, MAIN, PHYSICS
+from bench.methods.fusion import Fusion
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.methods.protocol import Method
-from bench.methods.together import Together
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.scoring import report
@@ -81,7 +81,7 @@ def score(
         raise UserError(f"model: expected a folder or what `load_model` gives, got {type(model).__name__}")
     if not isinstance(methods or {}, Mapping):
         raise UserError(f"methods: expected them by name, got {type(methods).__name__}")
-    if taken := {TOGETHER, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
+    if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
         raise UserError(f"methods: {min(taken)} is a name of ours; give yours another")
     if model is None and not methods:
         model = require_model(opened.has_two_eyes)
@@ -133,7 +133,7 @@ def _choose_methods(
         simple = comparison.simpler_methods(Path(train) if train else None, folder, two_eyes)
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
     if model is not None and isinstance(chosen.get(PHYSICS), Physics):
-        chosen = {TOGETHER: Together(MAIN, PHYSICS), **chosen}
+        chosen = {FUSION: Fusion(MAIN, PHYSICS), **chosen}
     return chosen
 
 
@@ -142,8 +142,8 @@ def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
     networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
     about = {name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()}
     main = networks.get(MAIN)
-    if main is not None and TOGETHER in chosen:
-        about[TOGETHER] = {"hash": f"{main.identity} and physics", "origin": main.origin}
+    if main is not None and FUSION in chosen:
+        about[FUSION] = {"hash": f"{main.identity} and physics", "origin": main.origin}
     described: dict[str, Any] = {} if main is None else {"model": main.described()}
     described["networks"] = about
     if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:

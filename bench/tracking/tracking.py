@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Combining, ForceEstimate, InSpace, Method, MethodContext, Revising
+from bench.methods.protocol import ForceEstimate, FusedEstimate, Method, MethodContext, Revising, Uses3D
 from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta
@@ -64,7 +64,7 @@ class TrackedRecording:
     trusted: list[bool] = field(default_factory=list)
     """Whether the frame could be followed; the forces of one that couldn't are none."""
     summary: TrackingSummary = field(default_factory=TrackingSummary)
-    """What was masked, lost and regained."""
+    """What was masked, lost and reinitialised."""
     repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
     """Frames that show an earlier one again, as of `FilmFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
@@ -201,7 +201,7 @@ class _Forces:
 
     def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
         shown = methods.get(pictured) if pictured is not None else None
-        self.pictured = shown.parts[0] if isinstance(shown, Combining) else pictured
+        self.pictured = shown.parts[0] if isinstance(shown, FusedEstimate) else pictured
         self.methods, self.watch = methods, watch
         self.out = TrackedRecording(pictured=self.pictured or "")
         self.answers: list[dict[str, ForceEstimate]] = []
@@ -222,11 +222,11 @@ class _Forces:
         answers: dict[str, ForceEstimate] = {}
         density = None
         for name, method in self.methods.items():
-            if isinstance(method, Combining):
+            if isinstance(method, FusedEstimate):
                 continue
             with self.watch.stage(name):
                 shown = wanted and name == self.pictured
-                if moved is not None and isinstance(method, InSpace):
+                if moved is not None and isinstance(method, Uses3D):
                     answer = method.in_space(frame.flow, frame.confidence, moved, scene, shown)
                 else:
                     answer = method(frame.flow, frame.confidence, scene, shown)
@@ -253,18 +253,18 @@ class _Forces:
         spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times = np.array(self.out.time_s)
         inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False of none
-        quiet = np.array(self.out.trusted, bool) & inside
+        contact_free = np.array(self.out.trusted, bool) & inside
         for name, method in self.methods.items():
             if isinstance(method, Revising) and len(times):
                 with self.watch.stage(name):
-                    for frame, answer in zip(self.answers, method.revise(quiet), strict=True):
+                    for frame, answer in zip(self.answers, method.revise(contact_free), strict=True):
                         frame[name] = answer
         followed = [frame for frame, kept in zip(self.answers, self.out.trusted, strict=True) if kept]
         for name, method in self.methods.items():
-            if isinstance(method, Combining):
+            if isinstance(method, FusedEstimate):
                 with self.watch.stage(name):
-                    combined = method.combine(followed, self.scene, self.eyes)
-                for frame, answer in zip(followed, combined, strict=True):
+                    fused = method.fuse(followed, self.scene, self.eyes)
+                for frame, answer in zip(followed, fused, strict=True):
                     frame[name] = answer
                 for frame in self.answers:
                     frame.setdefault(name, frame[method.parts[0]])

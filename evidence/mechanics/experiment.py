@@ -1,4 +1,4 @@
-"""Which of a living brain's mechanics must a force reader have been fitted on?
+"""Which of a living brain's mechanics must a force estimator have been fitted on?
 
 Ridge is fitted on the plain world and asked for the force in every other, of scenes with anatomies that were
 never fitted; then fitted on the mixture of all and asked again. A world is compared with the plain one on the
@@ -40,7 +40,7 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 41,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
 ) -> None:
-    """What a force reader fitted on plain tissue errs in other mechanics."""
+    """What a force estimator fitted on plain tissue errs in other mechanics."""
     fitted, asked = Scenes(seed, fit, work), Scenes(seed + 1, test, work)
     wanted = [(asked, one, k) for name in WORLDS for one in rendered(name) for k in range(test)]
     wanted += [(fitted, name, k) for k in range(fit) for name in (PLAIN, mixed(k))]
@@ -119,7 +119,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         sections.append(report.Section(f"Error of {what}", table))
     refused = [f"- {line}" for line in found["refused"]]
     return report.Page(
-        "Which mechanics must a force reader have seen?",
+        "Which mechanics must a force estimator have seen?",
         found,
         [report.Chart("Error across the line of sight", "more than in plain [% of the force]", tuple(bars))],
         [*sections, *([report.Section("Refused", words=refused)] if refused else [])],

@@ -186,7 +186,7 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
         result = score(folder, _model(two_eyes), methods={PHYSICS: Physics()}, baselines=False)
     except UserError as error:
         return {**row, "said": [str(error).replace(f"{folder}: ", "")]}
-    row["said"] = [f"{one.what}: {one.said}" for one in result.findings]
+    row["said"] = [f"{one.what}: {one.message}" for one in result.findings]
     row["said"] += [note for note in result.notes if re.search(_NOTES, note)]
     sensor, main = np.asarray(result.sensor_mn), result.methods[result.main]
     for key, method in (("physics", result.methods[PHYSICS]), ("error", main)):

@@ -1,7 +1,7 @@
 """Network, physics and what both say together, on sequences of a world that the network has not met.
 
 Every sequence's stored motion is read as a recording's is, by one eye and by two, with the membrane unknown
-and stated. The constants of `bench.methods.together`, and what physics' interval grows by under a membrane,
+and stated. The constants of `bench.methods.fusion`, and what physics' interval grows by under a membrane,
 were set on the half with even numbers; read the other.
 
 Run: python -m evidence.scoring.together mission-unseen --work work
@@ -18,11 +18,11 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bench.methods.comparison import MAIN, PHYSICS, TOGETHER
+from bench.methods.comparison import FUSION, MAIN, PHYSICS
+from bench.methods.fusion import Fusion
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.methods.protocol import ForceEstimate, MethodContext
-from bench.methods.together import Together
 from evidence import cache, report, status
 from learn.evaluation.statistics import interval
 from learn.inference.shipped import find_model
@@ -62,7 +62,7 @@ def main(
         found = [_kept(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
-            rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, TOGETHER)]
+            rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
     result = {"data": status.data(data), "rows": rows}
     report.save(out, "together.json", result, page(result))
     report.show(result)
@@ -83,7 +83,7 @@ def _read(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
         sequence.attrs["young_kpa"],
         membrane if case.told else "unknown",
     )
-    physics, both = Physics(), Together(MAIN, PHYSICS)
+    physics, both = Physics(), Fusion(MAIN, PHYSICS)
     seen: list[dict[str, ForceEstimate]] = []
     for k in range(len(sequence["force"])):
         flow, sure = sequence["flow_recovered"][k], sequence["flow_confidence"][k].astype(np.float32)
@@ -97,11 +97,11 @@ def _read(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
         seen.append(answers)
     for answers, revised in zip(seen, physics.revise(np.zeros(len(seen), bool)), strict=True):
         answers[PHYSICS] = revised
-    for answers, combined in zip(seen, both.combine(seen, scene, case.eyes), strict=True):
-        answers[TOGETHER] = combined
+    for answers, fused in zip(seen, both.fuse(seen, scene, case.eyes), strict=True):
+        answers[FUSION] = fused
     told = {
         name: [[*one[name].force_mn.tolist(), one[name].low_mn, one[name].high_mn] for one in seen]
-        for name in (MAIN, PHYSICS, TOGETHER)
+        for name in (MAIN, PHYSICS, FUSION)
     }
     return {"membrane": membrane, "true": sequence["force"][:].tolist(), "told": told}
 
@@ -144,7 +144,7 @@ def page(found: dict[str, Any]) -> report.Page:
         for row in found["rows"]
         if not row["told"]
     ]
-    whole = (False, TOGETHER, "all")
+    whole = (False, FUSION, "all")
     one, two = (r for r in found["rows"] if (r["told"], r["method"], r["tissue"]) == whole)
     words = (
         f"**Together they err by {two['whole'][0]:.0%} of the force with two eyes and by "

@@ -140,7 +140,7 @@ def _fit(
 
 
 def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
-    """What the model says of a sequence, per unit stiffness; no motion is no force, as to `ForceReader`."""
+    """A sequence's forces per unit stiffness; no motion is no force, as to `ForceEstimator`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
     sure, young = clip.sure(source), clip.young_kpa
     kind = predictor.card.settings.target

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.grid import GridView
-from learn.inference.force_reader import ForceReader, FrameForce
+from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
@@ -25,7 +25,7 @@ def apply(
     young_kpa: float | None = None,
     membrane: MembraneState = "unknown",
 ) -> dict[str, Any]:
-    """Force of every frame of a film, ready for np.savez; what is done to it is `ForceReader`'s.
+    """Force of every frame of a film, ready for np.savez; what is done to it is `ForceEstimator`'s.
 
     `young_kpa` overrides the film's own, but not where the scale is unknown; `membrane` is what is known of
     the tissue's. Returns fields of
@@ -35,13 +35,13 @@ def apply(
     young = young_kpa if young_kpa is not None else motion.young_kpa
     if not motion.scale_known:
         young = None
-    reader = ForceReader(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
+    estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
     numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
     for frame in motion.frames:
         numbers.append(frame.index)
         times.append(math.nan if frame.time_s is None else frame.time_s)
         followed.append(frame.trusted)
-        found.append(reader.read(frame))
+        found.append(estimator.estimate(frame))
     without_pulse = motion.again()
     if without_pulse is not None:
         return apply(predictor, without_pulse, young_kpa, membrane)
@@ -69,9 +69,9 @@ def apply(
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = force
-    notes = [one.said for one in findings if one.state == "odd"] + motion.notes() + reader.notes
+    notes = [one.message for one in findings if one.state == "odd"] + motion.notes() + estimator.notes
     if motion.scale_known:
-        notes += reader.interval_notes
+        notes += estimator.interval_notes
         out |= _ends(found, trusted)
     if fault:
         notes.insert(0, f"nothing can be measured: {fault}")

@@ -31,7 +31,7 @@ def deviation(confidence: Map) -> Map:
     return np.asarray(_HALF_PX * np.sqrt(1 / sure - 1), np.float32)
 
 
-def doubted(confidence: Map, deviation_px: float) -> Map:
+def add_deviation(confidence: Map, deviation_px: float) -> Map:
     """(H, W) the confidence of what has a further, independent error of this standard deviation."""
     return np.asarray(confidence / (1 + confidence * np.float32(deviation_px / _HALF_PX) ** 2), np.float32)
 

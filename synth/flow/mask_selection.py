@@ -81,7 +81,7 @@ class SelectingTracker:
         """(H, W) what is masked in the rest frame, by the last selection."""
         self.blocked = found.known
         """(H, W) what is masked in the last frame."""
-        self.regained = False
+        self.reinitialised = False
         """Whether the last frame can be trusted only for other masks, or for a start from nothing."""
         self._rest_picture = _normalised(rest)
         last = Proposal(tissue, np.ones_like(tissue), tissue).blocks().max()
@@ -111,17 +111,17 @@ class SelectingTracker:
         tracker.unsure = _grown(found.either | self.rest_found.either)
         resets = tracker.resets
         flow, confidence = tracker.step(frame, self.blocked)
-        first, doubted = tracker.last, not tracker.trusted
+        first, low_confidence = tracker.last, not tracker.trusted
         assert first is not None
         self._frames += 1
-        due = new or doubted or self._motion(flow) > self._tested_px + _GROWN_PX
+        due = new or low_confidence or self._motion(flow) > self._tested_px + _GROWN_PX
         proposed = (found.either | self.rest_found.either).any()
         if due and proposed and self._selections < _FIRST + self._frames / _EVERY:
             self._selections += 1
             better = self._select(frame, found, first)
             if better is not first:
                 flow, confidence = tracker.accept(better)
-        self.regained = tracker.trusted and (doubted or tracker.resets > resets)
+        self.reinitialised = tracker.trusted and (low_confidence or tracker.resets > resets)
         assert tracker.last is not None
         # Over faint tissue nothing but highlights, which stay with the light, says that nothing moves.
         stay = self.rest_found.glare & found.glare

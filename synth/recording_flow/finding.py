@@ -21,7 +21,7 @@ class Finding:
     """`ok`, `odd` (usable, but look at it), `lack` (optional, not there) or `bad` (no number can stand)."""
     what: str
     """Which part of the recording."""
-    said: str
+    message: str
     """What was found."""
 
 
@@ -52,4 +52,4 @@ def worth_saying(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 def first_fault(findings: Iterable[Finding]) -> str:
     """Why no number can stand; empty if one may."""
-    return next((one.said for one in findings if one.state == "bad"), "")
+    return next((one.message for one in findings if one.state == "bad"), "")

@@ -25,7 +25,7 @@ class FrameMotion:
     """(h, w) in 0..1."""
     trusted: bool = True
     """Whether the frame could be followed."""
-    regained: bool = False
+    reinitialised: bool = False
     """It could, but only from nothing or with other masks."""
     is_rest: bool = False
     """It is the rest frame itself."""
@@ -63,7 +63,7 @@ class TrackingSummary:
 
     frames: int = 0
     lost: int = 0
-    regained: int = 0
+    reinitialised: int = 0
     masked: float = 0.0
     """Sum over frames of the share of tissue that was masked."""
     masked_count: NDArray[np.float32] | None = None
@@ -77,7 +77,7 @@ class TrackingSummary:
             self.masked_count = np.zeros(tissue.shape, np.float32)
         self.frames += 1
         self.lost += not frame.trusted
-        self.regained += frame.regained
+        self.reinitialised += frame.reinitialised
         self.rest_masked = frame.rest_masked
         if frame.masked is not None:
             self.masked += np.count_nonzero(frame.masked & tissue) / np.count_nonzero(tissue)
@@ -85,9 +85,9 @@ class TrackingSummary:
 
     @property
     def shares(self) -> dict[str, float]:
-        """Shares of the tissue masked, and of the frames lost and regained."""
+        """Shares of the tissue masked, and of the frames lost and reinitialised."""
         n = max(self.frames, 1)
-        return {"masked": self.masked / n, "lost": self.lost / n, "regained": self.regained / n}
+        return {"masked": self.masked / n, "lost": self.lost / n, "reinitialised": self.reinitialised / n}
 
     @property
     def is_odd(self) -> bool:
@@ -98,4 +98,4 @@ class TrackingSummary:
         """A line for a person."""
         masked = f"{100 * self.shares['masked']:.2g}% of the tissue is masked on average; "
         lost = f"{self.lost} of {self.frames} frames looked at could not be followed"
-        return masked + lost + (f", {self.regained} only at a second try" if self.regained else "")
+        return masked + lost + (f", {self.reinitialised} only at a second try" if self.reinitialised else "")

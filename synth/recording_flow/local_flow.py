@@ -30,7 +30,7 @@ class LocalFlow:
                 flow,
                 confidence,
                 tracker.trusted,
-                tracker.regained,
+                tracker.reinitialised,
                 masked=tracker.blocked if tracker.blocked.any() else None,
                 rest_masked=tracker.rest_blocked if tracker.rest_blocked.any() else None,
                 cpu_s=time.process_time() - cpu,

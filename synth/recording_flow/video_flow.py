@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError, as_positive
 from synth.flow import mask_detection
-from synth.flow.confidence import doubted
+from synth.flow.confidence import add_deviation
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
@@ -406,7 +406,7 @@ class VideoFlow:
         if self._shared is not None and frame.trusted and small.time_s is not None:
             frame = self._without_camera(frame, small.time_s, self._shared)
         if frame.camera is not None:
-            frame = replace(frame, confidence=doubted(frame.confidence, frame.camera.deviation_px))
+            frame = replace(frame, confidence=add_deviation(frame.confidence, frame.camera.deviation_px))
         self._changes = self._changes or not np.array_equal(small.rgb, self._rest_rgb)
         if frame.trusted and find_fault(small.rgb, self.tissue):
             frame = replace(frame, trusted=False)

@@ -10,7 +10,7 @@ from made_clip import made_clip
 from numpy.typing import NDArray
 
 from bench.methods import baselines
-from bench.methods.protocol import InSpace, Method, MethodContext
+from bench.methods.protocol import Method, MethodContext, Uses3D
 from learn.data.clips import Clip
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -99,7 +99,7 @@ def test_fitted_on_two_eyes_asks_for_two() -> None:
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)[..., None]
     seen = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
     flow, sure = seen[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
-    assert isinstance(method, InSpace)
+    assert isinstance(method, Uses3D)
     said = method.in_space(flow, sure, Moved(seen, np.full_like(seen, 0.01)), scene, False)
     assert said.size_mn == pytest.approx(6, rel=0.12)
     with pytest.raises(UserError, match="second eye"):

@@ -30,7 +30,7 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
 
     predictor.grid = Grid(16)  # type: ignore[attr-defined]
     model = Model.__new__(Model)
-    model.predictor, model._reader = predictor, None  # type: ignore[assignment]
+    model.predictor, model._estimator = predictor, None  # type: ignore[assignment]
     scene = MethodContext(tissue, 0.1, young_kpa)
     moved, sure = np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32)
     young = young_kpa or 1.0

@@ -98,8 +98,8 @@ def test_a_method_may_answer_a_whole_film_anew(recording: Path) -> None:
         def __call__(self, flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
             return bench.ForceEstimate(np.zeros(3))
 
-        def revise(self, quiet: Any) -> list[bench.ForceEstimate]:
-            count = len(quiet) - self.short
+        def revise(self, contact_free: Any) -> list[bench.ForceEstimate]:
+            count = len(contact_free) - self.short
             return [bench.ForceEstimate(np.array([1.0 + k, 0.0, 0.0])) for k in range(count)]
 
     settings, later = bench.Settings(rate_hz=None, pulse=False), Later()

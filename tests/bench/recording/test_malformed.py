@@ -77,4 +77,4 @@ def test_broken_recording_is_told(sound: Path, tmp_path: Path, name: str) -> Non
         notes: tuple[str, ...] = scored(folder, backend="dis").notes
     except UserError as error:
         notes = (str(error),)
-    assert not any("\n" in line for line in (*notes, *(finding.said for finding in findings)))
+    assert not any("\n" in line for line in (*notes, *(finding.message for finding in findings)))

@@ -204,8 +204,8 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
 def test_a_baseline_in_metres_is_named() -> None:
     (found,) = judge_eyes(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
     assert found.state == "bad"
-    assert "metres" in found.said
-    assert "1000" in found.said
+    assert "metres" in found.message
+    assert "1000" in found.message
 
 
 @pytest.mark.parametrize(

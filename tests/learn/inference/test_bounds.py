@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from learn.checkpoint import _hash, read_card
-from learn.inference.force_reader import ForceReader, FrameForce
+from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
@@ -32,10 +32,10 @@ def flow(size_mm: float) -> NDArray[np.float32]:
 def read(
     folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0, notes: list[str] | None = None
 ) -> FrameForce:
-    reader = ForceReader(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
-    found = reader.read(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
+    estimator = ForceEstimator(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
+    found = estimator.estimate(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
     if notes is not None:
-        notes += reader.interval_notes
+        notes += estimator.interval_notes
     return found
 
 

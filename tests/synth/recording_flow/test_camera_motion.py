@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from synth.flow.confidence import deviation, doubted, of_deviation
+from synth.flow.confidence import add_deviation, deviation, of_deviation
 from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
@@ -62,14 +62,14 @@ def test_a_bump_is_no_motion_of_the_tissue_and_is_named() -> None:
     # Its pictures, drawn without noise, are named as repeated too.
     (finding,) = [one for one in film.findings if one.what == "camera"]
     assert finding.state == "odd"
-    assert all(said in finding.said for said in ("5 px", "0.375 s"))
+    assert all(said in finding.message for said in ("5 px", "0.375 s"))
 
 
 def test_confidence_stands_for_the_cameras_deviation_too() -> None:
     own = np.array([[0.1, 0.3, 1.0]], np.float32)
-    both = deviation(doubted(of_deviation(own), 0.4))
+    both = deviation(add_deviation(of_deviation(own), 0.4))
     assert both == pytest.approx(np.hypot(own, 0.4), rel=1e-4)
-    assert not doubted(np.zeros((1, 1), np.float32), 0.4).any()
+    assert not add_deviation(np.zeros((1, 1), np.float32), 0.4).any()
 
 
 def test_tissue_that_the_mask_leaves_out_is_no_camera() -> None:

@@ -29,7 +29,7 @@ def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked
         sure = np.ones(SHAPE, np.float32)
         mask = ROD if masked else None
         search.add(FrameMotion(k / 3 * motion, sure, is_rest=k == 0, index=k, masked=mask), depth)
-    return [one.said for one in search.findings]
+    return [one.message for one in search.findings]
 
 
 @pytest.mark.parametrize("peak_px", [0.5, 2.0, 8.0, 30.0])

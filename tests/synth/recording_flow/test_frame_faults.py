@@ -40,7 +40,7 @@ def test_what_spoils_a_film_is_named(kind: str) -> None:
     for k, picture in enumerate(film[1:], 1):
         faults.see(k, k / 10, picture)
         faults.look(k / 10, picture, picture)
-    said = [finding.said for finding in faults.findings()]
+    said = [finding.message for finding in faults.findings()]
     assert any(kind in one for one in said) or (kind == "as it came" and not said)
     assert faults.repeats() == ((dict.fromkeys((4, 5, 6), 3) if kind == "again" else {}), {})
 

@@ -125,7 +125,7 @@ def test_a_bump_is_taken_off_and_named() -> None:
     assert max(np.median(np.abs(one.flow)) for one in video.frames()) < 0.05
     (finding,) = [one for one in video.findings if one.what == "camera"]
     assert finding.state == "odd"
-    assert all(said in finding.said for said in ("5 px", "0.3 s"))
+    assert all(said in finding.message for said in ("5 px", "0.3 s"))
 
 
 def test_a_pulse_is_no_camera() -> None:

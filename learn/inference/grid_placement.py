@@ -21,7 +21,7 @@ _STRAYED = 0.25  # of the grid's width: nearer than that to its centre, motion d
 _RIM = 16  # the border is this part of the grid's width
 
 
-class Placing:
+class GridPlacement:
     """Places the grid frame by frame; it stays as long as what moves is in its middle."""
 
     def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:

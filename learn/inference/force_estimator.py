@@ -1,4 +1,4 @@
-"""The force of each frame of a film, for `learn predict` and the bench alike: zero, unknown E, intervals."""
+"""A network's force of each frame of a video, for `learn predict` and bench: tare, unknown E, intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.clips import UNKNOWN_YOUNG_KPA
-from learn.inference.placing import Placing, Point, share_at_border
+from learn.inference.grid_placement import GridPlacement, Point, share_at_border
 from learn.inference.predict import ForceMap, Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
@@ -36,7 +36,7 @@ def predict_force(
     confidence: Iterable[NDArray[np.float32]] | None = None,
     membrane: MembraneState = "unknown",
 ) -> NDArray[np.float64]:
-    """The force curve of one film: (T, 3) mN on the tissue, camera axes; what the rest frame says taken off.
+    """The force curve of one video: (T, 3) mN on the tissue, camera axes; that of the rest frame subtracted.
 
     Of a model without direction the size is in x and the rest NaN.
 
@@ -46,18 +46,18 @@ def predict_force(
         tissue: (H, W), in the rest frame.
         scale_mm_per_px: of the picture.
         young_kpa: of the tissue; None: forces are those of tissue of 1 kPa.
-        confidence: T times (H, W) in 0..1, for a model that reads it.
+        confidence: T times (H, W) in 0..1, for a model that uses it.
         membrane: whether the tissue has its membrane (pia), for a model that asks.
 
     Raises:
-        UserError: shapes that don't fit, values that aren't finite, or a model of two eyes.
+        UserError: shapes that don't fit, values that aren't finite, or a stereo model.
     """
     if not isinstance(model, Predictor):
         raise UserError(f"model: expected what `load_model` gives, got {type(model).__name__}")
     if len(size := np.shape(tissue)) != 2:
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0
-    reader = ForceReader(model, inside, scale_mm_per_px, young_kpa, membrane)
+    estimator = ForceEstimator(model, inside, scale_mm_per_px, young_kpa, membrane)
     known: Iterator[NDArray[np.float32]] = repeat(np.ones(size, np.float32))
     if confidence is not None:
         known = _each("confidence", confidence, size, (0.0, 1.0))
@@ -65,7 +65,7 @@ def predict_force(
     for moved in _each("flow", flow, (*size, 2)):
         if (sure := next(known, None)) is None:
             raise UserError(f"confidence: of {len(found)} frames, flow has more")
-        found.append(reader.read(FrameMotion(moved, sure)).force_mn)
+        found.append(estimator.estimate(FrameMotion(moved, sure)).force_mn)
     if confidence is not None and next(known, None) is not None:
         raise UserError(f"confidence: of more frames than flow's {len(found)}")
     return np.array(found).reshape(-1, 3)
@@ -80,22 +80,22 @@ def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32
 
 @dataclass(frozen=True)
 class FrameForce:
-    """What a model predicts of one frame of a film."""
+    """What a model predicts of one frame."""
 
     force_mn: NDArray[np.float64]
-    """(3,) total force on the tissue in camera axes [mN], that of no motion taken off; of a model without
+    """(3,) total force on the tissue in camera axes [mN], that of no motion subtracted; of a model without
     direction the size in x, the rest NaN."""
     map: ForceMap
-    """As the network predicts it, nothing taken off."""
+    """As the network predicts it, nothing subtracted."""
     bands: dict[float, Band]
     """By level, the intervals of the force, T = 1 [mN]; empty of a model without intervals."""
 
 
-class ForceReader:
-    """Reads the frames of one film.
+class ForceEstimator:
+    """A network's force estimates, frame by frame of one video.
 
-    What the model predicts of the rest frame, where nothing has moved, is taken off the total force, as a
-    sensor's tare is. Without a known E forces are those of tissue of 1 kPa: the model's own typical E would
+    What the model predicts of the rest frame, where nothing has moved, is subtracted from the total force, as
+    a sensor's tare is. Without a known E forces are those of tissue of 1 kPa: the model's own typical E would
     make the number depend on its training data.
     """
 
@@ -111,14 +111,14 @@ class ForceReader:
         self._predictor, self._tissue = predictor, tissue
         self._scale, self._young_kpa, self._membrane = scale_mm_per_px, young_kpa, membrane
         self._at_rest: dict[Point, ForceMap] = {}
-        self.placing = Placing(tissue, scale_mm_per_px, predictor.grid)
+        self.placement = GridPlacement(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
         self._at_border = self._in_all = 0.0
         self._seen: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each frame that was followed
 
-    def read(self, frame: FrameMotion) -> FrameForce:
+    def estimate(self, frame: FrameMotion) -> FrameForce:
         """The force of a frame; errors as `Predictor`."""
-        place = self.placing.place(frame.flow, frame.confidence)
+        place = self.placement.place(frame.flow, frame.confidence)
         found = self._predict(frame, place)
         if place not in self._at_rest:
             motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
@@ -130,23 +130,21 @@ class ForceReader:
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]
         share = share_at_border(found.magnitude, found.view.mask)
-        if not self.placing.fits and math.isfinite(share):
+        if not self.placement.fits and math.isfinite(share):
             size = float(force_size(force))
             self._at_border, self._in_all = self._at_border + share * size, self._in_all + size
         return FrameForce(force, found, self._bound(force, found))
 
     @property
     def notes(self) -> list[str]:
-        """What its user should know of the model and of where the grid lay, once the frames are read."""
+        """What its user should know of the model and of where the grid lay, after the last frame."""
         deaf = self._membrane != "unknown" and not self._predictor.card.settings.arch.membrane
-        notes = (
-            ["this network takes no word of a membrane: it answers as if that were unknown"] if deaf else []
-        )
-        if self.placing.fits:
+        notes = ["this network ignores what is known of a membrane"] if deaf else []
+        if self.placement.fits:
             return notes
         wide = self._predictor.grid.extent_mm
         note = f"the tissue is wider than the network's {wide:g} mm: it looks at what moves most"
-        note += f", and was moved there {self.placing.moves} times" if self.placing.moves else ""
+        note += f", and was moved there {self.placement.moves} times" if self.placement.moves else ""
         share = self._at_border / self._in_all if self._in_all > 0 else 0.0
         if share > _MUCH_AT_BORDER:
             note += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
@@ -154,7 +152,7 @@ class ForceReader:
 
     @property
     def interval_notes(self) -> list[str]:
-        """What the user of the model's intervals should know, once the frames are read."""
+        """What the user of the model's intervals should know, after the last frame."""
         found = self._predictor.card.intervals
         if found is None:
             return []

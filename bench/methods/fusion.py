@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.methods.force_mixture import size_interval
-from bench.methods.protocol import Field, ForceEstimate, MethodContext, allow_creep
+from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
 from synth.errors import UserError
 
 _COMMON, _CAUTION = 0.3, 1.5
@@ -21,7 +21,7 @@ deviation is multiplied by, for what comes is less like its training than what s
 (`evidence.scoring.together`)."""
 
 
-class Together:
+class Fusion:
     """Two methods of the table that say what they hold likely, as one; see the module."""
 
     def __init__(self, network: str, physics: str) -> None:
@@ -33,10 +33,10 @@ class Together:
         """Raises UserError: it has nothing to say of a flow."""
         raise UserError(f"what {' and '.join(self.parts)} say together can't be asked for without them")
 
-    def combine(
+    def fuse(
         self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
     ) -> list[ForceEstimate]:
-        """See `Combining`; where one knows nothing of its error the network answers alone."""
+        """See `FusedEstimate`; where one knows nothing of its error the network answers alone."""
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in answers:
@@ -51,7 +51,7 @@ class Together:
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
         self._share = pulled / apart if apart else 0.0
-        return allow_creep(found)
+        return widen_small_forces(found)
 
     @property
     def notes(self) -> list[str]:

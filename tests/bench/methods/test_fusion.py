@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from bench.methods.force_mixture import ForceMixture
+from bench.methods.fusion import Fusion
 from bench.methods.protocol import ForceEstimate, MethodContext
-from bench.methods.together import Together
 
 Floats = NDArray[np.float64]
 SCENE = MethodContext(np.ones((4, 4), bool), 0.1, 1.0)
@@ -22,9 +22,9 @@ def estimate(forces: list[Floats], deviations: list[float], weights: list[float]
     return ForceEstimate(mixture.mean, likely=mixture)
 
 
-def together(network: ForceEstimate, physics: ForceEstimate) -> tuple[ForceEstimate, Together]:
-    method = Together("network", "physics")
-    return method.combine([{"network": network, "physics": physics}], SCENE, 2)[0], method
+def together(network: ForceEstimate, physics: ForceEstimate) -> tuple[ForceEstimate, Fusion]:
+    method = Fusion("network", "physics")
+    return method.fuse([{"network": network, "physics": physics}], SCENE, 2)[0], method
 
 
 def test_two_gaussians_weigh_as_their_precisions() -> None:
@@ -63,5 +63,5 @@ def test_ninety_of_a_hundred_draws_lie_within() -> None:
 
 def test_what_a_press_leaves_behind_may_be_no_force() -> None:
     said = [estimate([np.array([size, 0.0, 0.0])], [0.01], [1.0]) for size in (10.0, 0.3, 1.0)]
-    found = Together("network", "physics").combine([{"network": o, "physics": o} for o in said], SCENE, 1)
+    found = Fusion("network", "physics").fuse([{"network": o, "physics": o} for o in said], SCENE, 1)
     assert [one.low_mn > 0 for one in found] == [True, False, True]
