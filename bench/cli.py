@@ -191,26 +191,6 @@ def import_(
         print(out)
 
 
-@app.command(epilog="Example: bench demo out --model model --out runs/demo")
-def demo(
-    dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
-    model: Annotated[Path, typer.Option("--model", "-m", help="Model trained on it, to stand beside.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for recording, score and report.")],
-    flow: Backend = "tvl1",
-    json: Json = False,
-) -> None:
-    """Scores the network that comes along on a sequence that it has not seen, the given model beside it."""
-    from bench.recording.folder import open_recording
-    from bench.scoring.demo import choose_networks, export_unseen
-    from synth.recording_flow.video_flow import RecordingFlowSettings
-
-    main, others = choose_networks(dataset, model)
-    index = export_unseen(dataset, [main, *others.values()], out / "recording")
-    title = f"Force from video: sequence {index}, unseen in training"
-    settings = RecordingFlowSettings(flow, rate_hz=None)
-    _score(open_recording(out / "recording"), main, out, settings, title, json, others)
-
-
 @app.command(
     "from-dataset", epilog="Example: bench from-dataset out --out recordings --sequence 3 --footage mp4"
 )
@@ -218,16 +198,27 @@ def from_dataset(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets one recording a sequence.")],
     sequence: Annotated[int | None, typer.Option(help="Only this sequence.")] = None,
+    unseen_by: Annotated[
+        list[Path] | None,
+        typer.Option(help="Only the first sequence that this model was not trained on; repeat for more."),
+    ] = None,
     footage: Annotated[Literal["png", "mp4"], typer.Option(help="Lossless pictures or H.264.")] = "png",
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored as real ones are."""
     from bench.recording.from_sequence import export_recording
+    from learn.checkpoint import read_card
+    from learn.inference.shipped import find_model
     from synth.dataset.store import Dataset
 
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
+    if unseen_by:
+        seen = set[str]().union(*(read_card(find_model(model)).seen for model in unseen_by))
+        chosen = [s for s in chosen if s.attrs["content_hash"] not in seen][:1]
+    if not chosen:
+        raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")
     _print_paths([export_recording(s, out / f"{s.index:06d}", footage) for s in chosen], json)
 
 

@@ -74,6 +74,11 @@ class ModelCard:
     no_intervals: str = ""
     """Why it could not be; empty if it could, or nobody tried."""
 
+    @property
+    def seen(self) -> set[str]:
+        """Content hashes of the sequences that no score of the model may be of."""
+        return {content for part in SEEN for content in self.split.get(part, [])}
+
 
 _CARD = TypeAdapter(ModelCard)
 

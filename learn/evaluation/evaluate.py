@@ -231,7 +231,7 @@ def compare(a: EvaluationReport, b: EvaluationReport) -> dict[str, Paired]:
 
 def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
-    hashes = {h for part in SEEN for h in card.split.get(part, [])}
+    hashes = card.seen
     seen = {g for part in SEEN for g in card.groups.get(part, [])}
     named = zip(clips, regroup(clips, find_unit(card.groups)), strict=True)
     return [c for c, one in named if c.content_hash not in hashes and one.group not in seen]

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_model import write_model
+from typer.testing import CliRunner
 
+from bench.cli import app
 from bench.recording.folder import open_recording
 from bench.recording.from_sequence import export_recording
+from learn.checkpoint import read_card, write_card
 from synth.dataset.store import Sequence, Writer, open_sequence
 from synth.job.schema import Job
 
@@ -61,3 +66,17 @@ def test_nothing_of_the_truth_leaks(tmp_path: Path) -> None:
     folder = export_recording(sealed(tmp_path), tmp_path / "rec")
     names = {path.relative_to(folder).parts[0] for path in folder.rglob("*")}
     assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
+
+
+def test_the_first_sequence_that_no_model_was_trained_on(tmp_path: Path) -> None:
+    hashes = [sealed(tmp_path / "data", index).attrs["content_hash"] for index in range(3)]
+    model = write_model(tmp_path / "model")
+    words = ["from-dataset", str(tmp_path / "data"), "--unseen-by", "mono", "--unseen-by", str(model)]
+    for seen, exported in ((["fit", "select"], ["000002"]), (["test", "intervals"], ["000000"])):
+        split = {part: [content] for part, content in zip(seen, hashes, strict=False)}
+        write_card(model, replace(read_card(model), split=split))
+        out = tmp_path / seen[0]
+        assert CliRunner().invoke(app, [*words, "-o", str(out)]).exit_code == 0
+        assert [folder.name for folder in out.iterdir()] == exported
+    write_card(model, replace(read_card(model), split={"fit": hashes}))
+    assert CliRunner().invoke(app, [*words, "-o", str(tmp_path / "none")]).exit_code == 2
