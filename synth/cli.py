@@ -303,48 +303,46 @@ def verify(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: synth picture out --sequence 1 -f 0 -f 5 --to picture.jpg")
-def picture(
-    out: Out,
-    sequence: Index = 0,
-    frame: Annotated[
-        list[int] | None, typer.Option("--frame", "-f", help="Which frame; repeat for more. [the strongest]")
-    ] = None,
-    to: Annotated[Path, typer.Option("--to", help="The PNG or JPEG to write.")] = Path("picture.png"),
-) -> None:
-    """Draws frames with their flow and force map side by side, as in the README."""
-    from synth.dataset import location
-    from synth.dataset.store import open_sequence
-    from synth.publish.picture import draw_sequence, strongest
-    from synth.system.checked_file import write_picture
-
-    chosen = open_sequence(location.store(out, sequence))
-    rows = draw_sequence(chosen, frame or [strongest(chosen)])
-    to.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(to, rows)
-    print(f"wrote {to}")
-
-
-@app.command(epilog="Example: synth view out --sequence 0 --save scene.rrd")
+@app.command(epilog="Example: synth view out --sequence 1 -f 0 -f 5 --save picture.jpg")
 def view(
     out: Out,
     sequence: Index = 0,
     save: Annotated[
-        Path | None, typer.Option("--save", help="Write a recording (.rrd) instead of opening the viewer.")
+        Path | None,
+        typer.Option(
+            "--save", help="Write a recording (.rrd) or a picture (.png, .jpg) instead of opening the viewer."
+        ),
+    ] = None,
+    frame: Annotated[
+        list[int] | None,
+        typer.Option("--frame", "-f", help="Frame of a picture; repeat for more. [the strongest]"),
     ] = None,
     web: Annotated[
         bool, typer.Option("--web", help="In a browser: for a machine without a window system.")
     ] = False,
 ) -> None:
-    """Opens a sequence in rerun, on this machine only: frame, depth, flow, traction and force by time."""
+    """Opens a sequence in rerun, on this machine only: frame, depth, flow, traction and force by time.
+
+    A picture has frames with their flow and force map side by side, as in the README.
+    """
     from synth.dataset import location
     from synth.dataset.store import open_sequence
+    from synth.publish.picture import draw_sequence, strongest
     from synth.publish.rerun_view import save_recording, show_sequence
+    from synth.system.checked_file import write_picture
 
+    pictured = save is not None and save.suffix != ".rrd"
+    if frame and not pictured:
+        raise UserError("--frame is of a picture: give --save a name that ends with .png or .jpg")
     _end_on_terminate()
     chosen = open_sequence(location.store(out, sequence))
     if save is None:
         show_sequence(chosen, web=web)
+    elif pictured:
+        rows = draw_sequence(chosen, frame or [strongest(chosen)])
+        save.parent.mkdir(parents=True, exist_ok=True)
+        write_picture(save, rows)
+        print(f"wrote {save}")
     else:
         save_recording(chosen, save)
         print(f"wrote {save}; open it with: rerun {save}")

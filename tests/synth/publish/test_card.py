@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
+from synth.cli import app
 from synth.dataset import index
 from synth.dataset.store import Dataset
 from synth.publish import card, croissant, picture
@@ -66,7 +69,7 @@ def test_the_folder_loads_with_datasets(root: Path, tmp_path: Path, monkeypatch:
     assert set(index.SCHEMA.names) <= set(loaded.column_names)
 
 
-def test_a_picture_shows_flow_and_load_where_they_are(root: Path) -> None:
+def test_a_picture_shows_flow_and_load_where_they_are(root: Path, tmp_path: Path) -> None:
     sequence = Dataset(root)[0]
     drawn = picture.draw_sequence(sequence, [0, picture.strongest(sequence)])
     height, width = sequence.size
@@ -77,3 +80,8 @@ def test_a_picture_shows_flow_and_load_where_they_are(root: Path) -> None:
     red, _, blue = force[at].astype(int)
     assert red > blue + 50, "yellow where the load is greatest"
     assert np.array_equal(drawn[-height:, :width], sequence["rgb"][2])
+    words = ["view", str(root), "--frame", "0", "-f", str(picture.strongest(sequence)), "--save"]
+    assert CliRunner().invoke(app, [*words, str(tmp_path / "two.png")]).exit_code == 0
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "two.png")), drawn)
+    for name in ("two.txt", "two.rrd"):
+        assert CliRunner().invoke(app, [*words, str(tmp_path / name)]).exit_code == 2
