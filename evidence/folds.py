@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from learn.data.clips import Clip
-from learn.data.split import Split, groups
+from learn.split import Split, groups
 from synth.dataset.split import draw_groups
 
 

@@ -17,7 +17,6 @@ from synth.system.cli_errors import Commands
 from synth.system.terminal import counting
 
 if TYPE_CHECKING:
-    from learn.checkpoint import ModelCard
     from learn.data.clips import Clip
     from learn.data.grid import Grid
     from learn.uncertainty.intervals import Intervals
@@ -77,7 +76,7 @@ def train_command(
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
     from learn.settings import preset as named
-    from learn.training.sides import divide
+    from learn.split import divide
     from learn.training.threads import make_fabric, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
@@ -162,18 +161,18 @@ def eval_command(
 ) -> None:
     """Score a model on the sequences it has not seen; forces in mN."""
     from learn.data.clips import scored
-    from learn.data.split import find_unit
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.evaluation.tables import coverage_table, paired_table, score_table
     from learn.inference.predict import load_model
+    from learn.split import choose_unseen, find_unit
     from learn.training.threads import set_threads
 
     set_threads(threads)
     predictor = load_model(model)
     source = predictor.readable(input or scored(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
-    if find_unit(predictor.card.groups) != "anatomy":
+    if find_unit(predictor.card) != "anatomy":
         _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
     other = None if against is None else load_model(against)
     if other is not None:
@@ -183,7 +182,7 @@ def eval_command(
                 f"{against}: is of another grid or target than {model}; their maps can't be paired"
             )
     cards = [one.card for one in (predictor, other) if one is not None]
-    chosen = _unseen(clips, dataset, cards)
+    chosen = choose_unseen(clips, dataset, cards, _console.print)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
         second = None if other is None else evaluate(other, chosen, source, progress)
@@ -204,28 +203,6 @@ def eval_command(
         screen.print(coverage_table(covered))
     if second is not None:
         screen.print(paired_table(pairs, f"against {against}, paired by sequence", predictor.card, all))
-
-
-def _unseen(clips: list[Clip], dataset: Path, cards: list[ModelCard]) -> list[Clip]:
-    """Those that no model has seen; of a dataset that one has met, of its test side. UserError if none is."""
-    from learn.evaluation.evaluate import unseen
-    from synth.dataset.index import read_split
-
-    split, asked = read_split(dataset, required=False), clips
-    met = {name for card in cards for part in card.split.values() for name in part}
-    if split.sides and any(clip.content_hash in met for clip in clips):
-        asked = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = asked
-    for card in cards:
-        chosen = unseen(chosen, card)
-    if not chosen:
-        raise UserError(
-            f"{dataset}: the model was fitted or chosen on the brains of all {len(asked)} sequences that are "
-            "for testing; `synth split` says which are"
-        )
-    if left := len(asked) - len(chosen):
-        _console.print(f"{left} of {len(asked)} left out: the model was fitted or chosen on their brains.")
-    return chosen
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")

@@ -19,9 +19,9 @@ from bench.methods import baselines, physics, posterior
 from bench.methods.compliance import TissueKind
 from bench.methods.protocol import Field
 from learn.data.clips import Clip
-from learn.data.split import Split
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
+from learn.split import Split
 from learn.training import batches
 from learn.training.train import train
 from synth.flow.confidence import deviation

@@ -24,9 +24,9 @@ from evidence.folds import folds, nested
 from evidence.gap import gap
 from evidence.gap.runs import KEYS, Training, carry_out, with_flow
 from learn.data.clips import Clip, load_clips
-from learn.data.split import Split, groups
 from learn.evaluation.statistics import interval, paired
 from learn.settings import preset, replace
+from learn.split import Split, groups
 from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
 from synth.errors import UserError

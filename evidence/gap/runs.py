@@ -14,11 +14,11 @@ from evidence.end_to_end.pipelines import recover_flow
 from evidence.gap import gap
 from learn.data.clips import Clip
 from learn.data.grid import Grid
-from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings
 from learn.settings import replace as changed
+from learn.split import Split
 from learn.training.train import train
 from synth.dataset.store import Sequence as Stored
 

@@ -21,13 +21,13 @@ from evidence import report, status
 from evidence.folds import nested
 from evidence.learn import labels
 from learn.data.clips import Clip
-from learn.data.split import Split
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
 from learn.evaluation.statistics import Interval, interval, paired
 from learn.inference.predict import Predictor, load_model
 from learn.loss import Loss
 from learn.settings import TrainingSettings, preset, replace
+from learn.split import Split
 from learn.training.threads import set_threads
 from learn.training.train import train
 from synth.job import reader

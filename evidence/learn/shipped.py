@@ -20,9 +20,9 @@ from evidence.curves.readers import figures, map_figures
 from evidence.end_to_end import models
 from learn.data.clips import load_clips, scored
 from learn.evaluation.coverage import cover
-from learn.evaluation.evaluate import unseen as never_met
 from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
+from learn.split import unseen as never_met
 from learn.training.threads import set_threads
 from synth.errors import UserError
 

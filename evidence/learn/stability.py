@@ -20,10 +20,10 @@ from evidence.learn import labels
 from evidence.learn.runs import JOB, Run, carry_out, fit, study
 from learn.data.clips import Clip
 from learn.data.grid import Grid
-from learn.data.split import Split
 from learn.evaluation.evaluate import EvaluationReport, evaluate
 from learn.loss import Loss
 from learn.settings import replace
+from learn.split import Split
 from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.job import reader

@@ -1,1 +1,1 @@
-"""Clips of displacement and force on the network's grid, and who is trained on."""
+"""Clips of displacement and force on the network's grid."""

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from learn.checkpoint import SEEN, ModelCard
+from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
-from learn.data.split import find_unit, regroup
 from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments, rescale
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
@@ -227,11 +226,3 @@ def compare(a: EvaluationReport, b: EvaluationReport) -> dict[str, Paired]:
         if np.isfinite(two - one).any():
             out[key] = paired(one, two, rng)
     return out
-
-
-def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
-    """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
-    hashes = card.seen
-    seen = {g for part in SEEN for g in card.groups.get(part, [])}
-    named = zip(clips, regroup(clips, find_unit(card.groups)), strict=True)
-    return [c for c, one in named if c.content_hash not in hashes and one.group not in seen]

@@ -10,9 +10,8 @@ import numpy as np
 
 from learn.checkpoint import ModelCard, write_card
 from learn.data.clips import Clip, scored
-from learn.data.split import Split, find_unit, groups, regroup
-from learn.evaluation.interval_sides import find_obstacle, find_sides
 from learn.inference.predict import Predictor, length, net_force
+from learn.split import Split, find_obstacle, find_sides, find_unit, groups, regroup
 from learn.uncertainty.features import motion_features, motion_names
 from learn.uncertainty.intervals import Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
@@ -91,7 +90,7 @@ def fit_from_datasets(
     Raises:
         UserError: none of the sequences was fitted, or there are too few of others.
     """
-    clips = regroup(clips, find_unit(predictor.card.groups))
+    clips = regroup(clips, find_unit(predictor.card))
     marked = [read_split(one, required=False).sides.items() for one in datasets]
     tests = [name for part in marked for name, side in part if side == "test"]
     split = find_sides(clips, predictor.card, tests, from_test)

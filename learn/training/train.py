@@ -21,16 +21,15 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
-from learn.data.split import Split, groups
 from learn.evaluation.metrics import agreement
 from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
+from learn.split import Split, name_parts
 from learn.training.batches import Batch, FrameDataset, inputs, measure_scales, swayed
 from learn.training.gpu_batches import place_frames
 from learn.training.log import Log
 from learn.training.threads import make_fabric
-from synth.dataset.split import find_crossings
 from synth.errors import UserError, as_user_error
 from synth.system.terminal import ProgressCallback
 
@@ -68,7 +67,7 @@ def train(
     fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
-    card = ModelCard(settings, scales, typical_young(fit), *_provenance(clips, split), [*split.hashes])
+    card = ModelCard(settings, scales, typical_young(fit), *name_parts(clips, split), [*split.hashes])
     state = _open(out, card)
     try:
         run = _start(card, state)
@@ -264,19 +263,6 @@ def moments(true: torch.Tensor, predicted: torch.Tensor) -> NDArray[np.float64]:
     t, p = true.double(), predicted.double()
     sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
     return np.array([t.numel(), *sums.tolist()])
-
-
-def _provenance(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    parts = {"fit": split.fit, "select": split.select, "test": split.test}
-    if split.intervals:
-        parts["intervals"] = split.intervals
-    number, sides = groups(clips), [(i, side) for side, part in parts.items() for i in part]
-    if find_crossings([number[i] for i, _ in sides], [side for _, side in sides]):
-        raise UserError("the split shares an anatomy between its parts")
-    return (
-        {k: [clips[i].content_hash for i in v] for k, v in parts.items()},
-        {k: sorted({clips[i].group for i in v}) for k, v in parts.items()},
-    )
 
 
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:

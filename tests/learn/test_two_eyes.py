@@ -21,9 +21,9 @@ from learn.data.grid import Grid, Scales, channels
 from learn.inference.export import export
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
+from learn.split import divide
 from learn.training.batches import UNTOLD, FrameDataset, FrameItem, inputs
 from learn.training.gpu_batches import DeviceDataset
-from learn.training.sides import divide
 from learn.training.train import train
 from synth.job.types import MembraneState
 

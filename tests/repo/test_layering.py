@@ -46,6 +46,7 @@ ORDER = (
     "learn.loss",
     "learn.settings",
     "learn.checkpoint",
+    "learn.split",
     "learn.inference",
     "learn.evaluation",
     "learn.training",

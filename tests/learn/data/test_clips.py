@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 
 from learn.data.clips import Clip, load_clips, pack, target, unpack
 from learn.data.grid import Grid
-from learn.data.split import groups
+from learn.split import groups
 from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.errors import UserError

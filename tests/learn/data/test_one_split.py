@@ -18,10 +18,8 @@ from learn import cli
 from learn.checkpoint import ModelCard, read_card
 from learn.data.clips import load_clips
 from learn.data.grid import Scales
-from learn.data.split import Split, find_unit, regroup
-from learn.evaluation.interval_sides import find_sides
 from learn.settings import preset
-from learn.training.sides import divide
+from learn.split import Split, choose_unseen, divide, find_sides, find_unit, name_parts, regroup
 from synth.cli import app as synth
 from synth.dataset import index, split
 from synth.dataset.folder import claim
@@ -48,10 +46,8 @@ def divided(*datasets: Path) -> tuple[ModelCard, Split]:
     """The card of a model that would be trained on them, and the parts."""
     clips = [clip for one in datasets for clip in load_clips(one, BASE.grid, ["ideal"])]
     clips, parts = divide(clips, datasets, seed=0)
-    named = {part: getattr(parts, part) for part in ("fit", "select", "test", "intervals")}
-    hashes = {part: [clips[i].content_hash for i in which] for part, which in named.items()}
-    groups = {part: sorted({clips[i].group for i in which}) for part, which in named.items()}
-    return ModelCard(BASE, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, hashes, groups, [*parts.hashes]), parts
+    named = name_parts(clips, parts)
+    return ModelCard(BASE, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, *named, [*parts.hashes]), parts
 
 
 def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
@@ -108,11 +104,11 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     card, _ = divided(own)
     assert card.dataset_splits == [stored.hash]
     sides = {part: {stored.sides[name] for name in names} for part, names in card.split.items()}
-    assert sides == {"fit": {"train"}, "select": {"validation"}, "test": {"test"}, "intervals": set()}
+    assert sides == {"fit": {"train"}, "select": {"validation"}, "test": {"test"}}
     assert sum(map(len, card.split.values())) == len(on)
     clips = load_clips(own, BASE.grid, ["ideal"])
-    assert {clip.content_hash for clip in cli._unseen(clips, own, [card])} == set(card.split["test"])
-    grouped = regroup(clips, find_unit(card.groups))
+    assert {clip.content_hash for clip in choose_unseen(clips, own, [card])} == set(card.split["test"])
+    grouped = regroup(clips, find_unit(card))
     used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
     assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
     assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
@@ -126,10 +122,10 @@ def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_pat
     split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
     clips = load_clips(own, BASE.grid, ["ideal"])
     with pytest.raises(UserError):
-        cli._unseen(clips, own, [card])
+        choose_unseen(clips, own, [card])
     # A dataset that it never met has no side that it was fitted on.
     strangers = make(tmp_path / "strangers", [*range(20, 26)], first=30)
-    assert len(cli._unseen(load_clips(strangers, BASE.grid, ["ideal"]), strangers, [card])) == 6
+    assert len(choose_unseen(load_clips(strangers, BASE.grid, ["ideal"]), strangers, [card])) == 6
 
 
 def test_several_datasets_are_divided_as_each_says_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
@@ -161,7 +157,7 @@ def test_openings_that_overlap_are_one_group_and_the_others_are_kept_apart(tmp_p
     assert on[names[0]] == on[names[2]], "19 mm apart at 12 mm radius"
     assert on[names[6]] == on[names[8]]
     card, _ = divided(own)
-    assert find_unit(card.groups) == "opening"
+    assert find_unit(card) == "opening"
     assert all(card.split[part] for part in ("fit", "select", "test"))
 
 

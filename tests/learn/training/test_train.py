@@ -10,10 +10,9 @@ import torch
 
 from learn import checkpoint
 from learn.data.clips import Clip
-from learn.data.split import Split
-from learn.evaluation.evaluate import unseen
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
+from learn.split import Split, unseen
 from learn.training.batches import Batch, FrameDataset, FrameItem, measure_scales, swayed
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset

@@ -8,9 +8,8 @@ from collections.abc import Iterable
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
 from learn.data.grid import Scales
-from learn.data.split import Split
-from learn.evaluation.interval_sides import find_obstacle, find_sides, keep_back
 from learn.settings import preset
+from learn.split import Split, find_obstacle, find_sides, keep_back, name_parts
 
 
 def many(clips: list[Clip], brains: int, each: int = 2) -> list[Clip]:
@@ -25,12 +24,6 @@ def many(clips: list[Clip], brains: int, each: int = 2) -> list[Clip]:
 
 def of(brains: Iterable[int], each: int = 2) -> tuple[int, ...]:
     return tuple(b * each + k for b in brains for k in range(each))
-
-
-def card(clips: list[Clip], **parts: tuple[int, ...]) -> ModelCard:
-    hashes = {part: [clips[i].content_hash for i in which] for part, which in parts.items()}
-    groups = {part: sorted({clips[i].group for i in which}) for part, which in parts.items()}
-    return ModelCard(preset("tiny"), Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, hashes, groups)
 
 
 def test_half_of_the_choosing_brains_are_kept_whole(clips: list[Clip]) -> None:
@@ -48,7 +41,8 @@ def test_half_of_the_choosing_brains_are_kept_whole(clips: list[Clip]) -> None:
 
 def test_what_a_model_has_met_and_its_test_are_not_taken(clips: list[Clip]) -> None:
     some = many(clips, 30)
-    known = card(some, fit=of(range(6)), select=of(range(6, 10)), test=of([10, 11]))
+    named = name_parts(some, Split(of(range(6)), of(range(6, 10)), of([10, 11])))
+    known = ModelCard(preset("tiny"), Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, *named)
     # A sequence of its own of a brain that was fitted, of one that is test, and a brain marked test.
     some += [
         dataclasses.replace(some[0], content_hash="new-a", group="brain-3"),
