@@ -123,7 +123,7 @@ def read_card(folder: Path) -> ModelCard:
         check_format(tree.pop("format_version", 1), MODEL, str(file))
         return _CARD.validate_json(json.dumps(tree), strict=True)
     except ValidationError as error:
-        raise UserError(f"{file}: corrupt model configuration ({first_mistake(error)})") from None
+        raise UserError(f"{file}: damaged or of another version ({first_mistake(error)})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
 

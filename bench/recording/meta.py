@@ -7,18 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from synth.errors import UserError
-from synth.job.types import MembraneState, Positive
+from synth.job.types import MembraneState, Positive, Section
 from synth.job.writer import section_lines
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile
@@ -52,11 +44,7 @@ LEAST_TURNING = 20
 """Frames that `sensor.turn_s` must hold for the sensor's rotation to be found on it."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
-
-
-class ScaleCalibration(_Section):
+class ScaleCalibration(Section):
     """How to find the scale when it isn't stated. Give one of the ways."""
 
     focal_px: Positive | None = None
@@ -95,7 +83,7 @@ class ScaleCalibration(_Section):
         return self
 
 
-class SensorMeta(_Section):
+class SensorMeta(Section):
     """The force sensor and how its file is to be read."""
 
     axes: Literal["camera", "sensor"] = "sensor"
@@ -132,7 +120,7 @@ class SensorMeta(_Section):
         return self.axes == "camera" or self.to_camera is not None
 
 
-class Sync(_Section):
+class Sync(Section):
     """How the sensor's clock lies on the video's."""
 
     method: Literal["clock", "offset", "correlate"] = "clock"
@@ -146,7 +134,7 @@ class Sync(_Section):
     """Largest offset looked for, either way [s]."""
 
 
-class PulseMeta(_Section):
+class PulseMeta(Section):
     """The tissue's own motion by heart and breath, which is taken off before any method reads the motion."""
 
     remove: bool = True
@@ -155,7 +143,7 @@ class PulseMeta(_Section):
     """Spans of video time without contact, (from, to) [s], to find it on; without, the video alone says."""
 
 
-class Stereo(_Section):
+class Stereo(Section):
     """The second eye of `right.mp4` or `right/`."""
 
     calibration: Path
@@ -165,7 +153,7 @@ class Stereo(_Section):
     """Millimetres in a unit of T: the side of a chessboard's square, say."""
 
 
-class Depth(_Section):
+class Depth(Section):
     """The depth pictures of `depth/`, on the video's pixels."""
 
     focal_px: Positive
@@ -176,7 +164,7 @@ class Depth(_Section):
     """Millimetres in a unit of the pictures: 1 for the 16-bit PNG of most depth cameras."""
 
 
-class Meta(_Section):
+class Meta(Section):
     """One recording."""
 
     scale_mm_per_px: Positive | Literal["unknown"] | None = None

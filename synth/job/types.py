@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
-from pydantic._internal._model_construction import ModelMetaclass
-from pydantic_core import ValidationError
-
-from synth.errors import InvalidValue
-from synth.system.config_file import find_mistakes
 
 Number = TypeVar("Number")
 
 
-class _Checked(ModelMetaclass):
-    """Makes mistakes in a call one line each, as those in a file are."""
-
-    def __call__(cls, *args: Any, **values: Any) -> Any:
-        try:
-            return super().__call__(*args, **values)
-        except ValidationError as error:
-            raise InvalidValue("\n".join(map(str, find_mistakes(error, cast(Any, cls))))) from None
-
-
-class Section(BaseModel, metaclass=_Checked):
+class Section(BaseModel):
     """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)

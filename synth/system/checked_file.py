@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import stat
 import tempfile
@@ -18,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
 from synth.errors import UserError, as_user_error, first_line
 
@@ -28,9 +27,6 @@ LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 
 LARGEST_PIXELS = 40_000_000
 """Of a still or of a frame of a video."""
 _LARGEST_ARRAYS = 64 << 30
-_DEEPEST = 32  # levels of a YAML file
-_NESTED = re.compile(r"[\[{]|<\w|[-?] +(?=[-?] )|\w: +(?=\w+: )")
-_MOST_NESTED = 1000  # values within values of an OpenCV file
 PART = ".part"
 """How the names of files end that are being written, `.NAME.RANDOM.part`."""
 
@@ -41,7 +37,7 @@ def open_file(path: Path, largest: int) -> BufferedReader:
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except (OSError, ValueError) as error:
         why = str(getattr(error, "strerror", None) or error).lower()
-        raise UserError(f"{str(path)[:500]}: {why}") from None
+        raise UserError(f"{path}: {why}") from None
     about = os.fstat(file.fileno())
     if stat.S_ISREG(about.st_mode) and about.st_size <= largest:
         return file
@@ -123,15 +119,12 @@ def refuse_large(width: int, height: int) -> None:
 def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
     """Matrices (float64 arrays) and numbers at the top of an OpenCV FileStorage: YAML, XML or JSON.
 
-    Raises:
-        UserError: it is none, or nested so deep that OpenCV's parser, which calls itself, ends the process.
+    UserError for what is none.
     """
     import cv2
 
     text = read_text(path, largest)
     with as_user_error(f"{path}: is no OpenCV calibration"):
-        if sum(1 for _ in _NESTED.finditer(text)) > _MOST_NESTED:
-            raise ValueError(f"more than {_MOST_NESTED} nested values")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()  # it and its nodes live as long as the storage
         nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is no dictionary
@@ -143,25 +136,21 @@ def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> Any:
-    """The values of a YAML file. Raises as `read_text`, `load_yaml` and `plain_yaml`."""
-    return plain_yaml(load_yaml(read_text(path, LARGEST_YAML), str(path)), str(path))
+    """The values of a YAML file. Raises as `read_text` and `load_yaml`."""
+    return load_yaml(read_text(path, LARGEST_YAML), str(path))
 
 
-def load_yaml(text: str, label: str) -> Any:
-    """The tree of YAML 1.2 with places and comments (`ruamel.yaml`'s round trip); `plain_yaml` is its values.
+def load_yaml(text: str, label: str, *, places: bool = False) -> Any:
+    """The values of YAML 1.2, a date as its text; with `places`: `ruamel.yaml`'s tree, comments too.
 
     Raises:
-        UserError: `label:line:column: ...`: no YAML, too long, nested too deep, or with aliases, by which a
-            kilobyte can stand for a billion values.
+        UserError: `label:line:column: not YAML: ...`.
     """
-    depth = 0
+    yaml = YAML(typ="rt" if places else "safe", pure=True)
+    if not places:
+        yaml.Constructor = _Plain
     try:
-        for event in YAML(typ="rt").parse(text):  # before anything is built of it
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            if depth > _DEEPEST or isinstance(event, AliasEvent):
-                what = f"aliases, and more than {_DEEPEST} levels, are not read"
-                raise MarkedYAMLError(problem=what, problem_mark=event.start_mark)
-        return YAML(typ="rt").load(text)
+        return yaml.load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
@@ -170,24 +159,11 @@ def load_yaml(text: str, label: str) -> Any:
         raise UserError(f"{label}: not YAML: {first_line(error)}") from error
 
 
-def plain_yaml(value: Any, label: str) -> Any:
-    """A tree of `load_yaml` as dictionaries with keys of text, lists, texts, numbers, booleans and None.
+class _Plain(SafeConstructor):
+    """Values whose dates stay text."""
 
-    Dates are their text. UserError for an integer beyond 64 bits and for another kind (`!!binary`, a tag).
-    """
-    if isinstance(value, dict):
-        return {str(key)[:100]: plain_yaml(item, label) for key, item in value.items()}
-    if isinstance(value, list):
-        return [plain_yaml(item, label) for item in value]
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, int) and abs(value) <= 1 << 64:
-        return int(value)
-    if isinstance(value, float):
-        return float(value)
-    if isinstance(value, str) or hasattr(value, "isoformat"):
-        return str(value)
-    raise UserError(f"{label}: a {type(value).__name__} of a kind or size that is not read")
+
+_Plain.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 def folder_bytes(path: Path) -> int:

@@ -29,10 +29,10 @@ def write(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) -> Non
         FileExistsError: it does.
     """
     text, label, folder = reader.read_source(source)
-    tree = checked_file.load_yaml(text, label)
+    tree = checked_file.load_yaml(text, label, places=True)
     for override in overrides:
         key, _, value = override.partition("=")
-        _set(tree, key.strip(), checked_file.load_yaml(value, override))
+        _set(tree, key.strip(), checked_file.load_yaml(value, override, places=True))
     if folder != out.resolve().parent:  # from which relative paths will start
         job = reader.load_job(source, overrides).model_dump(mode="json")
         for section, name in identity.FILES:

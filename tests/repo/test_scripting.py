@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_model import write_model
+from pydantic import ValidationError
 
 import bench
 import learn
@@ -55,8 +56,6 @@ FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
 @pytest.mark.parametrize(
     ("named", "call"),
     [
-        ("fraims", lambda: synth.Job(fraims=3)),  # type: ignore[call-arg]
-        (r"render\.sppp", lambda: synth.Job(render={"sppp": 3})),
         ("tiyn", lambda: synth.simulate("tiyn")),
         ("rate_hz", lambda: bench.Settings(rate_hz=0)),
         ("shrink", lambda: bench.Settings(shrink=-1)),
@@ -79,6 +78,12 @@ FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
 def test_what_cannot_be_is_refused_by_name(named: str, call: Callable[[], object]) -> None:
     with pytest.raises(synth.UserError, match=named):
         call()
+
+
+def test_a_key_that_a_job_does_not_have_is_refused_by_name() -> None:
+    for named, values in (("fraims", {"fraims": 3}), (r"render\.sppp", {"render": {"sppp": 3}})):
+        with pytest.raises(ValidationError, match=named):
+            synth.Job(**values)
 
 
 @pytest.mark.slow

@@ -30,15 +30,15 @@ def test_every_mistake_is_named_at_its_line_and_column() -> None:
         reader.parse_job(BAD, "job.yaml", Path())
     places = [": ".join(line.split(": ")[:2]) for line in str(caught.value).splitlines()]
     assert [place.removeprefix("job.yaml:") for place in places] == [
-        "1:7: seed",
-        "2:9: frames",
+        "1:1: seed",
+        "2:1: frames",
         "4:3: render.sppp",
-        "5:8: render.spp",
+        "5:3: render.spp",
         "7:18: fem.poisson[1]",
-        "8:9: fem.load",
+        "8:3: fem.load",
         "9:18: fem.young_kpa[1]",
-        "11:3: anatomy",
-        "11:9: anatomy.mesh",
+        "10:1: anatomy",
+        "11:3: anatomy.mesh",
     ]
 
 
