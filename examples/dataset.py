@@ -64,8 +64,8 @@ def main(root: Path, sequences: int) -> None:
             # ... and the look, the camera's path and the tool's path, which are ours.
             look = replace(
                 case.look,
-                crown=(0.80, 0.62, 0.55),
-                blush=0.2 * case.look.blush,
+                gyrus_albedo=(0.80, 0.62, 0.55),
+                pial_absorbance=0.2 * case.look.pial_absorbance,
                 sensor=replace(case.look.sensor, exposure=0.8 * case.look.sensor.exposure),
             )
             case = replace(case, look=look, sway=Arc(rng.uniform(4, 10)))

@@ -292,7 +292,7 @@ class Renderer:
         small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
         axis = noise.centres(_MIRRORED_PX, extent)
         inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
-        around = 0.5 * (np.asarray(self._look.dura) + np.asarray(self._look.beyond))
+        around = 0.5 * (np.asarray(self._look.dura_albedo) + np.asarray(self._look.surroundings_albedo))
         wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
         lit = self._look.light.power * light.blackbody(self._look.light.kelvin)
         return reflection.Theatre(wound, extent, tuple(self.lamps), lit, self._look.rim_seed)

@@ -306,27 +306,22 @@ def draw_sway(render: RenderSection, rng: Random) -> CameraMotion:
 def draw_look(job: Job, family: Family, rng: Random) -> Look:
     """A look of `family` under the job's light, seen by its sensor."""
     lighting = draw_light(job.light, rng)
-    glare = lighting.glare
-    ranges = FAMILIES[family]
+    ranges = vars(FAMILIES[family])
+    if job.appearance.blood:
+        ranges = ranges | {"blood": job.appearance.blood}
+    drawn: dict[str, Any] = {
+        name: _near(ends, rng) if len(ends) == 3 else _uniform(rng, ends) for name, ends in ranges.items()
+    }
+    # More highlights: a thicker film over more relief, rougher, of a higher index. By eye on photographs.
+    square = lighting.glare**2
+    drawn["film_smoothing_mm"] += 0.14 * square
+    drawn["bump"] *= 1 + 3 * square
+    drawn["roughness"] += 0.12 * square
+    drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
     look = Look(
         family=family,
-        crown=_near(ranges.crown, rng),
-        flush=_near(ranges.flush, rng),
-        vein=_near(ranges.vein, rng),
-        wine=_near(ranges.wine, rng),
-        arterial=_uniform(rng, ranges.arterial),
-        capillary=_uniform(rng, ranges.capillary),
-        blush=_uniform(rng, ranges.blush),
-        shade=_uniform(rng, ranges.shade),
-        grain=_uniform(rng, (0.008, 0.02)),
-        film_mm=_uniform(rng, ranges.film_mm) + 0.14 * glare**2,
-        bump=_uniform(rng, ranges.bump) * (1 + 3 * glare**2),
-        roughness=_uniform(rng, (0.012, 0.02)) + 0.12 * glare**2,
-        dry_roughness=_uniform(rng, (0.22, 0.34)) * (1 - 0.6 * glare),
-        film_index=1.33 + 0.47 * glare**2,
-        blood=_uniform(rng, job.appearance.blood or ranges.blood),
-        dura=_near(ranges.dura, rng),
-        beyond=_near(ranges.beyond, rng),
+        **drawn,
+        film_index=1.33 + 0.47 * square,
         cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
         scenery=(),
         rim_seed=int(rng.integers(2**31)),

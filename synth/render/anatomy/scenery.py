@@ -5,22 +5,68 @@ None of it is tissue or an instrument that acts: it hides what is below it, in p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, maximum_filter1d
 from scipy.spatial import cKDTree
 
 from synth.geometry.triangles import Shape, grid_faces
+from synth.render.anatomy.layers import Rgb, over, speckled, step, through
 from synth.render.anatomy.tree import Tree
 
 Floats = npt.NDArray[np.float64]
+Map = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
 PATTY_MM = (5.0, 2.3)
 """Half length and width of the patties over the opening's edge."""
+PATTY_UP_MM = 0.55 + 0.3
+"""Height of a patty on the rim: cotton, and folds that it lies over."""
 _PATTY_GRID = (34, 18)
 _COTTON_MM = 0.45
 _BLADE_RINGS, _BLADE_AROUND = 60, 24
+
+
+@dataclass(frozen=True)
+class Cotton:
+    """Albedo of white felt and its blue thread, absorption of the blood that soaks it."""
+
+    felt: Rgb = (0.86, 0.82, 0.76)
+    thread: Rgb = (0.05, 0.12, 0.30)
+    blood: Rgb = (0.15, 1.3, 1.4)
+
+
+@dataclass(frozen=True)
+class Suture:
+    """A stitch's black thread."""
+
+    albedo: Rgb = (0.025, 0.025, 0.035)
+    half_mm: float = 0.075
+    raised_mm: float = 0.08
+
+
+@dataclass(frozen=True)
+class Patty:
+    """A strip of cotton on the rim."""
+
+    middle: tuple[float, float]
+    """World x, y [mm]."""
+    turn: float
+    """Direction of its long side [rad]."""
+    half: tuple[float, float]
+    """Half its length and width [mm]."""
+
+    def placed(self, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats, Map]:
+        """Places x, y mm along its length, across it, and from its outline, negative inside [mm]."""
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        dx, dy = x - self.middle[0], y - self.middle[1]
+        along, across = c * dx + s * dy, c * dy - s * dx
+        far = np.maximum(np.abs(along) - self.half[0], np.abs(across) - self.half[1])
+        return along, across, np.asarray(far, np.float32)
 
 
 def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
@@ -30,6 +76,30 @@ def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
     parts = np.array_split(np.roll(np.arange(len(edge)), -first), sectors)
     widest = np.array([part[np.argmax(edge[part])] for part in parts])
     return np.asarray(2 * np.pi * widest / len(edge))
+
+
+def aside(angle: npt.NDArray[Any], stitch: float) -> npt.NDArray[Any]:
+    """Angle (...) from a stitch, to the shorter side [rad]."""
+    return np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi
+
+
+def threaded(
+    stitches: Floats, angle: Map, away: Map, radius: float, colour: Map, bumps: Map
+) -> tuple[Map, Map]:
+    """Colour (r, n, 3) and bumps mm with threads: two strands from each stitch, meeting far out.
+
+    `angle` rad and `away` mm: places (r, n) around an opening of mean `radius` mm, and beyond its edge.
+    """
+    covered = np.zeros_like(away)
+    for stitch in stitches:
+        across = aside(angle, stitch) * (radius + away)
+        # A loop that is round where it goes through, drawn together far out.
+        apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
+        line = np.where(away > 0.9, np.abs(np.abs(across) - apart), 9.0)
+        covered = np.maximum(covered, step((Suture.half_mm - line) / 0.06 + 0.2))
+    threads = np.asarray(covered, np.float32)
+    colour = colour + threads[..., None] * (np.array(Suture.albedo, np.float32) - colour)
+    return colour, bumps + np.float32(Suture.raised_mm) * threads
 
 
 def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
@@ -49,8 +119,8 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
         stems.append((*first, way * rng.uniform(0.09, 0.2), 60, -1))
     while stems:
         angle, away, lean, width, steps, before = stems.pop()
-        for step in range(steps):
-            own = abs(width) * (1 - 0.75 * step / steps)
+        for k in range(steps):
+            own = abs(width) * (1 - 0.75 * k / steps)
             r = mean + away
             nodes.append(np.array([r * np.cos(angle), r * np.sin(angle)]))
             parent.append(before)
@@ -61,10 +131,35 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
             angle, away = angle + 0.25 * np.sign(width) / r, float(np.clip(away + 0.25 * lean, 0.8, 8.0))
             if own > 0.06 and rng.random() < 0.045:
                 fork = lean + rng.choice([-1, 1]) * rng.uniform(0.7, 1.3)
-                stems.append(
-                    (angle, away, fork, 0.65 * np.sign(width) * own, int(0.6 * (steps - step)), before)
-                )
+                stems.append((angle, away, fork, 0.65 * np.sign(width) * own, int(0.6 * (steps - k)), before))
     return Tree(np.stack(nodes), np.asarray(parent, np.int64), np.asarray(radius))
+
+
+def drawn_patty(rng: np.random.Generator, edge: Floats) -> Patty:
+    """A patty on the rim, along the opening's edge (A,) mm."""
+    around = float(rng.uniform(0, 2 * np.pi))
+    half = (float(rng.uniform(4.0, 8.0)), float(rng.uniform(2.0, 3.2)))
+    radius = edge_at(edge, around) + half[1] + float(rng.uniform(0.5, 2.0))
+    turn = around + np.pi / 2 + float(rng.uniform(-0.35, 0.35))
+    return Patty((radius * float(np.cos(around)), radius * float(np.sin(around))), turn, half)
+
+
+def with_patty(
+    patty: Patty, x: Map, y: Map, drawn: Sequence[Map], blood: float, colour: Map, bumps: Map
+) -> tuple[Map, Map]:
+    """Colour (r, n, 3) and bumps mm at x, y mm with a patty's felt, of noise (r, n), soaked at its edges."""
+    ragged, weave, stains = drawn
+    along, across, far = patty.placed(x, y)
+    far = far + 0.12 * ragged
+    cover = step(0.5 - far / 0.25)[..., None]
+    soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * stains, 0, 1.5)
+    felt = through(speckled(Cotton.felt, 0.06 * weave), soaked, Cotton.blood)
+    thread = (np.exp(-((across / 0.25) ** 4)) * (along > -patty.half[0] + 1))[..., None]
+    felt = felt * (1 - 0.8 * thread) + np.array(Cotton.thread, np.float32) * 0.8 * thread
+    near = np.exp(-np.maximum(far, 0) / 0.5)[..., None]
+    shaded = colour * (1 - 0.4 * near * (1 - cover))
+    rough = bumps * (1 - cover[..., 0]) + 0.03 * weave * cover[..., 0]
+    return np.asarray(over(shaded, felt, cover), np.float32), np.asarray(rough, np.float32)
 
 
 def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tuple[Floats, Ints, Floats]]:

@@ -2,105 +2,113 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from synth.job.schema import Family
 
 Colour = tuple[float, float, float]
+Ends = tuple[float, float]
 
 
-class Ranges(NamedTuple):
-    """What a family means: middle colours, linear RGB, and ranges of what `look.Look` documents."""
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """Middle colours, linear RGB, and ranges of what `look.Look` documents, in the order of drawing.
 
-    crown: Colour
-    flush: Colour
-    vein: Colour
-    wine: Colour
-    arterial: tuple[float, float]
-    capillary: tuple[float, float]
-    blush: tuple[float, float]
-    shade: tuple[float, float]
-    film_mm: tuple[float, float]
-    bump: tuple[float, float]
-    blood: tuple[float, float]
-    dura: Colour
-    beyond: Colour
+    Chosen by eye on intra-operative photographs; `evidence.render.realism` measures colours against one.
+    """
+
+    gyrus_albedo: Colour
+    perfused_albedo: Colour
+    vein_crest_albedo: Colour
+    vein_side_albedo: Colour
+    arterial_absorption: Ends
+    subpial_absorbance_per_mm: Ends
+    pial_absorbance: Ends
+    sulcus_shading: Ends
+    grain: Ends = (0.008, 0.02)
+    film_smoothing_mm: Ends
+    bump: Ends
+    roughness: Ends = (0.012, 0.02)
+    dry_roughness: Ends = (0.22, 0.34)
+    blood: Ends
+    dura_albedo: Colour
+    surroundings_albedo: Colour
 
 
 FAMILIES: dict[Family, Ranges] = {
     "healthy": Ranges(
-        crown=(0.95, 0.79, 0.49),
-        flush=(0.93, 0.57, 0.38),
-        vein=(0.34, 0.24, 0.3),
-        wine=(0.2, 0.045, 0.045),
-        arterial=(1.1, 1.5),
-        capillary=(1.4, 2.2),
-        blush=(0.3, 0.9),
-        shade=(0.3, 0.6),
-        film_mm=(0.035, 0.06),
+        gyrus_albedo=(0.95, 0.79, 0.49),
+        perfused_albedo=(0.93, 0.57, 0.38),
+        vein_crest_albedo=(0.34, 0.24, 0.3),
+        vein_side_albedo=(0.2, 0.045, 0.045),
+        arterial_absorption=(1.1, 1.5),
+        subpial_absorbance_per_mm=(1.4, 2.2),
+        pial_absorbance=(0.3, 0.9),
+        sulcus_shading=(0.3, 0.6),
+        film_smoothing_mm=(0.035, 0.06),
         bump=(0.8, 1.3),
         blood=(0.25, 0.75),
-        dura=(0.86, 0.6, 0.5),
-        beyond=(0.46, 0.07, 0.04),
+        dura_albedo=(0.86, 0.6, 0.5),
+        surroundings_albedo=(0.46, 0.07, 0.04),
     ),
     "hyperaemic": Ranges(
-        crown=(0.88, 0.52, 0.35),
-        flush=(0.80, 0.37, 0.26),
-        vein=(0.3, 0.2, 0.29),
-        wine=(0.16, 0.03, 0.035),
-        arterial=(1.3, 1.8),
-        capillary=(2.2, 3.2),
-        blush=(1.2, 2.2),
-        shade=(0.3, 0.6),
-        film_mm=(0.035, 0.06),
+        gyrus_albedo=(0.88, 0.52, 0.35),
+        perfused_albedo=(0.80, 0.37, 0.26),
+        vein_crest_albedo=(0.3, 0.2, 0.29),
+        vein_side_albedo=(0.16, 0.03, 0.035),
+        arterial_absorption=(1.3, 1.8),
+        subpial_absorbance_per_mm=(2.2, 3.2),
+        pial_absorbance=(1.2, 2.2),
+        sulcus_shading=(0.3, 0.6),
+        film_smoothing_mm=(0.035, 0.06),
         bump=(0.8, 1.3),
         blood=(0.5, 0.95),
-        dura=(0.82, 0.5, 0.42),
-        beyond=(0.46, 0.06, 0.04),
+        dura_albedo=(0.82, 0.5, 0.42),
+        surroundings_albedo=(0.46, 0.06, 0.04),
     ),
     "pale": Ranges(
-        crown=(0.92, 0.84, 0.67),
-        flush=(0.89, 0.74, 0.58),
-        vein=(0.42, 0.38, 0.48),
-        wine=(0.25, 0.09, 0.1),
-        arterial=(0.7, 1.0),
-        capillary=(0.6, 1.2),
-        blush=(0.1, 0.4),
-        shade=(0.2, 0.4),
-        film_mm=(0.04, 0.07),
+        gyrus_albedo=(0.92, 0.84, 0.67),
+        perfused_albedo=(0.89, 0.74, 0.58),
+        vein_crest_albedo=(0.42, 0.38, 0.48),
+        vein_side_albedo=(0.25, 0.09, 0.1),
+        arterial_absorption=(0.7, 1.0),
+        subpial_absorbance_per_mm=(0.6, 1.2),
+        pial_absorbance=(0.1, 0.4),
+        sulcus_shading=(0.2, 0.4),
+        film_smoothing_mm=(0.04, 0.07),
         bump=(0.7, 1.1),
         blood=(0.1, 0.45),
-        dura=(0.88, 0.7, 0.62),
-        beyond=(0.5, 0.13, 0.09),
+        dura_albedo=(0.88, 0.7, 0.62),
+        surroundings_albedo=(0.5, 0.13, 0.09),
     ),
     "oedematous": Ranges(
-        crown=(0.93, 0.80, 0.57),
-        flush=(0.89, 0.66, 0.48),
-        vein=(0.42, 0.35, 0.44),
-        wine=(0.25, 0.09, 0.09),
-        arterial=(0.8, 1.1),
-        capillary=(0.9, 1.5),
-        blush=(0.3, 0.7),
-        shade=(0.1, 0.25),
-        film_mm=(0.07, 0.12),
+        gyrus_albedo=(0.93, 0.80, 0.57),
+        perfused_albedo=(0.89, 0.66, 0.48),
+        vein_crest_albedo=(0.42, 0.35, 0.44),
+        vein_side_albedo=(0.25, 0.09, 0.09),
+        arterial_absorption=(0.8, 1.1),
+        subpial_absorbance_per_mm=(0.9, 1.5),
+        pial_absorbance=(0.3, 0.7),
+        sulcus_shading=(0.1, 0.25),
+        film_smoothing_mm=(0.07, 0.12),
         bump=(0.4, 0.8),
         blood=(0.2, 0.6),
-        dura=(0.87, 0.64, 0.55),
-        beyond=(0.46, 0.08, 0.05),
+        dura_albedo=(0.87, 0.64, 0.55),
+        surroundings_albedo=(0.46, 0.08, 0.05),
     ),
     "calf": Ranges(
-        crown=(0.81, 0.64, 0.50),
-        flush=(0.73, 0.48, 0.38),
-        vein=(0.24, 0.12, 0.13),
-        wine=(0.14, 0.035, 0.03),
-        arterial=(0.6, 1.0),
-        capillary=(0.4, 0.9),
-        blush=(0.3, 0.8),
-        shade=(0.4, 0.7),
-        film_mm=(0.03, 0.05),
+        gyrus_albedo=(0.81, 0.64, 0.50),
+        perfused_albedo=(0.73, 0.48, 0.38),
+        vein_crest_albedo=(0.24, 0.12, 0.13),
+        vein_side_albedo=(0.14, 0.035, 0.03),
+        arterial_absorption=(0.6, 1.0),
+        subpial_absorbance_per_mm=(0.4, 0.9),
+        pial_absorbance=(0.3, 0.8),
+        sulcus_shading=(0.4, 0.7),
+        film_smoothing_mm=(0.03, 0.05),
         bump=(1.0, 1.7),
         blood=(0.0, 0.04),
-        dura=(0.66, 0.54, 0.44),
-        beyond=(0.5, 0.36, 0.27),
+        dura_albedo=(0.66, 0.54, 0.44),
+        surroundings_albedo=(0.5, 0.36, 0.27),
     ),
 }

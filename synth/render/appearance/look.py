@@ -14,27 +14,28 @@ class Look:
     """One sequence's appearance; colours are linear RGB."""
 
     family: str
-    crown: Colour
-    """Reflectance of the gyri's crowns."""
-    flush: Colour
-    """Reflectance where more blood shines through."""
-    vein: Colour
-    """Reflectance of a thick vein along its crest, where its wall scatters blue."""
-    wine: Colour
-    """Reflectance of a thick vein at its sides."""
-    arterial: float
-    """Strength of the arteries' red."""
-    capillary: float
-    blush: float
-    """Blood in the pia, over sulci most."""
-    shade: float
-    """Darkening of the sulci."""
+    gyrus_albedo: Colour
+    """Of the crowns of gyri."""
+    perfused_albedo: Colour
+    """Of parenchyma where more blood shines through."""
+    vein_crest_albedo: Colour
+    """Of a thick vein along its crest, where its wall scatters blue."""
+    vein_side_albedo: Colour
+    """Of a thick vein at its sides."""
+    arterial_absorption: float
+    """Of the blood in arteries, as a multiple of `texture.Artery.absorption_per_mm`."""
+    subpial_absorbance_per_mm: float
+    """Optical depth (natural, green) of a millimetre of vessel under the pia [1/mm]."""
+    pial_absorbance: float
+    """Optical depth (natural, green) of the blood in the pia; over sulci most of it, over crowns little."""
+    sulcus_shading: float
+    """Optical depth of the sulci, as a multiple of `texture.Sulcus`'s."""
     grain: float
-    """Contrast of the parenchyma's finest mottling."""
-    film_mm: float
-    """Width of what the wet film evens out."""
+    """Contrast of the parenchyma's finest mottling, as a share of its albedo."""
+    film_smoothing_mm: float
+    """Standard deviation of what the wet film evens out [mm]."""
     bump: float
-    """Strength of the microstructure under the film."""
+    """Height of the microstructure under the film, as a multiple of `texture.Film.swell_mm`."""
     roughness: float
     """GGX alpha of the wet coat."""
     dry_roughness: float
@@ -43,9 +44,9 @@ class Look:
     """Refractive index of the film: 1.33 is water."""
     blood: float
     """How much blood lies on the rim, 0 to 1."""
-    dura: Colour
-    beyond: Colour
-    """What lies outside the dura: muscle, or the bone of a specimen."""
+    dura_albedo: Colour
+    surroundings_albedo: Colour
+    """Of what lies outside the dura: muscle, or the bone of a specimen."""
     cottonoid: bool
     """Whether a cotton patty lies on the rim."""
     scenery: tuple[str, ...]
