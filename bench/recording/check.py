@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
-from bench.recording.eye_pairing import LATE
 from bench.recording.folder import Force, Recording, open_recording
-from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
+from bench.recording.meta import Meta
 from bench.recording.second_eye import SecondEye, StereoQuality
 from bench.recording.tracking_picture import draw_tracking
 from synth.errors import UserError
@@ -83,7 +82,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         ("pictures", _check_film),
         ("times", _check_times),
         ("sensor", _check_sensor),
-        ("spans", _check_spans),
+        ("press", _check_press),
     ):
         try:
             check(recording, found)
@@ -146,7 +145,7 @@ def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
     found = [Finding("bad", "second eye", f"the second eye {stereo.fault}")] if stereo.fault else []
     if stereo.epipolar_px > _OTHER_ROWS_PX:
         found.append(Finding("bad", "second eye", f"its rows are {stereo.epipolar_px:.2g} px off"))
-    elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:
+    elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM:
         found.append(Finding("odd", "second eye", stereo.describe()))
     off = abs(np.log(stereo.mm_per_px / mm_per_px))
     if off > _OTHER_SCALE:
@@ -267,25 +266,11 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
         found.judge(share > 0.9 and not other, "clocks", said)
 
 
-def _check_spans(recording: Recording, found: _Checked) -> None:
-    """Whether the spans that calibrate are long enough, and in the record, before anything is computed."""
-    meta, times = recording.meta, found.time_s
-    if len(times) < 2:
-        return
-    rate = min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
-    clock = meta.sync.calibration_s if meta.sync.method == "correlate" else None
-    for part, name, span, frames in (
-        ("clocks", "sync.calibration_s", clock, LEAST_INTERVALS),
-        ("sensor", "sensor.turn_s", meta.sensor.turn_s, LEAST_TURNING),
-        ("press", "press_s", meta.press_s, _LEAST_PRESS),
-    ):
-        if span is not None:
-            inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
-            said = f"{name} holds {inside_s:.3g} s of video, {frames / rate:.3g} s are needed"
-            found.judge(inside_s >= frames / rate, part, said)
-    if clock is not None and recording.force is not None:
-        t, margin = recording.force.time_s, meta.sync.search_s
-        lacks = max(t[0] - (clock[0] - margin), (clock[1] + margin) - t[-1], 0.0)
-        if lacks > 0:
-            said = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
-            found.add("odd", "clocks", said)
+def _check_press(recording: Recording, found: _Checked) -> None:
+    """Whether the press is long enough. The searches for clock and axes say it of their own spans."""
+    span, times = recording.meta.press_s, found.time_s
+    if span is not None and len(times) > 1:
+        needed_s = _LEAST_PRESS / min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
+        inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
+        said = f"press_s holds {inside_s:.3g} s of video, {needed_s:.3g} s are needed"
+        found.judge(inside_s >= needed_s, "press", said)

@@ -1,4 +1,4 @@
-"""Whether the right eye's pictures are those of the right eye, and of the left eye's moments."""
+"""Whether the right eye's pictures are those of the right eye."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import cv2
 import numpy as np
 
 from synth.flow import image, mask_detection
-from synth.flow.estimator import Flags, Map, Rgb
+from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
 
-LATE = 0.22
-"""Share of the motion that the second eye doesn't show from which on it is of another moment."""
-_MOVED_PX = 0.5  # less says nothing of when
 _SAME = 0.2  # of the change of the left eye's picture: less is the same picture again
 _COPY = 0.03  # of the picture's own detail: two cameras' noise alone differs by more
 _FROZEN = 3  # frames
@@ -28,25 +25,14 @@ class EyePairing:
         self._last: tuple[Rgb, Rgb] | None = None
         self._copied, self._frozen, self._largest = True, 0, 0
         self._tool: tuple[Flags, Rgb, Rgb] | None = None
-        self._lags: list[float] = []
 
-    @property
-    def lag(self) -> float:
-        """Share of the motion that the right eye lacks, exceeded in a tenth of the frames that moved."""
-        return float(np.percentile(np.abs(self._lags), 90)) if self._lags else 0.0
-
-    def add(self, left: Rgb, right: Rgb, masked: Flags, flow: Map, tissue: Flags, lag: float) -> None:
-        """A frame's pictures (H, W, 3), its mask, and flow (H, W, 2) px since the rest frame, which is first.
-
-        `lag`: of `StereoTracker`.
-        """
+    def add(self, left: Rgb, right: Rgb, masked: Flags) -> None:
+        """A frame's pictures (H, W, 3) and its mask; the rest frame's first."""
         # A flat surface may look alike to both eyes, but not in every frame.
         self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
         if self._last is not None:
             before_left, before_right = self._last
             self._frozen += _change(right, before_right) < _SAME * _change(left, before_left)
-            if np.percentile(np.abs(flow[tissue]), 98) > _MOVED_PX:
-                self._lags.append(lag)
         self._last = left, right
         tool = masked & ~mask_detection.glare(left, 3)
         if tool.sum() > max(_LEAST_TOOL, self._largest):

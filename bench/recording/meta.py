@@ -37,13 +37,6 @@ def _must_not_fall(span: tuple[float, float]) -> tuple[float, float]:
 Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
-LEAST_INTERVALS = 20
-"""Frame intervals that `sync.calibration_s` must hold for the clocks to be lined up on it."""
-
-LEAST_TURNING = 20
-"""Frames that `sensor.turn_s` must hold for the sensor's rotation to be found on it."""
-
-
 class ScaleCalibration(Section):
     """How to find the scale when it isn't stated. Give one of the ways."""
 

@@ -9,7 +9,7 @@ from itertools import chain
 import cv2
 import numpy as np
 
-from bench.recording.eye_pairing import LATE, EyePairing
+from bench.recording.eye_pairing import EyePairing
 from bench.recording.eye_timing import EyeTiming
 from bench.recording.folder import Recording
 from synth.errors import UserError
@@ -41,9 +41,6 @@ class StereoQuality:
     """What a pixel of the recording spans at the tissue in the rest frame, by the second eye."""
     noise_mm: float
     """Median deviation of depth motion over the tissue, and over the frames looked at."""
-    lag: float = 0.0
-    """Share of the motion that the second eye doesn't show, exceeded in a tenth of the frames that moved: its
-    pictures are of another moment. 0 for a depth camera, which can't tell."""
     fault: str = ""
     """Why its pictures aren't the second eye's, of these moments; empty if nothing is wrong."""
 
@@ -53,8 +50,6 @@ class StereoQuality:
         if np.isnan(self.baseline_mm):
             return f"a depth camera; {noise}"
         rows = f"rows {self.epipolar_px:.2g} px off"
-        if self.lag > LATE:
-            rows += f", {100 * self.lag:.0f}% of the motion at another moment than the left eye's"
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 
@@ -86,9 +81,8 @@ class SecondEye:
             return StereoQuality(float("nan"), float("nan"), away / focal / self._shrink, noise)
         r, rest = self._stereo.rectified, self._stereo.rest
         scale = self._stereo.distance_mm / r.focal / self._shrink
-        lag, fault = self._pairing.lag, self._pairing.fault(r)
-        fault = fault or ("" if self._timing is None else self._timing.fault())
-        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag, fault)
+        fault = self._pairing.fault(r) or ("" if self._timing is None else self._timing.fault())
+        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, fault)
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
         """Motion in space of a frame since rest, None where the second eye's picture is missing.
@@ -107,7 +101,7 @@ class SecondEye:
                 self._pair = frame.rgb, right
                 hidden = _mask_right(right, video.settings.masks, masked)
                 self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
-                self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, 0.0)
+                self._pairing.add(frame.rgb, right, masked)
                 self._timing = EyeTiming(self._stereo, frame.rgb, right, tissue & ~masked)
                 inside = self._stereo.right_tissue()
                 self._camera = CameraTracker(right, inside, mask_detection.blocked(right))
@@ -120,7 +114,7 @@ class SecondEye:
             if view is not None:
                 hidden |= view.outside(tissue.shape)
             moved = self._stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
-            self._pairing.add(frame.rgb, right, masked, frame.flow, tissue, self._stereo.lag)
+            self._pairing.add(frame.rgb, right, masked)
             if self._timing is not None:
                 self._timing.add(frame.rgb, right, frame.time_s or 0.0)
         else:

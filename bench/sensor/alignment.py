@@ -58,7 +58,7 @@ def align_sensor(
     if force is None:
         notes.append("no force.csv: predictions only, nothing is scored")
         return AlignedSensor()
-    offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed, notes)
+    offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
     rotation = None
     if sensor.turn_s is not None:
         rotation = _find_rotation(force, sensor, offset_s, surface)
@@ -90,7 +90,7 @@ def describe_span(span: Span) -> str:
 
 
 def _find_offset(
-    force: Force, sensor: SensorMeta, sync: Sync, time_s: Curve, speed: Curve, notes: list[str]
+    force: Force, sensor: SensorMeta, sync: Sync, time_s: Curve, speed: Curve
 ) -> tuple[float, Offset | None]:
     """What to add to the sensor's times [s], and the search for it if there was one."""
     if sync.method == "clock":
@@ -102,12 +102,7 @@ def _find_offset(
     found = clock_sync.find_offset(
         time_s[inside], speed[inside], smooth.time_s, smooth.force_mn, sync.search_s
     )
-    if not found.refused:
-        return found.offset_s, found
-    notes.append(
-        f"clocks could not be aligned ({found.refused}): scored at the offset stated, {sync.offset_s:g} s"
-    )
-    return sync.offset_s, found
+    return sync.offset_s if found.refused else found.offset_s, found
 
 
 def _find_rotation(

@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from bench import bootstrap
-from bench.recording.meta import LEAST_TURNING
 
 Floats = NDArray[np.float64]
 
+_LEAST_TURNING = 20  # frames
 _FLAT = 0.1  # of the largest standard deviation of force: a direction with less is not known
 _EXPLAINED = 0.5  # share of the motion's variance
 _SURE_DEG = 15.0
@@ -57,12 +57,12 @@ def find_rotation(moved: Floats, seen: Floats, force_mn: Floats) -> SensorRotati
         force_mn: (T, 3) in the sensor's axes, tared; frames with NaN are left out.
 
     Returns:
-        The rotation, refused where there are fewer than `LEAST_TURNING`, the force keeps to a plane, less
+        The rotation, refused where there are fewer than `_LEAST_TURNING`, the force keeps to a plane, less
         than half of the motion is explained, or its angle is known to 15° only.
     """
     good = np.isfinite(force_mn).all(axis=1)
-    if good.sum() < LEAST_TURNING:
-        return _none(f"only {good.sum()} frames with force that could be followed, {LEAST_TURNING} needed")
+    if good.sum() < _LEAST_TURNING:
+        return _none(f"only {good.sum()} frames with force that could be followed, {_LEAST_TURNING} needed")
     force, shift = force_mn[good], _shift(moved[good], seen[good])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
     if spread[2] < _FLAT * spread[0] or not shift.any():

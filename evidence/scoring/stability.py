@@ -424,7 +424,7 @@ def _both_bumped(film: Film) -> Film:
 
 _UNSEEN, _AGAIN = "unseen world", "again"
 _MISSING = r"^pictures: .*missing|^clocks|^times"
-_LATE = "^second eye: .*(late|early|another moment)"
+_LATE = "^second eye: .*(late|early)"
 _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", np.s_[::-1]
 # How it is made, and what names its cause (a pattern; none: the answer is to hold).
 ONE_EYE: dict[str, tuple[Change, str]] = {
