@@ -22,8 +22,3 @@ def test_help_and_examples(spoken: Spoken) -> None:
         end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
         if not spoken.group:
             spoken.command.make_context(spoken.words[-1], typed[len(spoken.words) : end])
-
-
-def test_the_walk_reaches_every_program() -> None:
-    words = {spoken.words for spoken in SPOKEN}
-    assert {("synth", "render"), ("learn", "train"), ("bench", "score")} <= words

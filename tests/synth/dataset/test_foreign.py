@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import fake_work
 import foreign
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -51,23 +49,7 @@ def bad(dataset: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     "changes",
-    [
-        {"young_kpa": 0.0},
-        {"young_kpa": float("nan")},
-        {"young_kpa": "soft"},
-        {"young_kpa": True},
-        {"scale_mm_per_px": -1000.0},
-        {"frames": 10**9},
-        {"size": [64]},
-        {"size": [20_000, 20_000]},
-        {"index": "0"},
-        {"field_hashes": []},
-        {"scenario": {"gesture": "pull"}},
-        {"timings": {"render": None}},
-        {"format_version": [1] * 999},
-        {"format_version": 1},
-    ],
-    ids=str,
+    [{"young_kpa": float("nan")}, {"frames": 10**9}, {"scenario": {"gesture": "pull"}}, {"format_version": 1}],
 )
 def test_attributes_that_cant_be_right_are_refused_though_sealed(
     dataset: Path, changes: dict[str, Any]
@@ -85,13 +67,6 @@ def test_an_edited_attribute_is_refused_by_all_but_verify(dataset: Path) -> None
     assert "seal" in bad(dataset)
 
 
-def test_metadata_without_end_is_not_read(dataset: Path) -> None:
-    with (dataset / FIRST / "zarr.json").open("ab") as file:
-        file.truncate(10**10)
-    with pytest.raises(UserError, match="32,000,000"):
-        open_sequence(dataset / FIRST)
-
-
 def rows(dataset: Path) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = index.read_index(dataset).to_pylist()
     return found
@@ -104,17 +79,6 @@ def test_an_index_of_another_program(dataset: Path) -> None:
     assert "dataset" in bad(dataset)
 
 
-def test_a_flipped_bit_never_changes_the_index_unseen(pristine: Path, tmp_path: Path) -> None:
-    before, data = index.read_index(pristine), (pristine / index.NAME).read_bytes()
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        flipped = bytearray(data)
-        flipped[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
-        (tmp_path / index.NAME).write_bytes(flipped)
-        with suppress(UserError):
-            assert index.read_index(tmp_path).equals(before)
-
-
 def test_a_side_edited_in_the_index_is_found(dataset: Path) -> None:
     assert CliRunner().invoke(app, ["split", str(dataset), "--by", "sequence"]).exit_code == 0
     assert "splits" not in bad(dataset)
@@ -124,28 +88,21 @@ def test_a_side_edited_in_the_index_is_found(dataset: Path) -> None:
     assert "splits" in bad(dataset)
 
 
-@pytest.mark.parametrize("text", ["[]", '{"by": 7}', '{"shares": [1e999, 0, 0]}', "[" * 100_000, "\x00"])
+@pytest.mark.parametrize("text", ['{"by": 7}', "\x00"])
 def test_a_split_that_is_none(dataset: Path, text: str) -> None:
     (dataset / "split.json").write_text(text)
     with pytest.raises(UserError, match="split"):
         split.read_stored(dataset)
 
 
-@pytest.mark.parametrize(
-    "name", [".run", ".run/scratch", ".run/logs", ".run/failed", ".run/lock", "000009.zarr.part"]
-)
-def test_no_run_follows_a_link(dataset: Path, tmp_path: Path, name: str) -> None:
+def test_no_run_follows_a_link(dataset: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
-    (elsewhere / "scratch").mkdir(parents=True)
-    (elsewhere / "worker-1.log").write_text("mine")
-    place = dataset / name
-    if place.is_dir():
-        shutil.rmtree(place)
-    place.unlink(missing_ok=True)
-    place.symlink_to(elsewhere)
+    (elsewhere / "precious").mkdir(parents=True)
+    shutil.rmtree(dataset / ".run/scratch")
+    (dataset / ".run/scratch").symlink_to(elsewhere)
     with pytest.raises(UserError), claim(dataset, JOB):
         pass
-    assert sorted(path.name for path in elsewhere.rglob("*")) == ["scratch", "worker-1.log"]
+    assert (elsewhere / "precious").is_dir()
 
 
 def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from pathlib import Path
 
 from sources import imports
@@ -44,12 +43,3 @@ def test_rooms_that_a_sequence_is_made_with_are_counted_or_decide_no_value() -> 
     }
     deciding_none = {f"synth/{name}" for name in ("errors", "fields", "plugins", "system", "dataset")}
     assert made - deciding_none == set(provenance._MAKING)
-
-
-def test_the_generator_names_rooms_that_are_there_and_what_compiles_the_loops() -> None:
-    made_by = provenance.generator()
-    assert all((provenance.HOME / room / "__init__.py").is_file() for room in provenance._MAKING)
-    assert (provenance.HOME / "synth/sequence/pipeline.py").is_file()
-    for name in ("numpy", "numba", "llvmlite"):
-        assert made_by[name] == metadata.version(name)
-    assert provenance.fingerprint() == provenance.word(dict(reversed(made_by.items())))
