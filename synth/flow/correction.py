@@ -33,11 +33,22 @@ from synth.system.jit import vectorised
 WEIGHTS = Path(__file__).with_name("correction.pt")
 CELL = 4
 """Pixels a side that are one cell."""
-CHANNELS = 24
-VECTORS = ((4, 5), (7, 8), (10, 11), (13, 14), (22, 23))
-"""Channels that are x and y of a vector: a picture that is mirrored or turned changes them."""
-_MULTIPLE = 8  # cells a side that the network's levels need
 _WINDOWS = 3, 7  # cells a side
+_STEPS = [f"{of} {n} {part}" for of in ("grey", "colour") for n in _WINDOWS for part in ("x", "y", "known")]
+FEATURES = (
+    *("visible in both", "visible now", "usable at rest", "residual", *_STEPS, "red", "green", "blue"),
+    *("light at rest", "light now", "agreement", "flow x", "flow y"),
+)
+"""Channels that the network takes, in the order that its weights are bound to."""
+CHANNELS = len(FEATURES)
+VECTORS = tuple((k, k + 1) for k, name in enumerate(FEATURES) if name.endswith(" x"))
+"""Channels that are x and y of a vector: a picture that is mirrored or turned changes them."""
+PRODUCTS = ("1", "gx", "gy", "r", "gx gx", "gx gy", "gx r", "gy gy", "gy r", "r r")
+"""Planes of `sum_cells` of greys, then of colours: g the gradient of both pictures' mean, r their change."""
+LIGHTS = ("red", "green", "blue", "luminance")
+"""Planes of `sum_cells` of the rest frame after those, then of the frame now."""
+_PRODUCTS, _LIGHTS, _LUMINANCE = len(PRODUCTS), len(LIGHTS), LIGHTS.index("luminance")
+_MULTIPLE = 8  # cells a side that the network's levels need
 _WIDTHS = 20, 32, 48
 _LEAST = 0.02  # squared gradients a pixel: windows of less contrast say nothing
 _FARTHEST_PX = 2.0  # no step of a linear equation is believed beyond
@@ -95,7 +106,7 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
 
     Args:
         net: the network.
-        features: (24, h, w), see `describe`.
+        features: (CHANNELS, h, w), see `describe`.
         flow: (H, W, 2) px, the one described.
     """
     height, width = flow.shape[:2]
@@ -123,7 +134,7 @@ def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:
 def describe(
     rest: Rgb, now: Rgb, rest_usable: Flags, greys: tuple[Map, Map], seen: Map, flow: Flow, agreed: Map
 ) -> NDArray[np.float32]:
-    """What the network sees of a frame and its flow: (24, h, w) float32 on cells of 4 x 4 px.
+    """The `FEATURES` of a frame and its flow: (CHANNELS, h, w) float32 on cells of 4 x 4 px.
 
     Args:
         rest: (H, W, 3) uint8.
@@ -140,19 +151,20 @@ def describe(
     y = v + np.arange(height, dtype=np.float32)[:, None]
     there = cv2.remap(now, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     mask = seen * rest_usable
-    sums = np.empty((28, -(-height // CELL), -(-width // CELL)), np.float32)
+    sums = np.empty((2 * (_PRODUCTS + _LIGHTS), -(-height // CELL), -(-width // CELL)), np.float32)
     colours = np.stack([cv2.split(picture) for picture in (rest, there)])
     sum_cells(colours, np.stack(greys), mask, sums)
-    products, lights = sums[:20], sums[20:].reshape(2, 4, *sums.shape[1:]) / (CELL * CELL)
+    products, lights = np.split(sums, [2 * _PRODUCTS])
+    lights = lights.reshape(2, _LIGHTS, *sums.shape[1:]) / (CELL * CELL)
     m, seen, usable, agreed, u, v = means(mask, seen, rest_usable, agreed, u, v)
     area = np.maximum(m, 0.05)
-    before, after = lights[:, :3] / area + _OFFSET
+    before, after = lights[:, :_LUMINANCE] / area + _OFFSET
     change = (m > 0) * np.log(after / before)
     common = np.median(change[:, m > 0.5], axis=1) if (m > 0.5).any() else np.zeros(3)
     change = 3 * np.clip(change - common[:, None, None] * (m > 0), -1, 1)
-    light = 0.5 * np.log1p(lights[:, 3]) - 2
-    steps = np.stack([_steps(products, side) for side in _WINDOWS], 1).reshape(12, *m.shape)
-    left = np.minimum(products[9] / (CELL * CELL * area), 4)
+    light = 0.5 * np.log1p(lights[:, _LUMINANCE]) - 2
+    steps = np.stack([_steps(products, side) for side in _WINDOWS], 1).reshape(-1, *m.shape)
+    left = np.minimum(products[PRODUCTS.index("r r")] / (CELL * CELL * area), 4)
     rows = [m, seen, usable, left, *steps, *change, *light, agreed, 0.25 * u, 0.25 * v]
     return np.stack(rows).astype(np.float32)
 
@@ -171,11 +183,11 @@ def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
 def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
     """Lucas and Kanade's steps x, y [px] over windows of `side` cells, and how well they are known.
 
-    Of products (20, h, w), those of `sum_cells`; (2, 3, h, w), by greys and by colours.
+    Of two `PRODUCTS` (20, h, w) of `sum_cells`; (2, 3, h, w), by greys and by colours.
     """
     around = np.empty_like(products)
     kernels.box_into(products, (0,) * side, around)
-    around = around.reshape(2, 10, *products.shape[1:]).swapaxes(0, 1)
+    around = around.reshape(2, _PRODUCTS, *products.shape[1:]).swapaxes(0, 1)
     inside = cv2.boxFilter(np.ones_like(products[0]), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     # Windows that see less than a pixel a cell say less.
     gx, gy, r, xx, xy, xr, yy, yr = around[1:9] * (inside / np.maximum(around[0] * inside, 1))
@@ -192,13 +204,12 @@ def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[np.float32]) -> None:
     """Sums over cells of two aligned pictures (2, 3, H, W) and their greys (2, H, W) into `sums` (28, h, w).
 
-    Of the greys, then of green against red, which shading leaves alone: 1, g_x, g_y, r, g_x², g_x g_y, g_x r,
-    g_y², g_y r, r² where the mask (H, W) is, g being the gradient of both pictures' mean, r their difference.
-    Of rest, then of now: red, green, blue where the mask is, and luminance; a cell repeats the border.
+    `PRODUCTS` of the greys, then of green against red, which shading leaves alone, where the mask (H, W) is;
+    `LIGHTS` of rest, then of now, colours where the mask is. A cell repeats the border.
     """
     height, width = mask.shape
     total, left = np.empty((2, height, width + 2), np.float32), np.empty((2, height, width), np.float32)
-    line, lines = np.empty((2, width), np.float32), np.empty((28, sums.shape[2] * CELL), np.float32)
+    line, lines = np.empty((2, width), np.float32), np.empty((len(sums), sums.shape[2] * CELL), np.float32)
     one, weighed = np.ones((4, width), np.float32), np.empty(width, np.float32)
     for y in range(height):
         for tone in range(2):
@@ -221,7 +232,7 @@ def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[n
                     one[1, x] = _QUARTER * (total[tone, at, x + 2] - total[tone, at, x])
                     one[2, x] = _QUARTER * (total[tone, below, x + 1] - total[tone, above, x + 1])
                     one[3, x] = left[tone, at, x]
-                k = 10 * tone
+                k = _PRODUCTS * tone
                 for i in range(4):
                     for x in range(width):
                         weighed[x] = mask[at, x] * one[i, x]
@@ -230,12 +241,13 @@ def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[n
                             lines[k, x] += weighed[x] * one[j, x]
                         k += 1
             for k in range(2):
+                first = 2 * _PRODUCTS + _LIGHTS * k
                 for i in range(3):
                     for x in range(width):
-                        lines[20 + 4 * k + i, x] += mask[at, x] * colours[k, i, at, x]
-                        lines[23 + 4 * k, x] += GREY[i] * colours[k, i, at, x]
-        for k in range(28):
-            if k >= 20:
+                        lines[first + i, x] += mask[at, x] * colours[k, i, at, x]
+                        lines[first + _LUMINANCE, x] += GREY[i] * colours[k, i, at, x]
+        for k in range(len(sums)):
+            if k >= 2 * _PRODUCTS:
                 lines[k, width:] = lines[k, width - 1]
             for column in range(sums.shape[2]):
                 sums[k, row, column] = lines[k, column * CELL]

@@ -20,19 +20,25 @@ from synth.flow import correction
 from synth.flow.stereo.depth_motion import Change, Map, Solver
 
 WEIGHTS = Path(__file__).with_name("depth_correction.pt")
-CHANNELS = 13
-VECTORS = ((2, 3),)
+_WINDOWS = 1, 3  # cells a side
+_STEPS = [f"{part} over {side}" for side in _WINDOWS for part in ("step", "precision")]
+FEATURES = (
+    *("visible in both", "tissue", "motion x", "motion y", "motion away", *_STEPS),
+    *("plate's deviation", "misfit", "flow's deviation", "strain"),
+)
+"""Channels that the network takes, in the order that its weights are bound to."""
+CHANNELS = len(FEATURES)
+VECTORS = ((FEATURES.index("motion x"), FEATURES.index("motion y")),)
 """Channels that are x and y of a vector, as in `synth.flow.correction`."""
 UNIT_MM = 0.1
 """Of what the network says."""
 _FARTHEST_MM = 0.5  # no step of a linear equation is believed beyond
-_WINDOWS = 1, 3  # cells a side
 
 
 def describe(
     change: Change, solver: Solver, flow: Map, seen: Map, spread: Map, px_per_mm: float, mm_per_px: float
 ) -> NDArray[np.float32]:
-    """What the network sees of a frame: (13, h, w) float32 on the solver's cells.
+    """The `FEATURES` of a frame: (CHANNELS, h, w) float32 on the solver's cells.
 
     Args:
         change: of the solver.
