@@ -49,7 +49,12 @@ def bad(dataset: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"young_kpa": float("nan")}, {"frames": 10**9}, {"scenario": {"gesture": "pull"}}, {"format_version": 1}],
+    [
+        {"young_kpa": float("nan")},
+        {"frames": 10**9},
+        {"scenario": {"gesture": "pull"}},
+        {"format_version": 1},
+    ],
 )
 def test_attributes_that_cant_be_right_are_refused_though_sealed(
     dataset: Path, changes: dict[str, Any]
