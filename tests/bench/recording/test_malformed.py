@@ -21,6 +21,14 @@ def text(name: str, content: str) -> Spoil:
     return lambda folder: (folder / name).write_text(content) and None
 
 
+def rows(change: Callable[[list[str]], list[str]]) -> Spoil:
+    def spoil(folder: Path) -> None:
+        lines = (folder / "force.csv").read_text().splitlines()
+        (folder / "force.csv").write_text("\n".join([lines[0], *change(lines[1:])]) + "\n")
+
+    return spoil
+
+
 def cut_video(folder: Path) -> None:
     shutil.rmtree(folder / "frames")
     (folder / "frames.csv").unlink()
@@ -31,11 +39,17 @@ def cut_video(folder: Path) -> None:
 
 HEAD = "t_s,fx_n,fy_n,fz_n\n"
 CASES: dict[str, Spoil] = {
+    "no meta": lambda folder: (folder / "meta.yaml").unlink(),
     "meta is not yaml": text("meta.yaml", "a: [1\nb: 2"),
+    "pictures of two sizes": lambda folder: cv2.imwrite(str(folder / "frames/0003.png"), texture(50, 128)),
     "video cut off": cut_video,
     "frame times run back": text("frames.csv", "frame,t_s\n0,0\n1,5\n2,3\n3,4\n4,6\n"),
+    "force column missing": text("force.csv", "t_s,fx_n\n0,0\n"),
     "force all nan": text("force.csv", HEAD + "0,nan,nan,nan\n1,nan,nan,nan\n"),
-    "sensor clock elsewhere": text("force.csv", HEAD + "".join(f"{1e9 + k},0.1,0,0\n" for k in range(90))),
+    "an axis is empty": text("force.csv", HEAD + "0,1,,2\n0.1,1,,2\n0.2,1,,2\n"),
+    "force in millinewtons": rows(lambda lines: [f"{k / 100},{k * 90},0,0" for k in range(90)]),
+    "sensor clock in ms": rows(lambda lines: [f"{k * 10},0.1,0,0" for k in range(90)]),
+    "sensor clock elsewhere": rows(lambda lines: [f"{1e9 + k},0.1,0,0" for k in range(90)]),
 }
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fake_model
 import foreign
 import pytest
 import zarr
+from typer.testing import CliRunner
 
+from learn.cli import app
 from learn.data.clips import load_clips
 from learn.data.grid import Grid
 from synth.errors import UserError
@@ -53,6 +57,33 @@ def test_what_is_not_as_sealed_is_not_trained_on(
     harm(own / "000002.zarr")
     with pytest.raises(UserError, match=rf"000002\.zarr: .*{key}"):
         load_clips(own, GRID, ("ideal",), cache=tmp_path / "cache")
+
+
+def test_nor_is_it_predicted_on(own: Path, tmp_path: Path) -> None:
+    model = fake_model.write_model(tmp_path / "model")
+    another_flow(own / "000002.zarr")
+    words = ["predict", str(model), str(own / "000002.zarr"), "--input", "ideal", "-o", str(tmp_path / "f")]
+    done = CliRunner().invoke(app, words)
+    assert (done.exit_code, len(done.stderr.splitlines())) == (2, 1), done.output
+    assert not (tmp_path / "f").exists()
+
+
+def test_a_copied_hash_poisons_no_cache(own: Path, tmp_path: Path) -> None:
+    """A store that claims the hash of another is refused, before and after that one is in the cache."""
+    cache = tmp_path / "cache"
+    load_clips(own, GRID, ("ideal",), cache=cache)
+    attrs = json.loads((own / "000000.zarr/zarr.json").read_text())["attributes"]
+    foreign.edit_attributes(own / "000005.zarr", reseal=False, content_hash=attrs["content_hash"])
+    for place in (cache, tmp_path / "fresh"):
+        with pytest.raises(UserError, match=r"000005\.zarr"):
+            load_clips(own, GRID, ("ideal",), cache=place)
+    # All attributes of the other, seals too, over values of its own: the values tell.
+    foreign.write_attributes(own / "000005.zarr", attrs, reseal=False)
+    for path in own.glob("00000[!5].zarr"):
+        shutil.rmtree(path)
+    with pytest.raises(UserError):
+        load_clips(own, GRID, ("ideal",), cache=tmp_path / "empty")
+    assert not (tmp_path / "empty").exists()
 
 
 def flipped(folder: Path) -> None:
