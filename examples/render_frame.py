@@ -20,7 +20,7 @@ def push(load: float = 0.3) -> synth.Scene:
             "seed": 4,
             "frames": 5,
             "anatomy": {"vertices": 6000},
-            "light": {"kelvin": 4200, "main": 0.6},
+            "light": {"main": 0.6},
             "fem": {"gestures": ["push"], "load": load, "young_kpa": 1.0, "tets": 1000},
             "render": {"size": [320, 240], "tilt_deg": 15, "field_mm": 34},
         }

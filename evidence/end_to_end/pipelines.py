@@ -22,11 +22,11 @@ from synth.dataset import location
 from synth.dataset.folder import write_whole
 from synth.dataset.store import Sequence, open_sequence
 from synth.flow import mask_detection
-from synth.flow.estimator import Estimator
+from synth.flow.estimator import Estimator, create
 from synth.flow.track import track
 from synth.job import identity
 from synth.job.schema import FemSection, FlowSection, Job, RenderSection
-from synth.sequence import pipeline, scene
+from synth.sequence import pipeline
 
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
 _MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
@@ -156,8 +156,7 @@ class Sequences:
         began = time.process_time()
         hidden = mask_detection.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
         masks_s = time.process_time() - began
-        estimator = scene.estimator(self._job.flow.model_copy(update={"backend": flow}))
-        recovered, flow_s = recover_flow(sequence, clip, estimator, hidden, GRID)
+        recovered, flow_s = recover_flow(sequence, clip, create(flow), hidden, GRID)
         spent = (masks_s + flow_s) / (clip.frames - 1)
         write_whole(self._flow_cost(index, flow), str(spent), durable=False)
         return recovered

@@ -38,12 +38,12 @@ _LIGHTS: dict[str, Settings] = {
     "few highlights": {"light": {"glare": 0.0}},
     "many highlights": {"light": {"glare": 0.8}},
     "tilted lamp": {"light": {"tilt_deg": 30.0, "main": 0.9}},
-    "3000 K": {"light": {"kelvin": 3000.0, "even": 0.22}},
+    "narrow spot": {"light": {"even": 0.22}},
 }
 _CAMERAS: dict[str, Settings] = {
     "default": {},
     "noisy": {"sensor": {"full_well": 900.0, "read_noise": 25.0, "sharpening": 1.2}},
-    "one chip": {"sensor": {"bayer": True}},
+    "soft": {"sensor": {"blur_px": 1.2}},
     "wide": {"render": {"field_mm": 46.0, "tilt_deg": 28.0, "distortion": (-0.25, 0, 0, 0, 0)}},
 }
 _SCENERY: dict[str, Kind] = {

@@ -104,9 +104,9 @@ class Folder:
     def sweep(self, index: int) -> None:
         """Removes what an attempt at `index` left behind."""
         sealed = location.store(self.root, index)
-        for leftover in (sealed.with_name(f"{sealed.name}.part"), self.root / "radiance" / f"{index:06d}"):
-            if leftover.exists() and not sealed.exists():
-                shutil.rmtree(leftover)
+        leftover = sealed.with_name(f"{sealed.name}.part")
+        if leftover.exists() and not sealed.exists():
+            shutil.rmtree(leftover)
 
     def sweep_all(self) -> None:
         """Removes every leftover of interrupted attempts."""
@@ -116,9 +116,6 @@ class Folder:
         parts = (part for place in places for part in place.glob(f".*{checked_file.PART}"))
         for file in (*parts, *self.logs.glob("worker-*.log")):
             file.unlink()
-        for radiance in self.root.glob("radiance/[0-9]*"):
-            if radiance.name.isascii() and radiance.name.isdigit():
-                self.sweep(int(radiance.name))
 
     def pass_turn(self) -> None:
         """Ends what other machines still do for an earlier run: they look at the turn."""
@@ -133,9 +130,8 @@ class Folder:
         """Removes the traces of a run that finished nothing."""
         for name in (_NAME, "job.yaml", "index.parquet"):
             (self.root / name).unlink(missing_ok=True)
-        for own in (self.state, self.root / "radiance"):
-            if own.exists():
-                shutil.rmtree(own)
+        if self.state.exists():
+            shutil.rmtree(self.state)
 
 
 @contextmanager
@@ -209,8 +205,8 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
 
 def _refuse_links(folder: Folder) -> None:
     """A link where a run writes or sweeps leads it elsewhere."""
-    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"), folder.root / "radiance")
-    for place in (*own, *folder.root.glob("radiance/*"), *folder.root.glob("*.zarr.part")):
+    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
+    for place in (*own, *folder.root.glob("*.zarr.part")):
         if place.is_symlink():
             raise UserError(f"{place}: is a link, which is not followed; remove it")
 

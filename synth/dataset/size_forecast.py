@@ -92,8 +92,7 @@ def estimate(job: Job) -> float:
     total = sum(
         field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.stored_fields
     )
-    radiance = 6.0 * width * height * job.frames if job.render.exr else 0.0
-    return _MARGIN * (total + radiance)
+    return _MARGIN * total
 
 
 def estimate_memory(job: Job) -> float:

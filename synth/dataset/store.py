@@ -47,17 +47,13 @@ class Writer:
         """
         self.path = location.store(folder, index)
         self._part = self.path.with_name(f"{self.path.name}.part")
-        self._exr = folder / "radiance" / f"{index:06d}"
         self._frames, self._size = frames, size
-        for stale in (self._part, self._exr):
-            if stale.exists():
-                shutil.rmtree(stale)
+        if self._part.exists():
+            shutil.rmtree(self._part)
         self._group = zarr.create_group(str(self._part), zarr_format=3)
         self._writers: dict[str, _FieldWriter] = {}
         self._wanted = job.stored_fields
         self._half = job.store.flow == "float16"
-        self._exr_hash = hashlib.blake2b(digest_size=16)
-        self._exr_frames = 0
         self._own = {
             "format": FORMAT,
             "format_version": STORE,
@@ -94,20 +90,6 @@ class Writer:
         if self.wants(name):
             self._writer(name).append(t, array)
 
-    def put_exr(self, t: int, radiance: NDArray[np.floating]) -> None:
-        """Writes the linear picture of frame `t`, (H, W, 3), as `radiance/NNNNNN/TTTT.exr` in half floats."""
-        import OpenEXR
-
-        if not np.isfinite(radiance).all():
-            raise NotFinite(f"radiance, frame {t}: not finite")
-        self._exr.mkdir(parents=True, exist_ok=True)
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        file = self._exr / f"{t:04d}.exr"
-        with OpenEXR.File(header, {"RGB": np.ascontiguousarray(radiance, np.float16)}) as exr:
-            exr.write(str(file))
-        self._exr_hash.update(file.read_bytes())
-        self._exr_frames += 1
-
     def seal(self, **attributes: Any) -> Path:
         """Finishes the store: checks that every field is whole, adds attributes and hashes, renames.
 
@@ -124,8 +106,6 @@ class Writer:
             if written.filled != written.shape[0]:
                 raise ValueError(f"{name}: {written.filled} of {written.shape[0]} frames were written")
         hashes = {name: self._writers[name].hash.hexdigest() for name in FIELDS if name in self._writers}
-        if self._exr_frames:
-            hashes["radiance"] = self._exr_hash.hexdigest()
         summary: dict[str, Any] = {key: self._writers[name].largest for name, key in _PEAKS.items()}
         if self._half:
             rounded = {name: one.rounding for name, one in self._writers.items() if FIELDS[name].half}

@@ -19,6 +19,10 @@ from synth.geometry.triangles import Shape
 
 Floats = NDArray[np.float64]
 
+HEART_HZ, BREATH_HZ = (1.0, 1.7), (0.2, 0.35)
+"""Beats and breaths a second, of an adult at rest: 60 to 102 and 12 to 21 a minute. On the exposed brain
+their peaks lie at 1 and 0.2 Hz (Faria et al., Med. Phys. 41, 2014)."""
+
 _SECOND = 0.4  # share of twice the heart's rate: a steep rise and a slow fall
 _PEAK_TO_PEAK = 2.4293  # what that wave spans
 _MIDDLE = 0.25  # part of the opening's radius over which its motion is meant

@@ -45,9 +45,9 @@ def identify_anatomy(job: Job, seed: int) -> str:
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
 
 
-def identify_opening(job: Job, anatomy: int) -> str | None:
+def identify_opening(job: Job, index: int) -> str | None:
     """Which place of a user's brain a sequence shows, across datasets; None of a procedural one."""
-    where = job.anatomy.opened(anatomy).craniotomy
+    where = job.anatomy.opened(index).craniotomy
     if job.anatomy.mesh is None or where.point is None:
         return None
     return f"{identify_anatomy(job, 0)} at " + ", ".join(f"{value:g}" for value in where.point)

@@ -82,18 +82,14 @@ class MembraneSection(Section):
 class PulseSection(Section):
     """Heart and breath: the exposed surface rises and falls, by a pressure from below. Default: it is still.
 
-    Amplitudes are of the middle of the opening, peak to peak, drawn uniformly as the rates are. In a patient
-    below 0.8 mm, with peaks at 0.2 and 1 Hz (Faria et al., Med. Phys. 41, 2014).
+    Amplitudes are of the middle of the opening, peak to peak, drawn uniformly; in a patient they are below
+    0.8 mm (Faria et al., Med. Phys. 41, 2014). Rates are drawn from those of adults at rest.
     """
 
     heart_mm: Range[NonNegative] = (0.0, 0.0)
     """Motion with the heart [mm]."""
-    heart_hz: Range[Positive] = (1.0, 1.7)
-    """Heart beats a second."""
     breath_mm: Range[NonNegative] = (0.0, 0.0)
     """Motion with the breath [mm]."""
-    breath_hz: Range[Positive] = (0.2, 0.35)
-    """Breaths a second."""
 
 
 Skulls = Annotated[
@@ -143,9 +139,6 @@ class FemSection(Section):
     instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
     """Instruments as asked, the first ones of `instruments` (there are at least so many): a list of {gesture,
     place, direction, load, force_mn, footprint_mm, timing}, each of them drawn where it is left out."""
-    contact_region_radius_mm: Positive | None = None
-    """What is loaded keeps within this radius of the opening's middle [mm], such as what the camera sees of a
-    wide opening; places of an `instrument_list` count as they are. Empty: anywhere in the opening."""
     max_tilt_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
     time: Literal["quasi-static", "dynamic"] = "quasi-static"

@@ -19,8 +19,6 @@ class LightSection(Section):
     """Angle between main lamp and optical axis, 0-40, to any side. Empty: at most 6.5, as `glare` asks."""
     main: Range[Share] = (0.5, 0.68)
     """Share of light from the main lamp; the rest comes from one across the lens."""
-    kelvin: Range[Annotated[FiniteFloat, Field(ge=2000, le=12_000)]] = (4200.0, 5600.0)
-    """Colour temperature [K], 2000-12000."""
     even: Range[Positive] = (0.35, 0.5)
     """Radius of the evenly lit spot, in widths of the field; beyond it the light falls off."""
 
@@ -46,8 +44,6 @@ class SensorSection(Section):
     scale. Empty: those of the same camera."""
     sharpening: Range[NonNegative] = (0.15, 0.4)
     """Unsharp mask, as a share of the detail."""
-    bayer: bool = False
-    """One colour a pixel (RGGB), the others interpolated; else three chips."""
     chroma: Literal["4:4:4", "4:2:2", "4:2:0"] = "4:4:4"
     """Colour resolution in the video stream: full, half across, half across and down."""
     bitrate_mbps: Positive | None = None
@@ -86,13 +82,9 @@ class RenderSection(Section):
     place of field_mm and distortion, and sets the principal point."""
     drift_mm: Range[NonNegative] = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
-    vibration_mm: Range[NonNegative] = (0.0, 0.0)
-    """Vibration of the microscope at 4-14 Hz, standard deviation [mm]; it is part of the flow."""
     stereo_mm: NonNegative = 0.0
     """Distance of a second lens to the right [mm], for a stereo dataset: its pictures, and motion in three
     dimensions, true and recovered; 0: there is none."""
-    exr: bool = False
-    """Also write the linear radiance of every frame as EXR."""
     tool: bool = True
     """Show the instrument."""
     scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()

@@ -40,7 +40,7 @@ class CraniotomySection(Section):
     radius_mm: Positive = 12.0
     """Radius of the opening [mm]."""
     also: Annotated[tuple[PlaceSection, ...], Field(max_length=100)] = ()
-    """Further places on the same mesh, each with point and direction: anatomies take them in turn, the first
+    """Further places on the same mesh, each with point and direction: sequences take them in turn, the first
     being `point`. `synth split --by opening` then tells openings apart, though not brains."""
 
 
@@ -55,8 +55,6 @@ class AttachmentSection(Section):
     """Of a sheet (falx, tentorium) through the middle, in the same axes. Empty: a ball."""
     thickness_mm: Positive = 3.0
     """Thickness of a sheet [mm]."""
-    firm_per_mm: Positive = 2.0
-    """Traction per displacement as a multiple of E, per mm; the skull's is 2."""
 
 
 class AnatomySection(Section):
@@ -66,8 +64,6 @@ class AnatomySection(Section):
     """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: a procedural block."""
     fill_holes: bool = False
     """Whether holes of the mesh are closed, each by a fan of triangles. What can't be closed is refused."""
-    variety: Annotated[int, Field(ge=1)] | None = None
-    """Number of distinct anatomies in the dataset. Empty: every sequence has its own."""
     dome_mm: Positive = 70.0
     """Procedural block: radius of curvature of the brain surface [mm]."""
     gyrus_mm: Range[Positive] = (10.0, 15.0)
@@ -81,7 +77,7 @@ class AnatomySection(Section):
     """Where the skull is open."""
     attachments: tuple[AttachmentSection, ...] = ()
     """Regions in which the tissue is held inside, such as the falx: a list of {point, radius_mm, normal,
-    thickness_mm, firm_per_mm}, normal for a sheet. Empty: the skull alone holds it."""
+    thickness_mm}, normal for a sheet. Empty: the skull alone holds it."""
 
     @model_validator(mode="after")
     def _mesh_is_placed(self) -> AnatomySection:
@@ -91,12 +87,12 @@ class AnatomySection(Section):
             raise ValueError("craniotomy.also is for a mesh; a procedural block is opened in its middle")
         return self
 
-    def opened(self, number: int) -> AnatomySection:
-        """The section with the place that anatomy `number` is opened at as its only one."""
+    def opened(self, index: int) -> AnatomySection:
+        """The section with the place that sequence `index` is opened at as its only one."""
         where = self.craniotomy
         if not where.also:
             return self
-        turn = number % (len(where.also) + 1)
+        turn = index % (len(where.also) + 1)
         place = where if turn == 0 else where.also[turn - 1]
         moved = {"point": place.point, "direction": place.direction, "also": ()}
         return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
@@ -123,8 +119,6 @@ class FlowSection(Section):
 
     backend: Annotated[PlugInName, AfterValidator(ESTIMATORS.check_name)] = "tvl1"
     """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
-    warps: Annotated[int, Field(ge=1, le=12)] = 3
-    """tvl1: half the linearisations a level."""
 
 
 def _among(known: tuple[str, ...]) -> AfterValidator:
@@ -160,12 +154,6 @@ class CardSection(Section):
     """Licence under which you share it, as an SPDX name. Empty: none is given."""
     authors: tuple[str, ...] = ("made with Sulcus, maker not named",)
     """Who made it."""
-    contact: str | None = None
-    """Where questions go."""
-    url: str | None = None
-    """Where the dataset is to be found."""
-    published: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")] | None = None
-    """Date of publication, in quotes: "2027-01-31"."""
 
 
 class Job(Section):

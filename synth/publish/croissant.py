@@ -20,7 +20,7 @@ _CONTEXT = (
     Path(__file__).parent / "croissant_context.json"
 )  # as the specification gives it, and the prefix rai
 
-STATED = {"creator": "authors", "license": "licence", "url": "url", "datePublished": "published"}
+STATED = {"creator": "authors", "license": "licence"}
 """What only a person can say, and the key of the job's `card` that says it."""
 
 _TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:Text"}

@@ -38,11 +38,11 @@ def build(job: Job, case: Scenario) -> tuple[CortexSurface, Tets]:
 def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
     """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
 
-    Sequences that share an anatomy (`anatomy.variety`) share these: their arrays are read-only.
+    They are cached, so their arrays are read-only.
     """
     written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
     return _cortex(
-        job.anatomy.opened(case.anatomy), case.relief, written and (written.st_mtime_ns, written.st_size)
+        job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
     )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Writer
 from synth.fields import FIELDS
 from synth.flow import mask_detection, track
+from synth.flow.estimator import create
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
@@ -22,7 +23,7 @@ from synth.render.camera.camera import Camera
 from synth.sequence import mechanics, scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scenario import Scenario
-from synth.sequence.scene import Scene, estimator, simulate
+from synth.sequence.scene import Scene, simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 # Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
@@ -131,8 +132,6 @@ def _render_frames(task: _Task) -> list[_Video]:
             for name in names:
                 writer.put_frame(name, t, made[name] if name in made else getattr(frame, name))
             writer.put_frame("traction", t, frame.traction)
-            if job.render.exr:
-                writer.put_exr(t, frame.radiance)
         for video, (rgb, tool) in zip(videos, lenses, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
         poses[t] = frame.camera.pose
@@ -164,7 +163,7 @@ def _recover_flow(task: _Task, video: _Video) -> Track:
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
         tissue = task.scene.tissue
-        recovered = track.recover_flow(video.rgb, video.tools, tissue, estimator(job.flow))
+        recovered = track.recover_flow(video.rgb, video.tools, tissue, create(job.flow.backend))
     with task.watch.stage("store"):
         for t in range(job.frames):
             writer.put_frame("flow_recovered", t, recovered.flow[t])
@@ -225,7 +224,7 @@ def _seal(task: _Task) -> Path:
 
 def _opening(job: Job, case: Scenario) -> dict[str, Any]:
     """The attribute `opening_id` of a sequence on a user's brain."""
-    named = identity.identify_opening(job, case.anatomy)
+    named = identity.identify_opening(job, case.index)
     return {} if named is None else {"opening_id": named}
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem import tool_gesture
 from synth.fem.material import Pia, Tissue
-from synth.fem.pulse import Pulse
+from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Gesture, ToolContact
 from synth.job import schema
 from synth.job.mechanics import CLEAR_MM, InstrumentSection
@@ -22,7 +22,7 @@ from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.appearance.look import Look
-from synth.render.camera.camera import CameraView
+from synth.render.camera.camera import CameraView, place, seen_radius
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 Random = np.random.Generator
 Range = tuple[float, float]
 
-# First element of the spawn key: anatomies are shared between sequences, everything else is not.
+# First element of the spawn key.
 _ANATOMY, _SEQUENCE = 0, 1
 _TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY, _PULSE = range(9)
 
@@ -41,6 +41,7 @@ Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
 _RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
 _TRIES, _ROUNDS = 400, 8  # of a gesture until it has room, and of all of `fem.instrument_list`
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
+_KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, against one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
 _SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
@@ -52,8 +53,6 @@ class Scenario:
 
     index: int
     """Position in the dataset."""
-    anatomy: int
-    """Which anatomy; sequences that share it must never be split between training and test."""
     family: str
     """Appearance family."""
     relief: Relief
@@ -81,23 +80,22 @@ class Scenario:
 def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
     job = as_job(job)
-    anatomy = index % (job.anatomy.variety or job.sequences)
     family = job.appearance.families[index % len(job.appearance.families)]
 
     def generator(part: int) -> Random:
         return _generator(job, _SEQUENCE, index, part)
 
-    relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, anatomy, 0))
+    relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
     tissue = draw_tissue(job.fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
     view = draw_view(job.render, generator(_VIEW))
     sway = draw_sway(job.render, generator(_SWAY))
     opening_mm = job.anatomy.craniotomy.radius_mm
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, generator(_GESTURE), generator(_FURTHER))
+    seen_mm = seen_radius(place(view, job.render))
+    rngs = generator(_GESTURE), generator(_FURTHER)
+    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, seen_mm)
     look = draw_look(job, family, generator(_LOOK))
-    return Scenario(
-        index, anatomy, family, relief, tissue, gestures[0], gestures[1:], look, view, sway, pulse
-    )
+    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], look, view, sway, pulse)
 
 
 def frame_seeds(job: Job, index: int) -> list[int]:
@@ -133,13 +131,18 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
 def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
     """Amplitudes, rates and phases uniformly; None where nothing moves."""
     turn = 0, 2 * np.pi
-    heart, breath = (pulse.heart_mm, pulse.heart_hz, turn), (pulse.breath_mm, pulse.breath_hz, turn)
+    heart, breath = (pulse.heart_mm, HEART_HZ, turn), (pulse.breath_mm, BREATH_HZ, turn)
     drawn = Pulse(*(_uniform(rng, ends) for ends in (*heart, *breath)))
     return drawn if drawn.heart_mm or drawn.breath_mm else None
 
 
 def draw_gestures(
-    fem: FemSection, opening_mm: float, young_kpa: float, rng: Random, others: Random
+    fem: FemSection,
+    opening_mm: float,
+    young_kpa: float,
+    rng: Random,
+    others: Random,
+    seen_mm: float = np.inf,
 ) -> tuple[Gesture, ...]:
     """Draws the gestures of all instruments, each redrawn until it has room beside the others.
 
@@ -152,6 +155,7 @@ def draw_gestures(
         young_kpa: E of the tissue.
         rng: random numbers of this sequence's first gesture.
         others: of its further ones.
+        seen_mm: radius about the opening's middle that the camera shows, see `draw_gesture`.
 
     Raises:
         UserError: the opening has no room for so many, or not there.
@@ -164,7 +168,7 @@ def draw_gestures(
         found: dict[int, Gesture] = {}
         for k in order:
             for _ in range(_TRIES):
-                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k])
+                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k], seen_mm)
                 fits = not given or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
                 if fits and all(tool_gesture.clearance(trial, other) >= 0 for other in found.values()):
                     found[k] = trial
@@ -174,12 +178,10 @@ def draw_gestures(
         else:
             return tuple(found[k] for k in range(count))
     beside = f" beside the other {len(found)}" if found else ""
-    region = fem.contact_region_radius_mm
-    within = "" if region is None else f" and fem.contact_region_radius_mm of {region:g}"
     raise UserError(
         f"fem.{'instrument_list' if given else 'instruments'}: instrument {k} of {count} has no room{beside} "
-        f"in an opening of {opening_mm:g} mm radius{within}; lower fem.instruments or footprint_mm, change "
-        "its place, or widen anatomy.craniotomy.radius_mm"
+        f"in an opening of {opening_mm:g} mm radius; lower fem.instruments or footprint_mm, change "
+        "its place, or widen anatomy.craniotomy.radius_mm or render.field_mm"
     )
 
 
@@ -189,14 +191,12 @@ def draw_gesture(
     young_kpa: float,
     rng: Random,
     asked: InstrumentSection = InstrumentSection(),
+    seen_mm: float = np.inf,
 ) -> Gesture:
     """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
 
-    With `fem.contact_region_radius_mm` all that it loads keeps to that radius of the opening's middle. Where
-    it is asked for a place, what is drawn may reach beyond the opening.
-
-    Raises:
-        UserError: what is drawn has no room in `fem.contact_region_radius_mm`.
+    All that it loads keeps to the opening and to `seen_mm` of its middle, what the camera shows of a
+    wide one; what has no room there is in the middle. Asked for a place, it may reach beyond.
     """
     drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(asked)
     kind = asked.gesture or drawn
@@ -207,7 +207,7 @@ def draw_gesture(
     path = _uniform(rng, (3, 8)) if kind == "slide" else 0.0
     azimuth = _uniform(rng, (0, 360))
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
-    point = _draw_point(fem, opening_mm, kind, footprint, footprint + 0.5 * half, rng, asked)
+    point = _draw_point(opening_mm, seen_mm, footprint + 0.5 * half, rng, asked)
     along, direction = _draw_direction(fem, kind, rng, asked)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
@@ -234,22 +234,10 @@ def draw_gesture(
 
 
 def _draw_point(
-    fem: FemSection,
-    opening_mm: float,
-    kind: str,
-    footprint: float,
-    reach: float,
-    rng: Random,
-    asked: InstrumentSection,
+    opening_mm: float, seen_mm: float, reach: float, rng: Random, asked: InstrumentSection
 ) -> Floats:
-    """Middle of the contacts (2,) mm; with `reach` mm round it all that is loaded is in the opening."""
-    within = min(opening_mm, fem.contact_region_radius_mm or opening_mm)
-    if within < min(reach + CLEAR_MM, opening_mm) and asked.place is None:
-        raise UserError(
-            f"fem.contact_region_radius_mm: a {kind} of {footprint:.3g} mm footprint reaches {reach:.3g} mm, "
-            f"which {within:g} mm leave no room for; raise it or lower fem.footprint_mm"
-        )
-    room = max(within - reach - CLEAR_MM, 0.0)
+    """Middle of the contacts (2,) mm, all within `reach` mm of which is in the opening and in the picture."""
+    room = max(min(opening_mm - reach - CLEAR_MM, seen_mm - reach), 0.0)
     radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
     if asked.place is not None:
         return np.asarray(asked.place, np.float64)
@@ -298,9 +286,8 @@ def draw_view(render: RenderSection, rng: Random) -> CameraView:
 
 
 def draw_sway(render: RenderSection, rng: Random) -> CameraMotion:
-    """How far the microscope drifts and vibrates."""
-    drift, vibration = _uniform(rng, render.drift_mm), _uniform(rng, render.vibration_mm)
-    return CameraMotion(drift, vibration, int(rng.integers(2**31)))
+    """How far the microscope drifts."""
+    return CameraMotion(_uniform(rng, render.drift_mm), int(rng.integers(2**31)))
 
 
 def draw_look(job: Job, family: Family, rng: Random) -> Look:
@@ -344,7 +331,7 @@ def draw_light(light: LightSection, rng: Random) -> Lighting:
         azimuth_deg=azimuth * (50.0 if tilt is None else 180.0),
         main=_uniform(rng, light.main),
         power=_uniform(rng, _POWER),
-        kelvin=_uniform(rng, light.kelvin),
+        kelvin=_uniform(rng, _KELVIN),
         even=_uniform(rng, light.even),
         drift=_uniform(rng, _DRIFT),
         phase=_uniform(rng, (0, 2 * np.pi)),
@@ -361,7 +348,6 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
         vignette=section.vignette,
         blur=section.blur_px,
         sharpening=_uniform(rng, section.sharpening),
-        bayer=section.bayer,
         chroma=section.chroma,
         coded=section.bitrate_mbps is not None,
     )

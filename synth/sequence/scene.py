@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem.solver import Deformation
 from synth.fem.tool_gesture import ToolMotion
-from synth.flow import track, tvl1
-from synth.flow.estimator import Estimator, create
+from synth.flow import track
+from synth.flow.estimator import Estimator
 from synth.flow.track import Track
 from synth.job.reader import as_job
-from synth.job.schema import FlowSection, Job
+from synth.job.schema import Job
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
@@ -165,11 +165,10 @@ class Scene(RestScene):
         chosen = self.job.flow.backend if backend is None else backend
         if chosen == "ideal":
             raise UserError("flow.backend: `ideal` recovers nothing; name an estimator")
-        found = estimator(self.job.flow) if backend is None else chosen
         rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
         if self.job.sensor.bitrate_mbps is not None:
             rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
-        return track.recover_flow(rgb, tools, self.tissue, found)
+        return track.recover_flow(rgb, tools, self.tissue, chosen)
 
 
 def at_rest(
@@ -235,10 +234,3 @@ def simulate(
     with watch.stage("fem"):
         motion = mechanics.move(job, rest.scenario, surface, tets, motions)
     return Scene(**vars(rest), motion=motion)
-
-
-def estimator(flow: FlowSection) -> Estimator:
-    """The estimator that a job asks for."""
-    if flow.backend != "tvl1":
-        return create(flow.backend)
-    return tvl1.Tvl1(replace(tvl1.TVL1Settings(), warps=2 * flow.warps))

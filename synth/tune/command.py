@@ -26,7 +26,7 @@ def tune(
     """Writes the cheapest job whose error of the force is within a budget of full fidelity's.
 
     A few probe sequences are computed at full fidelity and with one parameter changed at a time (law, mesh,
-    time step, surface, size of picture, paths, flow's warps); the settings chosen are measured as a whole. A
+    time step, surface, size of picture, paths); the settings chosen are measured as a whole. A
     run that was stopped goes on when it is given again.
     """
     from synth.errors import UserError

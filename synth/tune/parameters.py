@@ -16,7 +16,7 @@ Setting = str | int | tuple[int, int]
 Settings = Mapping[str, Setting]
 """Values of parameters by their keys in the job, dotted."""
 
-_TETS, _SPP, _WARPS = (4000, 2500, 1600, 800), (8, 4, 2), (6, 3, 2, 1)
+_TETS, _SPP = (4000, 2500, 1600, 800), (8, 4, 2)
 _SIZES = (0.75, 0.6, 0.5, 0.4)  # parts of the job's
 _FEWEST_PX = 96  # of the picture's short side: below, flow has no pyramid to speak of
 _VERTICES = 10_000
@@ -61,8 +61,6 @@ def list_parameters(job: Job) -> list[Parameter]:
             Parameter("render.size", sizes, render.size),
             Parameter("render.spp", _falling(render.spp, *_SPP), render.spp, half),
         ]
-    if job.flow.backend == "tvl1":
-        parameters.append(Parameter("flow.warps", _falling(job.flow.warps, *_WARPS), job.flow.warps, half))
     return [one for one in parameters if len(one.settings) > 1]
 
 

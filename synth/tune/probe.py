@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from synth.errors import UserError
 from synth.fem.solver import Deformation
 from synth.flow import mask_detection
+from synth.flow.estimator import create
 from synth.flow.track import Tracker
 from synth.job.schema import Job
 from synth.render.camera import camera
 from synth.sequence import scenario
-from synth.sequence.scene import Frame, Scene, estimator, simulate
+from synth.sequence.scene import Frame, Scene, simulate
 from synth.system.stopwatch import Stopwatch
 from synth.tune.force_reading import cells, fit_reading
 
@@ -25,7 +26,12 @@ Floats = NDArray[np.float64]
 Found = TypeVar("Found")
 
 _LOADED = 3  # frames with load that are looked at in a sequence, on the way up to its peak
-_PHYSICS = {"seed", "sequences", "frames", "fps", "anatomy", "fem"}  # sections that it depends on
+_VIEW = {"field_mm", "working_distance_mm", "tilt_deg", "distortion", "calibration"}
+_PHYSICS: Any = {
+    **dict.fromkeys(("seed", "sequences", "frames", "fps", "anatomy", "fem"), True),
+    "render": _VIEW,
+}
+"""What it depends on; of the view, as contacts keep to what is in it, and not on the picture's size."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,8 @@ def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame]
     """Frames of a job's first sequence; CPU-s of its physics and scene, and of a frame."""
     job = Job.model_validate_json(job_json)
     moved, physics_s = _simulate(job.model_dump_json(include=_PHYSICS))
-    case = scenario.draw_scenario(job, 0)
+    own = moved.scenario
+    case = replace(scenario.draw_scenario(job, 0), gesture=own.gesture, further=own.further)
     scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
     _, scene_s = _timed(lambda: scene.renderer)
     rendered = [_timed(partial(scene.frame, t)) for t in numbers]
@@ -101,7 +108,7 @@ def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDA
     """Flow (H, W, 2) px of all frames but the first, and the CPU-s of one."""
     rgb = np.stack([frame.rgb for frame in frames])
     blocked = mask_detection.hidden(rgb, np.stack([frame.tool for frame in frames]))
-    tracker = Tracker(estimator(job.flow), rgb[0], blocked[0], scene.tissue)
+    tracker = Tracker(create(job.flow.backend), rgb[0], blocked[0], scene.tissue)
     steps = [_timed(partial(tracker.step, *one)) for one in zip(rgb[1:], blocked[1:], strict=True)]
     first_s, *others_s = (spent for _, spent in steps)
     return [flow for (flow, _), _ in steps], min(others_s or [first_s])  # in a video, most start warm

@@ -41,7 +41,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
     """What a stand-in's store says of itself."""
     gesture = {"kind": "pull", "load": 0.1}
     return {
-        "scenario": {"index": index, "anatomy": index, "family": "healthy", "gesture": gesture},
+        "scenario": {"index": index, "family": "healthy", "gesture": gesture},
         "scale_mm_per_px": 0.1,
         "young_kpa": float(rng.uniform(0.5, 3)),
         "poisson": 0.4,

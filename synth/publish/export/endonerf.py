@@ -108,7 +108,7 @@ def _poses(sequence: Sequence) -> Iterator[Floats]:
         yield from (poses[0] @ np.linalg.inv(pose) for pose in poses)
         return
     sway = sequence.attrs.get("scenario", {}).get("sway", {})
-    if sway.get("drift_mm") or sway.get("vibration_mm"):
+    if sway.get("drift_mm"):
         raise UserError(
             f"{sequence.path}: the microscope moves and its poses were not kept; "
             "render with store.extra=[camera]"

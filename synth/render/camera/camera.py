@@ -18,6 +18,7 @@ from synth.render.camera import calibration
 Floats = npt.NDArray[np.float64]
 
 _NEWTON = 20
+_BORDER = 65  # places on a side of the picture
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,22 @@ def calibrated(view: CameraView, lens: Camera) -> CameraView:
     x, y = (lens.K[:2, 2] - (np.array(lens.size) - 1) / 2) / width
     field_mm = float(width * view.working_distance_mm / lens.K[0, 0])
     return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
+
+
+def seen_radius(camera: Camera) -> float:
+    """Radius [mm] of the largest circle about the craniotomy's centre, in its plane, that is in the picture.
+
+    Raises:
+        UserError: as `rays`.
+    """
+    (width, height), side = camera.size, np.linspace(-0.5, 0.5, _BORDER)
+    across = [(x, y) for x in side for y in (-0.5, 0.5)]
+    edge = np.array(across + [(y, x) for x, y in across])
+    pixels = edge * (width, height) + 0.5 * np.array([width - 1, height - 1])
+    away = rays(camera, pixels) @ camera.rotation
+    # A ray that doesn't come down to the plane meets it very far away.
+    met = camera.centre - away * (camera.centre[2] / np.minimum(away[:, 2], -1e-9))[:, None]
+    return float(np.hypot(met[:, 0], met[:, 1]).min())
 
 
 def refuse_unfit(render: RenderSection) -> None:

@@ -1,4 +1,4 @@
-"""Slow drift and vibration of the microscope on its stand: a camera for every moment."""
+"""Slow drift of the microscope on its stand: a camera for every moment."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from synth.render.camera.camera import Camera
 Floats = npt.NDArray[np.float64]
 
 _SLOW_HZ = (0.05, 0.25)
-_FAST_HZ = (4.0, 14.0)  # stands ring in this range
 _WAVES = 3
 _TURN = 0.002  # rad of turn about each axis that go with a shift of 1 mm
 
@@ -23,24 +22,21 @@ class CameraMotion:
 
     drift_mm: float
     """Largest slow shift from there, about."""
-    vibration_mm: float
-    """Standard deviation of the fast shift."""
     seed: int
 
     def at(self, camera: Camera, seconds: float) -> Camera:
         """The camera at a time, `camera` being that of time 0."""
-        if self.drift_mm == 0 and self.vibration_mm == 0:
+        if self.drift_mm == 0:
             return camera
-        shift = self._wave(_SLOW_HZ, 0, seconds) * self.drift_mm / np.sqrt(_WAVES)
-        shift = shift + self._wave(_FAST_HZ, 1, seconds) * self.vibration_mm * np.sqrt(2 / _WAVES)
+        shift = self._waves(seconds) * self.drift_mm / np.sqrt(_WAVES)
         turn = _rotation(shift[3:] * _TURN)
         # The turn is about the craniotomy, so that it stays in view.
         return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])
 
-    def _wave(self, band: tuple[float, float], kind: int, seconds: float) -> Floats:
+    def _waves(self, seconds: float) -> Floats:
         """Six random waves (x, y, z and three turns), 0 at time 0."""
-        rng = np.random.default_rng([self.seed, kind])
-        hertz = rng.uniform(*band, (_WAVES, 6))
+        rng = np.random.default_rng([self.seed, 0])
+        hertz = rng.uniform(*_SLOW_HZ, (_WAVES, 6))
         phase = rng.uniform(0, 2 * np.pi, (_WAVES, 6))
         total = np.sin(2 * np.pi * hertz * seconds + phase) - np.sin(phase)
         return np.asarray(total.sum(axis=0))

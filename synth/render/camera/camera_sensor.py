@@ -45,8 +45,6 @@ class CameraSensor:
     """Tone curves of red, green, blue: video levels (1: white, more is cut off) at `KNOTS` of full scale."""
     sharpening: float = 0.3
     """Unsharp mask of the video processor, as a share of the detail."""
-    bayer: bool = False
-    """One colour a pixel (RGGB)."""
     chroma: str = "4:4:4"
     """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
     coded: bool = False
@@ -87,7 +85,7 @@ def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator
     most = np.float32(_HEADROOM)
     steps = np.float32(2**sensor.bits - 1) / most
     _convert(np.asarray(light, np.float32), well, read, steps, most, white / least, balanced)
-    return _demosaiced(balanced) if sensor.bayer else balanced
+    return balanced
 
 
 def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
@@ -134,16 +132,6 @@ def _convert(
                 electrons = electrons + noise[y, x, k] * np.sqrt(electrons + read)
                 digital = np.rint(min(max(electrons / well, zero), most) * steps) / steps
                 noise[y, x, k] = min(max(digital * white[k], zero), most)
-
-
-def _demosaiced(balanced: Map) -> Map:
-    """What is left of a picture when each pixel measures one colour, and the others are interpolated."""
-    mosaic = balanced[..., 1].copy()
-    mosaic[::2, ::2] = balanced[::2, ::2, 0]
-    mosaic[1::2, 1::2] = balanced[1::2, 1::2, 2]
-    raw = np.rint(mosaic * (65535 / _HEADROOM)).astype(np.uint16)
-    # OpenCV names a pattern by its second row's second and third pixel: this one is red first.
-    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB_EA), np.float32) * np.float32(_HEADROOM / 65535)
 
 
 def _thinned(video: Map, chroma: str) -> Map:

@@ -18,8 +18,6 @@ ABOUT = {
     "licence": "cc-by-4.0",
     "summary": "Made to be read.",
     "authors": ["A. Person"],
-    "url": "https://example.org/pulls",
-    "published": "2027-01-31",
 }
 
 

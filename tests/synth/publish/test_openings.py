@@ -69,7 +69,7 @@ def test_sequences_take_the_openings_of_a_brain_in_turn(egg: Path, found: list[O
     for index, case in enumerate(cases):
         origin = mechanics.cortex(job, case)[1].origin  # type: ignore[union-attr]
         assert np.linalg.norm(origin - found[index % 3].point) < 1.0
-    named = [identity.identify_opening(job, case.anatomy) for case in cases]
+    named = [identity.identify_opening(job, case.index) for case in cases]
     assert named[:3] == named[3:]
     assert len(set(named)) == 3
     assert parse_job(writer.commented(job), "job", Path()) == job

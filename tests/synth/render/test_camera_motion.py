@@ -9,14 +9,15 @@ from synth.job.schema import RenderSection
 from synth.render.camera import camera
 from synth.sequence import scenario
 
-RENDER = RenderSection(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4), vibration_mm=(0.02, 0.02))
+RENDER = RenderSection(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4))
 LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), RENDER)
 
 
-def test_vibration_has_the_deviation_asked_for() -> None:
-    sway = replace(scenario.draw_sway(RENDER, np.random.default_rng(5)), drift_mm=0.0)
-    x = [sway.at(LENS, t).translation for t in np.arange(0, 4, 0.005)]
-    np.testing.assert_allclose(np.std(x, axis=0), 0.02, rtol=0.15)
+def test_drift_starts_at_rest_and_is_as_large_as_asked_for() -> None:
+    sway = scenario.draw_sway(RENDER, np.random.default_rng(5))
+    x = [sway.at(LENS, t).translation for t in np.arange(0, 2000, 0.5)]
+    np.testing.assert_array_equal(x[0], LENS.translation)
+    np.testing.assert_allclose(np.std(x, axis=0), 0.4 / np.sqrt(2), rtol=0.15)
 
 
 def test_the_second_lens_sees_the_disparity_of_a_rectified_pair() -> None:

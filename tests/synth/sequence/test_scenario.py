@@ -1,8 +1,12 @@
-"""A scenario depends on (job, index) only, and grouped anatomies are really shared."""
+"""A scenario depends on (job, index) only, and what it loads is in the opening and in the picture."""
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+
 from synth.job.schema import Job
+from synth.render.camera import camera
 from synth.sequence.scenario import draw_scenario, frame_seeds
 
 
@@ -27,3 +31,20 @@ def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
         assert usual.pulse is usual.tissue.membrane is None
         assert one.tissue.young_kpa == usual.tissue.young_kpa
         assert (one.gesture, one.look) == (usual.gesture, usual.look)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (640, 360)])
+def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[int, int]) -> None:
+    opening, narrow = {"craniotomy": {"radius_mm": 24}}, {"footprint_mm": [2, 3]}
+    render = {"size": size, "tilt_deg": [15, 25]}
+    wide = Job.model_validate({"sequences": 40, "anatomy": opening, "fem": narrow, "render": render})
+    turn = np.linspace(0, 2 * np.pi, 100)
+    reach = []
+    for case in (draw_scenario(wide, k) for k in range(wide.sequences)):
+        lens, reach_mm = camera.place(case.view, wide.render), case.gesture.reach_mm
+        circle = reach_mm * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+        pixels = camera.project(lens, circle)
+        assert (pixels > -0.6).all()
+        assert (pixels < np.array(size) - 0.4).all()
+        reach.append(reach_mm / camera.seen_radius(lens))
+    assert max(reach) > 0.9, "up to the picture's edge"

@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {
     "fem": {"tets": 600, "load": 0.1, "law": "neo-hookean", "gestures": ["pull"]},
     "render": {"size": [128, 96], "spp": 2},
 }
-JOB = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}, "flow": {"warps": 6}})
+JOB = Job.model_validate({"seed": 1, "fem": {"gestures": ["pull"]}})
 
 
 @pytest.mark.slow
@@ -35,9 +35,9 @@ def test_a_tenth_more_load_reads_as_a_tenth_more_force() -> None:
     assert np.isfinite(found.read).all()
     assert (found.cost > 0).all()
     # What flow alone changes is no matter of the label, and needs no other pictures.
-    warps = one.measure(parameters.changed(job, {"flow.warps": 1}))
-    np.testing.assert_array_equal(warps.label, found.label)
-    assert warps.cost[:3].tolist() == found.cost[:3].tolist()
+    other = one.measure(parameters.changed(job, {"flow.backend": "dis"}))
+    np.testing.assert_array_equal(other.label, found.label)
+    assert other.cost[:3].tolist() == found.cost[:3].tolist()
     more = one.measure(parameters.changed(job, {"fem.load": [0.11, 0.11]}))
     # The reading's own mesh is another one, and the tangent a straight line: a tenth within a sixth of it.
     assert more.label.max() == pytest.approx(0.1, rel=0.16)
@@ -58,7 +58,7 @@ class Fake:
         read = label + 0.02 * (1 - small) + {8: 0.0, 4: 0.002, 2: 0.03}[job.render.spp]
         if small < 0.5 and job.render.spp < 8:
             read += 0.05
-        cost = [job.fem.tets / 1000, 2.0, small * job.render.spp / 8, small**2 * job.flow.warps / 6]
+        cost = [job.fem.tets / 1000, 2.0, small * job.render.spp / 8, small**2]
         return Measured(np.full((2, 1), label), np.full((2, 1), read), np.array(cost))
 
 
@@ -146,8 +146,8 @@ def test_the_written_job_is_the_persons_own(tuned: search.Tuned, tmp_path: Path)
         "appearance:\n  photo: cortex.jpg\n"
     )
     (tmp_path / "cortex.jpg").touch()
-    before = reader.load_job(str(source), ["flow.warps=6"])
-    tuned_job.write(tuned, str(source), ["flow.warps=6"], out)
+    before = reader.load_job(str(source), ["frames=12"])
+    tuned_job.write(tuned, str(source), ["frames=12"], out)
     text = out.read_text()
     assert "# mine" in text
     assert "# only these" in text
@@ -168,7 +168,7 @@ def test_parameters_follow_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
         Job.model_validate({"fem": {"time": "dynamic", "load": [0.05, 0.1]}})
     )
     physics = {"fem.law", "fem.tets", "fem.time"}
-    pictures = {"anatomy.vertices", "render.size", "render.spp", "flow.warps"}
+    pictures = {"anatomy.vertices", "render.size", "render.spp"}
     assert {one.key for one in dynamic} == physics | pictures
     monkeypatch.setattr(parameters, "CHEAPEST_FIRST", ("linear",))  # another's law is another tissue
     foreign = Job.model_validate({"fem": {"law": "neo-hookean", "load": [0.05, 0.1]}})
