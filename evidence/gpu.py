@@ -106,8 +106,6 @@ def full_size(
         learning_rate=2e-3,
         schedule="cosine",
         precision="bf16-mixed" if on_gpu else "32-true",
-        channels_last=True,
-        compile=on_gpu,
     )
     split = nested(clips, 10, 0, settings.seed)
     fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)

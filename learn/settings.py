@@ -49,9 +49,6 @@ class TrainingSettings(Section):
     """Most frames that an epoch has, drawn anew each epoch, so that more sequences take no longer; 0 sets no
     limit."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    channels_last: bool = False
-    compile: bool = False
-    """Whether torch.compile takes the network: worth its minute on a GPU; needs a C++ compiler on a CPU."""
     seed: Count = 0
 
     @model_validator(mode="after")
@@ -84,7 +81,6 @@ def replace(settings: S, **changes: Any) -> S:
 _SHORT: dict[str, Any] = {
     "epochs": 24,
     "schedule": "cosine",
-    "channels_last": True,
     "frames": 12,
     "epoch_frames": 4000,
 }
@@ -106,7 +102,6 @@ PRESETS: dict[str, TrainingSettings] = {
         loss="mse",
         learning_rate=2e-3,
         schedule="cosine",
-        channels_last=True,
     ),
     # At most 20 minutes on one core, with however many sequences: tells good choices from bad.
     "cpu": TrainingSettings(

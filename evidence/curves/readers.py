@@ -190,7 +190,6 @@ def network_settings(one: Reader, steps: int, frames: int) -> TrainingSettings:
             "batch": _BATCH,
             "learning_rate": 2e-3,
             "schedule": "cosine",
-            "channels_last": True,
             "seed": 0,
         }
     )

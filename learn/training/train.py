@@ -71,8 +71,7 @@ def train(
     state = _open(out, card)
     try:
         run = _start(card, state)
-        net: Any = torch.compile(run.model) if settings.compile else run.model
-        net, run.optimizer = fabric.setup(net, run.optimizer)
+        net, run.optimizer = fabric.setup(run.model, run.optimizer)
         frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
         with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
             for epoch in range(run.epoch, settings.epochs):
@@ -129,9 +128,7 @@ def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
     """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
     settings = card.settings
     torch.manual_seed(settings.seed)
-    model = D2FNet(settings.arch)
-    if settings.channels_last:
-        model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = D2FNet(settings.arch).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(
         # One pass over the weights, not a dozen: a fifth of a small network's training on a CPU.
         model.parameters(),
@@ -211,9 +208,7 @@ def cosine(progress: float, warm: float = 0.05) -> float:
 
 def forward(net: Any, batch: Batch, settings: TrainingSettings, scales: Scales) -> torch.Tensor:
     """The network's map in physical units per unit stiffness: (B, C, N, N), unit of `Scales.target`."""
-    x = inputs(batch, settings, scales)
-    if settings.channels_last:
-        x = x.contiguous(memory_format=torch.channels_last)
+    x = inputs(batch, settings, scales).contiguous(memory_format=torch.channels_last)
     predicted: torch.Tensor = net(x)
     return predicted.float() * scales.target
 
