@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -15,7 +14,7 @@ from scipy import ndimage
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
-from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments, rescale
+from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments
 from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.errors import UserError
@@ -124,8 +123,6 @@ class EvaluationReport:
         rows, clips = self.per_clip(young), self.columns[young]
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
         out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0)).r2
-        unit_maps = [rescale(c.map, c.young_kpa) for c in clips]
-        out["unit_map_r2_pooled"] = agreement(np.sum(unit_maps, axis=0)).r2
         true = np.concatenate([c.true_mn for c in clips])
         predicted = np.concatenate([c.predicted_mn for c in clips])
         out["force_r2_pooled"] = agreement(moments(true, predicted)).r2
@@ -141,41 +138,14 @@ class EvaluationReport:
             out[name] = pooled_r2(np.array(parts), rng)
         return out
 
-    def bands(self) -> list[dict[str, float]]:
-        """Errors of the total force in four bands of true force, as shares of the training data's largest."""
-        edges = [0.0, LOW, 1 / 3, 2 / 3, math.inf]
-        share = np.concatenate([c.true_mn / (self.card.scales.force * c.young_kpa) for c in self.clips])
-        true = np.concatenate([c.true_mn for c in self.clips])
-        gap = np.concatenate([c.predicted_mn for c in self.clips]) - true
-        out = []
-        for a, b in itertools.pairwise(edges):
-            here = (share >= a) & (share < b)
-            mae, bias = (one[here].mean() if here.any() else math.nan for one in (np.abs(gap), gap))
-            ends = {"from": a, "to": b if math.isfinite(b) else float(share.max(initial=a))}
-            out.append(ends | {"frames": float(here.sum()), "mae_mn": float(mae), "bias_mn": float(bias)})
-        return out
-
     def as_dict(self) -> dict[str, object]:
         """JSON-ready; NaN as null."""
         return {
             "sequences": [
-                {"name": c.name, "young_kpa": c.young_kpa}
-                | _plain(c.as_row())
-                | {"map_moments": c.map.tolist()}
-                for c in self.clips
+                {"name": c.name, "young_kpa": c.young_kpa} | _plain(c.as_row()) for c in self.clips
             ],
             "columns": {young: _plain(self.summary(young)) for young in self.columns},
             "intervals": {k: _plain({"low": i.low, "high": i.high}) for k, i in self.intervals().items()},
-            "bands": [_plain(b) for b in self.bands()],
-            "scales": asdict(self.card.scales),
-            "definitions": {
-                "ghost_mn": GHOST_MN,
-                "patch_mm2": PATCH_MM2,
-                "free_share": FREE,
-                "rim_mm": RIM_MM,
-                "low_share": LOW,
-                "target": self.card.settings.target,
-            },
         }
 
 

@@ -53,7 +53,6 @@ METRICS = {
     "vector_error_mn": Metric("total force: error of the vector", "mN", "Mean length of its error."),
     "peak_error_share": Metric("peak force: relative error", column="peak force error"),
     "map_r2_pooled": Metric("force map: R², all cells", column="map R²"),
-    "unit_map_r2_pooled": Metric("force map: R², all cells, at E = 1 kPa", listed=False),
     "map_r2": Metric("force map: R²", about="Over tissue cells.", column="map R²", listed=False),
     "map_mae": Metric("force map: MAE", _DENSITY),
     "map_rmse": Metric("force map: RMSE", _DENSITY, column="map RMSE [mN/mm²]"),
@@ -90,10 +89,6 @@ METRICS = {
 """By key of `learn eval --json`: the only place that says what a score is."""
 
 
-_DEGREES = np.array([0, 1, 1, 2, 2, 2, 1])
-"""Powers of the unit in each of `moments`."""
-
-
 def moments(true: Floats, predicted: Floats) -> Floats:
     """Sums over pairs (true, predicted), from which every agreement metric follows; those of parts add up.
 
@@ -101,11 +96,6 @@ def moments(true: Floats, predicted: Floats) -> Floats:
     """
     t, p = (np.asarray(values, np.float64).ravel() for values in (true, predicted))
     return np.array([t.size, t.sum(), p.sum(), t @ t, p @ p, t @ p, np.abs(p - t).sum()])
-
-
-def rescale(moments: Floats, unit: float) -> Floats:
-    """Moments of the same pairs, both divided by `unit`."""
-    return np.asarray(moments * (1 / unit**_DEGREES))
 
 
 @dataclass(frozen=True)
