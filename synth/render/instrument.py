@@ -1,8 +1,11 @@
-"""Instruments as meshes that follow tips and shafts: forceps of two kinds, dissector, suction, spatula."""
+"""Instruments as meshes that follow tips and shafts: forceps of two kinds, dissector, suction, spatula.
+
+Sizes in mm are those of common neurosurgical instruments, by eye: no maker's drawing stands behind them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,13 +22,6 @@ _AROUND = 40
 _LENGTH_MM = 110.0
 _COAT_MM = 11.0  # from the tip
 
-_TIP_MM: dict[Kind, float] = {
-    "forceps": 0.45,
-    "bayonet": 0.45,
-    "dissector": 1.5,
-    "suction": 1.2,
-    "spatula": 3.0,
-}  # half width of what touches tissue
 _CLIMB_MM, _REACH_MM = 0.30, 0.40  # how far fluid climbs at a tip, and over what distance that falls off
 
 # What a hand would take for each gesture, and how often.
@@ -79,7 +75,7 @@ def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
 
 def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
     """The mesh of some instruments, perhaps none, to be placed by `pose`; the `coated` have black ends."""
-    parts = tuple(_PARTS[kind]() for kind in kinds)
+    parts = tuple(_SHAPES[kind][0]() for kind in kinds)
     faces, coat, total = [np.zeros((0, 3), np.int32)], [np.zeros(0)], 0
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
@@ -128,7 +124,7 @@ def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
     for k, kind in enumerate(instrument.kinds):
         ends = tips[2 * k : 2 * k + 2]
         for end in ends if len(instrument.parts[k]) == 2 else ends.mean(axis=0, keepdims=True):
-            away = lengths(surface - end) - _TIP_MM[kind]
+            away = lengths(surface - end) - _SHAPES[kind][1]
             height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
     return height
 
@@ -222,10 +218,11 @@ def _spatula() -> tuple[Part, ...]:
     return (Part(_sweep(s, thick, wide, bow, 0.35), 0),)
 
 
-_PARTS = {
-    "forceps": _forceps,
-    "bayonet": _bayonet,
-    "dissector": _dissector,
-    "suction": _suction,
-    "spatula": _spatula,
+_SHAPES: dict[Kind, tuple[Callable[[], tuple[Part, ...]], float]] = {
+    "forceps": (_forceps, 0.45),
+    "bayonet": (_bayonet, 0.45),
+    "dissector": (_dissector, 1.5),
+    "suction": (_suction, 1.2),
+    "spatula": (_spatula, 3.0),
 }
+"""Parts of each, and half the width [mm] of what touches tissue."""

@@ -1,6 +1,7 @@
 """What else lies about an opening: cotton over its edge, a retractor's blade, stitches, dural vessels.
 
 None of it is tissue or an instrument that acts: it hides what is below it, in pictures and truth alike.
+Sizes (mm), albedos (linear RGB) and absorptions were chosen by eye against an intra-operative photograph.
 """
 
 from __future__ import annotations

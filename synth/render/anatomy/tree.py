@@ -2,6 +2,7 @@
 
 A. Runions, B. Lane, P. Prusinkiewicz, "Modeling trees with a space colonization algorithm", 2007.
 C. D. Murray, "The physiological principle of minimum work", 1926: r^3 of a parent is its children's sum.
+Other numbers were chosen by eye against an intra-operative photograph.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Trunks of vessels: smooth paths across the patch that keep to the sulci."""
+"""Trunks of vessels: smooth paths across the patch that keep to the sulci.
+
+What a path costs, and how widths and bends vary, was chosen by eye against an intra-operative photograph.
+"""
 
 from __future__ import annotations
 
@@ -50,6 +53,7 @@ def trunks(
     nodes, parents, radii = np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0)
     taken = np.zeros((side, side), np.float32)
     for trunk in range(max(1, count)):
+        # A pixel of a cleft costs 0.12, of a crown 1 more, by chance up to 0.35, and 2.5 where a vessel runs.
         cost = 0.12 + (1 - np.clip(depth, 0, 1)) ** 2 + 0.35 * rng.random((side, side)) + 2.5 * taken
         angle = rng.uniform(0, 2 * np.pi) + trunk * 2 * np.pi / count
         turn = rng.uniform(0.6, 1.0) * np.pi

@@ -13,8 +13,30 @@ from synth.render.anatomy.tree import Tree, grow, murray, pruned, relaxed, scatt
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
+Trunks = tuple[tuple[Floats, Ints], Floats]
 
 _STIFF_MM = 0.15  # radius of a vessel that winds half as far as the finest
+_PATCH_MM = 34.0  # side of the patch that `Kind.trunks` are counted on
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How one kind of vessel grows; lengths in mm, chosen by eye against an intra-operative photograph."""
+
+    trunks: tuple[int, int]  # from, and below
+    radius: tuple[float, float]  # of a trunk
+    smooth: int  # rounds over a trunk
+    wiggle: float  # share of a trunk's short bends
+    spacings: tuple[float, ...]  # of the branches of each round
+    leaf: float  # radius of the finest: Murray's law gives the others'
+    wander: float  # random part of a step's direction
+    settle: float = 0.0  # by which a round of smoothing draws a trunk into its cleft
+    winding: float = 0.0  # amplitude
+
+
+VEINS = Kind((1, 4), (0.55, 1.2), 60, 0.0, (9.0, 5.5), 0.1, 0.3, settle=0.1)
+ARTERIES = Kind((4, 7), (0.2, 0.4), 40, 0.12, (5.2, 2.6, 1.3, 0.7, 0.46), 0.042, 0.25, winding=0.1)
+DEEP = Kind((3, 4), (0.1, 0.2), 18, 0.2, (3.6, 1.9), 0.05, 0.35)  # coarser than the finest of the pia
 
 
 @dataclass(frozen=True)
@@ -35,55 +57,30 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
         extent_mm: side of the square that the map covers.
         rng: where the anatomy comes from.
     """
-    many = extent_mm / 34.0
-    count = round(many * rng.integers(1, 4))
-    trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, count, (0.55, 1.2), smooth=60, wiggle=0.0, settle=0.1
-    )
-    veins = _tree(extent_mm, rng, trunks, radius, spacings=(9.0, 5.5), leaf=0.1, wander=0.3)
-    trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(many * rng.integers(4, 7)), (0.2, 0.4), smooth=40, wiggle=0.12
-    )
+    veins = _tree(VEINS, _trunks(VEINS, sulci, extent_mm, rng), extent_mm, rng)
+    trunks = _trunks(ARTERIES, sulci, extent_mm, rng)
     # No gyrus has as dense a web as the next, and a wide vein has none.
     rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
     distance, width = tube.raster(veins, 128, extent_mm)
     rich = np.clip(rich, 0.3, 1.0) * ((distance > width + 0.3) | (width < 0.3))
-    rich = np.asarray(rich, np.float32)
-    arteries = _tree(
-        extent_mm,
-        rng,
-        trunks,
-        radius,
-        spacings=(5.2, 2.6, 1.3, 0.7, 0.46),
-        leaf=0.042,
-        wander=0.25,
-        density=rich,
-        winding=0.1,
-    )
-    # What shimmers through the tissue is coarser than the finest of the pia.
-    trunks, radius = trunk.trunks(
-        sulci, extent_mm, rng, round(3 * extent_mm / 34.0), (0.1, 0.2), smooth=18, wiggle=0.2
-    )
-    deep = _tree(extent_mm, rng, trunks, radius, spacings=(3.6, 1.9), leaf=0.05, wander=0.35)
+    arteries = _tree(ARTERIES, trunks, extent_mm, rng, np.asarray(rich, np.float32))
+    deep = _tree(DEEP, _trunks(DEEP, sulci, extent_mm, rng), extent_mm, rng)
     return Vessels(veins, arteries, deep)
 
 
+def _trunks(kind: Kind, sulci: Map, extent_mm: float, rng: np.random.Generator) -> Trunks:
+    count = round(extent_mm / _PATCH_MM * rng.integers(*kind.trunks))
+    bends = {"wiggle": kind.wiggle, "settle": kind.settle}
+    return trunk.trunks(sulci, extent_mm, rng, count, kind.radius, smooth=kind.smooth, **bends)
+
+
 def _tree(
-    extent_mm: float,
-    rng: np.random.Generator,
-    trunks: tuple[Floats, Ints],
-    own: Floats,
-    *,
-    spacings: tuple[float, ...],
-    leaf: float,
-    wander: float,
-    density: Map | None = None,
-    winding: float = 0.0,
+    kind: Kind, trunks: Trunks, extent_mm: float, rng: np.random.Generator, density: Map | None = None
 ) -> Tree:
-    """Branches from the trunks of radii `own` (N,) mm, then finer ones from those: a round a spacing [mm]."""
-    nodes, parent = trunks
+    """Branches from the trunks, of their own radii, then finer ones from those: a round a spacing."""
+    (nodes, parent), own = trunks
     fixed = len(nodes)
-    for spacing in spacings:
+    for spacing in kind.spacings:
         step = 0.15 * min(spacing, 1.6)
         grown = len(nodes)
         between = np.linalg.norm(nodes[1] - nodes[0])
@@ -94,18 +91,18 @@ def _tree(
             buds=_sprouting(len(nodes), float(between) / (0.9 * spacing), rng),
             step=step,
             kill=0.5 * spacing,
-            wander=wander,
+            wander=kind.wander,
             rng=rng,
         )
         nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))
     nodes = relaxed(nodes, parent, fixed, rounds=12)
     nodes = nodes + trunk.meander(rng, nodes, extent_mm, 0.3, 0.22)
-    radius = murray(parent, leaf) * taper(nodes, parent, 1.6)
+    radius = murray(parent, kind.leaf) * taper(nodes, parent, 1.6)
     radius[:fixed] = np.maximum(np.minimum(radius[:fixed], 1.3 * own), own)
     swell = 1 + 0.15 * noise.sample(noise.band(rng, 256, extent_mm, 2.0, 0.5), nodes[fixed:], extent_mm)
     radius[fixed:] = np.minimum(radius[fixed:] * np.clip(swell, 0.6, 1.4), 0.8 * own.max())
-    if winding:
-        nodes = nodes + _wound(rng, nodes, radius, extent_mm, winding)
+    if kind.winding:
+        nodes = nodes + _wound(rng, nodes, radius, extent_mm, kind.winding)
     return Tree(nodes, parent, radius)
 
 

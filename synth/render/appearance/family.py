@@ -14,43 +14,30 @@ Ends = tuple[float, float]
 class Ranges:
     """Middle colours, linear RGB, and ranges of what `look.Look` documents, in the order of drawing.
 
-    Chosen by eye on intra-operative photographs; `evidence.render.realism` measures colours against one.
+    Defaults are those of healthy cortex. Chosen by eye on intra-operative photographs;
+    `evidence.render.realism` measures colours against one.
     """
 
-    gyrus_albedo: Colour
-    perfused_albedo: Colour
-    vein_crest_albedo: Colour
-    vein_side_albedo: Colour
-    arterial_absorption: Ends
-    subpial_absorbance_per_mm: Ends
-    pial_absorbance: Ends
-    sulcus_shading: Ends
+    gyrus_albedo: Colour = (0.95, 0.79, 0.49)
+    perfused_albedo: Colour = (0.93, 0.57, 0.38)
+    vein_crest_albedo: Colour = (0.34, 0.24, 0.3)
+    vein_side_albedo: Colour = (0.2, 0.045, 0.045)
+    arterial_absorption: Ends = (1.1, 1.5)
+    subpial_absorbance_per_mm: Ends = (1.4, 2.2)
+    pial_absorbance: Ends = (0.3, 0.9)
+    sulcus_shading: Ends = (0.3, 0.6)
     grain: Ends = (0.008, 0.02)
-    film_smoothing_mm: Ends
-    bump: Ends
+    film_smoothing_mm: Ends = (0.035, 0.06)
+    bump: Ends = (0.8, 1.3)
     roughness: Ends = (0.012, 0.02)
     dry_roughness: Ends = (0.22, 0.34)
-    blood: Ends
-    dura_albedo: Colour
-    surroundings_albedo: Colour
+    blood: Ends = (0.25, 0.75)
+    dura_albedo: Colour = (0.86, 0.6, 0.5)
+    surroundings_albedo: Colour = (0.46, 0.07, 0.04)
 
 
 FAMILIES: dict[Family, Ranges] = {
-    "healthy": Ranges(
-        gyrus_albedo=(0.95, 0.79, 0.49),
-        perfused_albedo=(0.93, 0.57, 0.38),
-        vein_crest_albedo=(0.34, 0.24, 0.3),
-        vein_side_albedo=(0.2, 0.045, 0.045),
-        arterial_absorption=(1.1, 1.5),
-        subpial_absorbance_per_mm=(1.4, 2.2),
-        pial_absorbance=(0.3, 0.9),
-        sulcus_shading=(0.3, 0.6),
-        film_smoothing_mm=(0.035, 0.06),
-        bump=(0.8, 1.3),
-        blood=(0.25, 0.75),
-        dura_albedo=(0.86, 0.6, 0.5),
-        surroundings_albedo=(0.46, 0.07, 0.04),
-    ),
+    "healthy": Ranges(),
     "hyperaemic": Ranges(
         gyrus_albedo=(0.88, 0.52, 0.35),
         perfused_albedo=(0.80, 0.37, 0.26),
@@ -59,9 +46,6 @@ FAMILIES: dict[Family, Ranges] = {
         arterial_absorption=(1.3, 1.8),
         subpial_absorbance_per_mm=(2.2, 3.2),
         pial_absorbance=(1.2, 2.2),
-        sulcus_shading=(0.3, 0.6),
-        film_smoothing_mm=(0.035, 0.06),
-        bump=(0.8, 1.3),
         blood=(0.5, 0.95),
         dura_albedo=(0.82, 0.5, 0.42),
         surroundings_albedo=(0.46, 0.06, 0.04),

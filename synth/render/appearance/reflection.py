@@ -1,7 +1,8 @@
 """What polished steel mirrors: the wound below it, a dark theatre with its lamps, the microscope's windows.
 
 It is evaluated at vertices, with the finish as a blur: a renderer's own reflection of small bright lamps is
-grain at few paths a pixel, and the rest of the theatre lights nothing else.
+grain at few paths a pixel, and the rest of the theatre lights nothing else. Reflectances and the theatre's
+radiances (1: white that fills the sensor) were chosen by eye; no instrument or theatre was measured.
 """
 
 from __future__ import annotations
@@ -21,8 +22,7 @@ Map = npt.NDArray[np.float32]
 _STEEL, _BLACK = 0.58, 0.045
 """Reflectance at right angles of machined steel and of the coating."""
 _TINT = np.array([1.0, 0.985, 0.96])
-_DRAPE = np.array([0.02, 0.045, 0.055])
-_CEILING = np.array([0.16, 0.17, 0.18])
+_DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.16, 0.17, 0.18])
 _LAMPS = 7
 _FINISH = 0.30  # GGX alpha of machined steel
 _FADE_MM = 22.0  # from the opening's middle, where the wound ends and drapes begin
