@@ -35,8 +35,13 @@ TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 # A recording doesn't tell the brain's shape: the default job's.
 _ANATOMY = schema.AnatomySection()
 OPENING_MM = _ANATOMY.craniotomy.radius_mm
-_OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))
-_AT_ONCE, _MOST = 32, 64
+_OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))  # no skull near
+# By hand; docs/results/fem/pareto has what elements cost and err.
+_POINT_MM = 1.0  # spacing of the points, which reach to the opening's edge
+_NODE_MM = 1.2  # spacing of the nodes, which stay as far inside it
+_TETS = 3000  # of the map's own mesh, second order
+_AT_ONCE = 32  # loads solved at a time: memory
+_STORED = 64  # matrices in the cache: three recordings' tissues
 
 Edge = Literal["bonded", "slipping", "free"]
 
@@ -45,13 +50,11 @@ Edge = Literal["bonded", "slipping", "free"]
 class TissueKind:
     """What the displacement under a load depends on, but for E."""
 
-    edge: Edge = "bonded"
-    """How the skull holds the tissue round the opening; `free`: there is none."""
+    edge: Edge = "bonded"  # how the skull holds the tissue round the opening; `free`: there is none
     membrane: float = 0.0
     """Thickness times Young's modulus of the membrane over E of the tissue [mm]; 0: none."""
     poisson: float = 0.4
-    stretch: float = 1.0
-    """Of the membrane at rest: above 1 its tension resists being bent."""
+    stretch: float = 1.0  # of the membrane at rest: above 1 its tension resists being bent
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +64,9 @@ class Compliance:
     matrix: Floats
     """(C P, 3 K): displacement [mm], x of every point, then y, then z if a second eye sees it (C = 3), for x,
     y, z loads of 1 mN a node."""
-    points: Floats
-    """(P, 2) where displacement is seen, camera x, y from the opening's centre [mm]."""
-    nodes: Floats
-    """(K, 2) where loads stand, same axes [mm]."""
-    node_area: Floats
-    """(K,) mm^2."""
+    points: Floats  # (P, 2) where displacement is seen, camera x, y from the opening's centre [mm]
+    nodes: Floats  # (K, 2) where loads stand, same axes [mm]
+    node_area: Floats  # (K,) mm^2
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,42 +103,30 @@ def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
     return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], embedding.move(moved)), np.float64)
 
 
-def build(
-    point_mm: float = 1.0,
-    node_mm: float = 1.2,
-    tets: int = 3000,
-    components: int = 2,
-    tissue: TissueKind | None = None,
-) -> Compliance:
+def build(components: int, tissue: TissueKind) -> Compliance:
     """Solves one linear problem a node and axis, on one factorisation (4 CPU-s), or reads what was solved.
 
-    Args:
-        point_mm: spacing of the points, which reach to the opening's edge.
-        node_mm: spacing of the nodes, which stay as far inside it.
-        tets: of the map's own mesh, second order.
-        components: of the displacement that is seen: 2 by one eye, 3 by two.
-        tissue: of E = 1 kPa; None: bare, bonded to the skull, Poisson's ratio 0.4.
+    `components`: of the displacement that is observed: 2 monocular, 3 stereo.
     """
-    points, nodes = _disc(point_mm, OPENING_MM), _disc(node_mm, OPENING_MM - node_mm)
-    matrix = _stored(tissue or TissueKind(), tets, point_mm, node_mm)[: components * len(points)]
+    points, nodes = _lattices()
+    matrix = _stored(tissue)[: components * len(points)]
     flat = np.column_stack([nodes, np.zeros(len(nodes))])
     area = surface_embedding.vertex_area(flat, Delaunay(nodes).simplices)
     return Compliance(matrix.astype(np.float64), points, nodes, area)
 
 
 @lru_cache(maxsize=4)
-def _stored(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> NDArray[np.float32]:
-    """(3 P, 3 K) from this user's cache, or solved and kept there."""
+def _stored(tissue: TissueKind) -> NDArray[np.float32]:
+    """(3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
-    key = code + f"{tissue} {tets} {point_mm} {node_mm}".encode()
     return cache.kept(
         "compliance/npy",
-        key,
-        lambda: _solved(tissue, tets, point_mm, node_mm).astype(np.float32),
+        code + f"{tissue}".encode(),
+        lambda: _solved(tissue).astype(np.float32),
         _dumped,
         lambda data: np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float32),
         (ValueError, EOFError),
-        _MOST,
+        _STORED,
     )
 
 
@@ -147,9 +135,13 @@ def _dumped(matrix: NDArray[np.float32]) -> bytes:
     return held.getvalue()
 
 
-def _solved(tissue: TissueKind, tets: int, point_mm: float, node_mm: float) -> Floats:
-    block = ElasticBlock.build(tets, tissue)
-    points, nodes = _disc(point_mm, OPENING_MM), _disc(node_mm, OPENING_MM - node_mm)
+def _lattices() -> tuple[Floats, Floats]:
+    """Points (P, 2) and nodes (K, 2) [mm]."""
+    return _disc(_POINT_MM, OPENING_MM), _disc(_NODE_MM, OPENING_MM - _NODE_MM)
+
+
+def _solved(tissue: TissueKind) -> Floats:
+    block, (points, nodes) = ElasticBlock.build(_TETS, tissue), _lattices()
     seen, held = block.embed(points), block.embed(nodes)
     columns = np.empty((len(nodes), 3, 3, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bench.methods.protocol import Field, ForceEstimate, MethodContext
 
 PEAK_PERCENTILE = 98.0
-"""What 2% of the tissue exceeds: the largest displacement, but for outliers."""
+"""The largest displacement, without outliers of flow at edges; by hand."""
 
 
 class FlowSize:

@@ -10,22 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri, softmax
 
-_DRAWS = 400
-_SURELY = 6.25  # chi-squared of three degrees of freedom: zero is within 90%
+_DRAWS = 400  # by hand: a quantile of 0.05 is then of 20
+_SURELY = 6.25  # 90% of a chi-squared of three degrees of freedom: zero is within the interval
 
 
 @dataclass(frozen=True, eq=False)
 class ForceMixture:
     """What a method holds likely of a force, as a mixture of M Gaussians."""
 
-    weight: NDArray[np.float64]
-    """(M,) that add up to 1."""
-    force: NDArray[np.float64]
-    """(M, 3), mN or, over E, mN/kPa."""
-    covariance: NDArray[np.float64]
-    """(M, 3, 3)."""
-    common: float = 0.0
-    """Relative deviation by which all may be off alike, which is not in `covariance`."""
+    weight: NDArray[np.float64]  # (M,) that add up to 1
+    force: NDArray[np.float64]  # (M, 3), mN or, over E, mN/kPa
+    covariance: NDArray[np.float64]  # (M, 3, 3)
+    common: float = 0.0  # relative deviation by which all may be off alike, which is not in `covariance`
 
     @property
     def mean(self) -> NDArray[np.float64]:
@@ -76,7 +72,7 @@ def size_interval(found: ForceMixture, gain: float, eyes: int = 2) -> tuple[floa
     gain = float(np.hypot(gain, found.common))
     size = float(np.linalg.norm(found.mean))  # the length of a mean may be less than most lengths
     weight = found.weight / found.weight.sum()
-    drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS).clip(0, len(weight) - 1)
+    drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS)
     root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(3))
     normal, factor = _normals()
     forces = found.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)

@@ -1,7 +1,7 @@
-"""Network and physics as one answer: each counts as much as its own error says.
+"""Network and physics as one estimate, each weighed by its stated error.
 
-What physics holds likely of a frame is a mixture over contacts and tissues. The network's answer is one more
-observation of the same force: it draws each of them towards itself, and those that it speaks against fade.
+The estimate of physics is a mixture over contacts and tissues. The network's is one more observation of the
+same force: it draws each component towards itself, and those that it contradicts lose weight.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from bench.methods.force_mixture import size_interval
 from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
 from synth.errors import UserError
 
-_COMMON, _CAUTION = 0.3, 1.5
-"""Relative deviation of what both err by alike, which no weighing tells; and what the network's stated
-deviation is multiplied by, for what comes is less like its training than what stated it
-(`evidence.scoring.together`)."""
+# Both are chosen on even sequences of mission-unseen; odd ones: docs/results/scoring/together.
+_COMMON = 0.3  # relative deviation of what both err by alike
+_CAUTION = 1.5  # factor of the network's stated deviation: recordings are less like its training
 
 
 class Fusion:
-    """Two methods of the table that say what they hold likely, as one; see the module."""
+    """Two methods of the table that state their errors, as one; see the module."""
 
     def __init__(self, network: str, physics: str) -> None:
         """Names of the two."""
@@ -30,13 +29,13 @@ class Fusion:
         self._share, self._alone = 0.0, 0
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """Raises UserError: it has nothing to say of a flow."""
-        raise UserError(f"what {' and '.join(self.parts)} say together can't be asked for without them")
+        """Raises UserError: it has no estimate of its own."""
+        raise UserError(f"a fusion of {' and '.join(self.parts)} needs their estimates: score it with them")
 
     def fuse(
         self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
     ) -> list[ForceEstimate]:
-        """See `FusedEstimate`; where one knows nothing of its error the network answers alone."""
+        """See `FusedEstimate`; where one states no error the network's estimate stands alone."""
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in answers:

@@ -1,8 +1,8 @@
-"""Physics behind the bench's protocol: `posterior` on every frame, the film saying what tissue it is.
+"""Physics as a method of the bench: `posterior` on every frame, the tissue weighed by the whole video.
 
-Frames are answered once the film is over: the span without contact has told how the tissue moves by itself,
-the strongest frames together its edge, membrane and Poisson's ratio. A picture that is wanted before rests on
-what the strongest frame until then said of the tissue.
+Frames are estimated once the video is over: the span without contact gives the tissue's own motion, the
+strongest frames together its edge, membrane and Poisson's ratio. A picture that is wanted before rests on the
+strongest frame until then.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,36 +30,37 @@ from synth.job.types import MembraneState
 
 Floats = NDArray[np.float64]
 
-MEMBRANES = (0.0, 5.0, 15.0, 40.0, 100.0)
-"""Stiffness over E [mm]."""
-STRETCHES = (1.0, 1.02)
-"""Of a membrane at rest: slack, or as a living head's may be."""
-_THIN = 5.0
-"""Up to here films of bare tissue look alike: the compliance's misfit is as large."""
-_INTACT = 0.33
-"""How likely a membrane is that nobody speaks of."""
-_POISSON = (0.45, 0.4, 0.49)
-_WIDE = 1.2
-"""Tissue that reaches so many openings' radii is not held by a skull round an opening."""
-_TEMPER = 0.1
-"""Frames of a film err alike, and alike at neighbouring points: so much of their evidence counts."""
-_STRONGEST, _ANEW, _LEAST = 8, 1.3, 0.05
-_GAIN, _STIFFNESS = 0.25, 0.5
-"""Relative deviation of the force by what no film tells: relief, pose, the law at large strain; and, where
-there is a membrane, by its stiffness, which large strains and wrinkles hide."""
+
+@dataclass(frozen=True)
+class TissueConstants:
+    """Tissues and how they are weighed; by hand where no source is given."""
+
+    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0)  # stiffness over E
+    stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in a living head 1 to 3% (design.md)
+    thin_mm: float = 5.0  # on another mesh bare tissue looks like a membrane of up to this (design.md)
+    intact: float = 0.33  # prior probability of a membrane
+    poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # likeliest first
+    wide: float = 1.2  # openings' radii that tissue reaches which no skull holds round an opening
+    temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
+    strongest: int = 8  # frames that weigh tissues, every third
+    stronger: float = 1.3  # displacement over that of the last weighing, for a picture to weigh them anew
+    least: float = 0.05  # weight of a second tissue to be used
+    gain: float = 0.25  # relative deviation of the force by relief, pose and the law at large strain
+    stiffness: float = 0.5
+    """The same by a membrane's stiffness; of even sequences of mission-unseen (evidence.scoring.together)."""
+
+
+TISSUES = TissueConstants()
 
 
 @dataclass(frozen=True)
 class Film:
-    """What is known of a film by now."""
+    """What is known of a video by now."""
 
     tissues: tuple[TissueKind, ...]
-    weight: Floats
-    """Of each tissue; they add up to 1."""
-    own_mm: Floats
-    """(C,) size of the tissue's own motion."""
-    membrane: float
-    """How likely there is one that is not thin, of all tissues that were asked about."""
+    weight: Floats  # of each tissue; they add up to 1
+    own_mm: Floats  # (C,) size of the tissue's own motion
+    membrane: float  # how likely there is one that is not thin, of all tissues that were asked about
 
 
 class Physics:
@@ -93,7 +93,7 @@ class Physics:
 
     @property
     def notes(self) -> list[str]:
-        """What the film said of the tissue."""
+        """What the video says of the tissue."""
         if self._scene is None:
             return []
         own = self._film.own_mm
@@ -110,14 +110,14 @@ class Physics:
             self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
             self._seen: list[Observation] = []
             self._contact_free, self._weighed = 0, 0.0
-            self._film = Film(grid_of(scene)[:1], np.ones(1), np.zeros(moved.shape[2]), _INTACT)
+            self._film = Film(grid_of(scene)[:1], np.ones(1), np.zeros(moved.shape[2]), TISSUES.intact)
         mean = self._view.resample.mean
         moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
         seen = observe(moved, spread, self._view.mask)
         self._seen.append(seen)
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
-        if seen.signal_mm > _ANEW * self._weighed and seen.signal_mm > posterior.LEAST_MM:
+        if seen.signal_mm > max(TISSUES.stronger * self._weighed, posterior.MODEL.least_mm):
             self._weighed = seen.signal_mm
             self._film = weigh_tissues(scene, self._seen[-1:], self._film.own_mm)
         return self._answer(seen, picture)
@@ -127,13 +127,11 @@ class Physics:
         young = assumed_young(self._scene.young_kpa)
         found = infer(self._film, seen)
         covered = float(self._film.weight @ [one.membrane > 0 for one in self._film.tissues])
-        force = replace(found.force, common=_STIFFNESS * covered)
-        gain, eyes = float(np.hypot(_GAIN, self._scene.young_uncertainty)), len(seen.moved) - 1
+        force = replace(found.force, common=TISSUES.stiffness * covered)
+        gain, eyes = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(seen.moved) - 1
         low, high = size_interval(force, gain, eyes)
-        density = None
-        if picture:
-            density = np.float32(young) * self._picture(found)
-        likely = force.times(young).with_gain(_GAIN)
+        density = np.float32(young) * self._picture(found) if picture else None
+        likely = force.times(young).with_gain(TISSUES.gain)
         return ForceEstimate(young * force.mean, density, young * low, young * high, likely)
 
     def _picture(self, found: Posterior) -> Field:
@@ -158,34 +156,33 @@ def grid_of(scene: MethodContext) -> tuple[TissueKind, ...]:
     """The tissues that a recording may be of, with the likeliest Poisson's ratio of those it allows."""
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     low, high = scene.poisson
-    middle = next((nu for nu in _POISSON if low <= nu <= high), round((low + high) / 2, 3))
-    stiff = {"stripped": MEMBRANES[:1], "intact": MEMBRANES[1:], "unknown": MEMBRANES}[scene.membrane]
-    edges: tuple[Edge, ...] = ("free",) if radius > _WIDE * OPENING_MM else ("bonded", "slipping")
+    middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
+    every = TISSUES.membranes_mm
+    stiff = {"stripped": every[:1], "intact": every[1:], "unknown": every}[scene.membrane]
+    edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
     return tuple(
         TissueKind(edge, one, middle, stretch)
         for edge in edges
         for one in stiff
-        for stretch in (STRETCHES if one else STRETCHES[:1])
+        for stretch in (TISSUES.stretches if one else TISSUES.stretches[:1])
     )
 
 
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
-    assert known in get_args(MembraneState)
-    stiff = np.array([one.membrane > 0 for one in tissues])
     if known != "unknown":
         return np.full(len(tissues), 1 / len(tissues))
-    share = np.where(stiff, _INTACT / max(stiff.sum(), 1), (1 - _INTACT) / max((~stiff).sum(), 1))
-    return np.asarray(share, np.float64)
+    stiff, intact = np.array([one.membrane > 0 for one in tissues]), TISSUES.intact
+    return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
 def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Floats) -> Film:
     """Tissues weighed by the strongest frames; Poisson's ratio at the likeliest edge and membrane."""
-    strongest = sorted(seen, key=lambda one: -one.signal_mm)[: 3 * _STRONGEST : 3] or list(seen[:1])
+    strongest = sorted(seen, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [one for one in strongest if one.size_mm > 0]
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
-        return _TEMPER * sum(posterior.infer(basis, one, own_mm).evidence for one in strongest)
+        return TISSUES.temper * sum(posterior.infer(basis, one, own_mm).evidence for one in strongest)
 
     tissues = list(grid_of(scene))
     score = [
@@ -194,15 +191,15 @@ def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Flo
     ]
     best = int(np.argmax(score))
     low, high = scene.poisson
-    others = [nu for nu in _POISSON if low <= nu <= high and nu != tissues[best].poisson]
+    others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
     told = evidence(tissues[best]) if others else 0.0
     score[best] -= np.log(1 + len(others))  # they share what it was thought beforehand
     for nu in others:
         tissues.append(replace(tissues[best], poisson=nu))
         score.append(score[best] + evidence(tissues[-1]) - told)
     weight = softmax(score)
-    kept = np.argsort(-weight)[: max(1, min(2, int((weight > _LEAST).sum())))]
-    covered = float(weight @ [one.membrane > _THIN for one in tissues])
+    kept = np.argsort(-weight)[: max(1, min(2, int((weight > TISSUES.least).sum())))]
+    covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])
     return Film(tuple(tissues[k] for k in kept), weight[kept] / weight[kept].sum(), own_mm, covered)
 
 
@@ -246,10 +243,10 @@ def describe(film: Film, scene: MethodContext) -> str:
     young = assumed_young(scene.young_kpa) if scene.young_kpa else 1.0
     bare, covered = max(1 - film.membrane, 1e-3), max(film.membrane, 1e-3)
     if covered <= bare:
-        least = f"no evidence for a membrane above {_THIN * young:.2g} {unit}"
+        least = f"no evidence for a membrane above {TISSUES.thin_mm * young:.2g} {unit}"
         return f"{least}, odds {bare / covered:.3g} : 1 against; {said}"
     stiff = np.array([one.membrane for one in film.tissues])
-    thick, about = stiff > _THIN, ""
+    thick, about = stiff > TISSUES.thin_mm, ""
     if thick.any():
         about = f" of about {float(np.average(stiff[thick], weights=film.weight[thick])) * young:.2g} {unit}"
     return f"evidence for a membrane{about}, odds {covered / bare:.3g} : 1; {said}"

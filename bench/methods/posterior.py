@@ -1,12 +1,12 @@
-"""One Bayesian linear inverse: what loads a displacement tells of, and how surely.
+"""A Bayesian linear inverse: from displacement to loads and their uncertainty.
 
     d = C f / E + N a + e
 
-d: displacement seen at P points, C the compliance. Loads f are smooth ones spread over the opening, and a
-contact of unknown place and width on top; both sizes are by marginal likelihood, each frame. N a is what the
-tissue does by itself, six polynomials of second degree a component with sizes that somebody knows,
-marginalised. e has flow's stated deviations, multiplied as its errors go together, and a share of the
-displacement itself: what the compliance, of another shape than the tissue, cannot explain.
+d: displacement at P points, C the compliance. Loads f are smooth ones spread over the opening, and a contact
+of unknown place and width on top; both sizes are by marginal likelihood, each frame. N a is the tissue's own
+motion, six polynomials of second degree a component with given sizes, marginalised. e has flow's stated
+deviations, multiplied as its errors are correlated, and a share of the displacement itself: what the
+compliance, of another shape than the tissue, cannot explain.
 
 All is Gaussian but place, width and the sizes, which are summed over a grid (Bishop, Pattern Recognition and
 Machine Learning, 2006, ch. 3; rank-3 updates of the evidence by the matrix determinant lemma).
@@ -27,47 +27,46 @@ from bench.methods.compliance import OPENING_MM, TissueKind
 from bench.methods.force_mixture import ForceMixture
 
 Floats = NDArray[np.float64]
+Axes = tuple[float, float, float]
 
-_RANK = 100
-_SMOOTH_MM, _AROUND_MM = 2.0, 1.5
-_RADII_MM = (2.4, 3.4, 4.8)
-_REACH_MM = 9.5
-"""Contacts stand so near to the opening's middle."""
-_SPREAD = (0.03, 0.15, 0.75)
-"""Deviations of the smooth loads' total a component, mN a kPa."""
-_CONTACTS = ((1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
-"""The same of a contact's force along x, y, z: P = F/(E a^2) of 0.03 to 0.3."""
-_PRESSES = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
-"""Of one that presses along the view, for one eye: what it hardly sees would else count as not there, since
-forces across, which it sees, are not."""
-_CORRELATED, _MISFIT, _UNMET = 3.0, 0.1, 2.0
-"""Variances count so much more as errors at neighbouring points go together; what of the displacement the
-compliance cannot explain; how much larger the tissue's own motion is than few frames without contact show."""
-LEAST_MM = 0.005
-"""Of flow's deviation, whatever is stated."""
-_DRAWN = 128
+
+@dataclass(frozen=True)
+class ModelConstants:
+    """Constants of the model, by hand where no source is given; errors: docs/results/scoring/together."""
+
+    rank: int = 100  # directions of displacement that are kept of the compliance
+    smooth_mm: float = 2.0  # correlation length of the smooth loads
+    smooth: tuple[float, ...] = (0.03, 0.15, 0.75)  # deviations of their total, a component [mN/kPa]
+    radii_mm: tuple[float, ...] = (2.4, 3.4, 4.8)  # of contacts, whose load falls as (1 - r^2 / R^2)^2
+    reach_mm: float = 9.5  # of contacts from the middle of the opening, whose radius is 12
+    contacts: tuple[Axes, ...] = ((1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
+    """Deviations of a contact's force along x, y, z [mN/kPa]: F / (E a^2) of 0.03 to 0.3."""
+    presses: tuple[Axes, ...] = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
+    """With one camera also these, along the optical axis: without them 107 of 120 drawn presses lay outside
+    their interval, with them 10 (docs/design.md)."""
+    correlated: float = 3.0  # factor of flow's variances: errors at neighbouring points are correlated
+    misfit: float = 0.1  # share of the local displacement that the compliance cannot explain
+    around_mm: float = 1.5  # what is local: of each point alone 80, not 90, of 100 draws are held (design.md)
+    unmet: float = 2.0  # factor of the tissue's own motion: few frames don't show a whole rhythm (science.md)
+    least_mm: float = 0.005  # of flow's deviation, whatever is stated
+    draws: int = 128  # of hypotheses in a posterior
+
+
+MODEL = ModelConstants()
 
 
 @dataclass(frozen=True, eq=False)
 class LoadBasis:
     """A compliance in the few directions of displacement that smooth loads can cause, E = 1 kPa."""
 
-    motion: Floats
-    """(C P, R + 6 C) mm: orthonormal directions, then the polynomials."""
-    size: Floats
-    """(R,) deviation along each for loads of unit size."""
-    force: Floats
-    """(3, R) total force of a coefficient [mN/mm]."""
-    unseen: Floats
-    """(3,) variance of the total force in the directions left out, loads of unit size."""
-    contacts: NDArray[np.float32]
-    """(R, H, 3) coefficients of contacts of 1 mN along each axis."""
-    loads: Floats
-    """(3 K, R) mN at the nodes of a coefficient."""
-    shares: Floats
-    """(K, H) what each node carries of a contact."""
-    around: Floats
-    """(P, P) means over neighbouring points."""
+    motion: Floats  # (C P, R + 6 C) mm: orthonormal directions, then the polynomials
+    size: Floats  # (R,) deviation along each for loads of unit size
+    force: Floats  # (3, R) total force of a coefficient [mN/mm]
+    unseen: Floats  # (3,) variance of the total force in the directions left out, loads of unit size
+    contacts: NDArray[np.float32]  # (R, H, 3) coefficients of contacts of 1 mN along each axis
+    loads: Floats  # (3 K, R) mN at the nodes of a coefficient
+    shares: Floats  # (K, H) what each node carries of a contact
+    around: Floats  # (P, P) means over neighbouring points
     known: compliance.Compliance
 
 
@@ -75,10 +74,8 @@ class LoadBasis:
 class Observation:
     """One frame's displacement at the compliance's points."""
 
-    moved: Floats
-    """(C, P) mm."""
-    deviation: Floats
-    """(C, P) mm, stated; infinite where nothing is seen."""
+    moved: Floats  # (C, P) mm
+    deviation: Floats  # (C, P) mm, stated; infinite where nothing is seen
 
     @property
     def size_mm(self) -> float:
@@ -96,50 +93,48 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What a frame tells of its loads."""
+    """Loads of a frame and their uncertainty."""
 
-    evidence: float
-    """Logarithm of the marginal likelihood."""
-    force: ForceMixture
-    """Over E [mN/kPa]."""
-    load: Floats
-    """(K, 3) mean load at the nodes."""
+    evidence: float  # logarithm of the marginal likelihood
+    force: ForceMixture  # over E [mN/kPa]
+    load: Floats  # (K, 3) mean load at the nodes
 
 
 @lru_cache(maxsize=32)
 def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
-    """The reduced compliance of a tissue, seen in 2 or 3 components."""
+    """The reduced compliance of a tissue, observed in 2 or 3 components."""
     known = compliance.build(components=components, tissue=tissue)
     count = len(known.nodes)
     apart = np.square(known.nodes[:, None] - known.nodes[None]).sum(axis=-1)
-    kernel = np.exp(-apart / (2 * _SMOOTH_MM**2)) * known.node_area[:, None] * known.node_area
+    kernel = np.exp(-apart / (2 * MODEL.smooth_mm**2)) * known.node_area[:, None] * known.node_area
     root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
     root /= np.linalg.norm(root.sum(axis=0))
     by_node = known.matrix.reshape(-1, count, 3)
     smooth = np.tensordot(by_node, root, (1, 0)).transpose(0, 2, 1).reshape(len(by_node), -1)
     values, vectors = eigh(smooth.T @ smooth)
-    vectors, seen = vectors[:, ::-1], np.sqrt(np.maximum(values[::-1], 1e-30))
-    motion = smooth @ (vectors[:, :_RANK] / seen[:_RANK])
+    rank, vectors = MODEL.rank, vectors[:, ::-1]
+    seen = np.sqrt(values[: -rank - 1 : -1])
+    motion = smooth @ (vectors[:, :rank] / seen)
     loads = np.tensordot(root, vectors.reshape(count, 3, -1), (1, 0)).reshape(3 * count, -1)
     total = loads.reshape(count, 3, -1).sum(axis=0)
     shares = []
-    within = np.hypot(*known.nodes.T) <= _REACH_MM
-    for radius in _RADII_MM:
+    within = np.hypot(*known.nodes.T) <= MODEL.reach_mm
+    for radius in MODEL.radii_mm:
         share = np.clip(1 - apart / radius**2, 0, None) ** 2 * known.node_area[:, None]
         shares.append((share / share.sum(axis=0))[:, within])
     shares_of = np.concatenate(shares, axis=1)
-    seen_by = (motion.T @ known.matrix).reshape(_RANK, count, 3)
+    seen_by = (motion.T @ known.matrix).reshape(rank, count, 3)
     contacts = np.einsum("rka,kh->rha", seen_by, shares_of, optimize=True)
     near = np.square(known.points[:, None] - known.points[None]).sum(axis=-1)
-    near = np.exp(-near / (2 * _AROUND_MM**2))
+    near = np.exp(-near / (2 * MODEL.around_mm**2))
     own = np.kron(np.eye(components), polynomials(known.points))
     return LoadBasis(
         np.hstack([motion, own]),
-        seen[:_RANK],
-        total[:, :_RANK] / seen[:_RANK],
-        np.square(total[:, _RANK:]).sum(axis=1),
+        seen,
+        total[:, :rank] / seen,
+        np.square(total[:, rank:]).sum(axis=1),
         contacts.astype(np.float32),
-        loads[:, :_RANK] / seen[:_RANK],
+        loads[:, :rank] / seen,
         shares_of,
         near / near.sum(axis=1, keepdims=True),
         known,
@@ -163,18 +158,18 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
     for axis in range(components if contact_free else 0):
         excess = []
         for seen in contact_free:
-            weight = 1 / (_CORRELATED * (seen.deviation[axis] ** 2 + LEAST_MM**2))
+            weight = 1 / (MODEL.correlated * (seen.deviation[axis] ** 2 + MODEL.least_mm**2))
             gram = terms.T @ (terms * weight[:, None])
             if np.linalg.cond(gram) < 1e8:
                 inverse = np.linalg.inv(gram)
-                said = inverse @ (terms.T @ (weight * seen.moved[axis]))
-                excess.append(said**2 - np.diag(inverse))
-        found[axis] = _UNMET * np.sqrt(max(float(np.mean(excess)), 0.0)) if excess else 0.0
+                fitted = inverse @ (terms.T @ (weight * seen.moved[axis]))
+                excess.append(fitted**2 - np.diag(inverse))
+        found[axis] = MODEL.unmet * np.sqrt(max(float(np.mean(excess)), 0.0)) if excess else 0.0
     return found
 
 
 def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
-    """Loads that a frame tells of.
+    """The loads of a frame.
 
     Args:
         basis: of the tissue.
@@ -182,13 +177,13 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
         own_mm: (C,) size of the tissue's own motion, a component.
     """
     rank, count = len(basis.size), basis.contacts.shape[1]
-    sizes = np.array(_CONTACTS if len(seen.moved) == 3 else (*_CONTACTS, *_PRESSES))
+    sizes = np.array(MODEL.contacts + (MODEL.presses if len(seen.moved) == 2 else ()))
     levels, score = _weigh(basis, seen, own_mm, sizes)
     # Systematic draws: as many of each hypothesis as it is likely, none left out for being one of many.
     likely = np.cumsum(np.exp(score - logsumexp(score)))
-    drawn = np.searchsorted(likely, (np.arange(_DRAWN) + 0.5) / _DRAWN * likely[-1])
+    drawn = np.searchsorted(likely, (np.arange(MODEL.draws) + 0.5) / MODEL.draws * likely[-1])
     best, times = np.unique(drawn, return_counts=True)
-    share = times / _DRAWN
+    share = times / MODEL.draws
     force, covariance = np.empty((len(best), 3)), np.empty((len(best), 3, 3))
     coefficients, carried = np.zeros(rank), np.zeros((len(basis.shares), 3))
     for k, (hypothesis, part) in enumerate(zip(best, share, strict=True)):
@@ -222,7 +217,7 @@ def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -
     moved = seen.moved.ravel()
     # Of neighbours: a point's own square would weigh down the points that err upwards.
     local = basis.around @ np.square(seen.moved).mean(axis=0)
-    noise = _CORRELATED * (seen.deviation**2 + LEAST_MM**2 + _MISFIT**2 * local)
+    noise = MODEL.correlated * (seen.deviation**2 + MODEL.least_mm**2 + MODEL.misfit**2 * local)
     weight = 1 / noise.ravel()
     own = np.repeat(np.square(own_mm), 6)
     columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
@@ -234,7 +229,7 @@ def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -
     count = basis.contacts.shape[1]
     flat = basis.contacts.reshape(rank, -1)
     levels, evidence = list[_Level](), list[Floats]()
-    for spread in _SPREAD:
+    for spread in MODEL.smooth:
         prior = np.concatenate([np.square(spread * basis.size), own[own > 0]])
         factor = cho_factor(gram + np.diag(1 / prior), lower=True)
         mean = cho_solve(factor, right)
@@ -267,15 +262,9 @@ def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -
 class _Level:
     """Smooth loads of one size, and what contacts find beside them."""
 
-    mean: Floats
-    """(R,) of the smooth loads' coefficients."""
-    square: Floats
-    """(H, 3, 3) precision of each contact's force by what the smooth loads can't explain."""
-    pull: Floats
-    """(H, 3) that, times the force."""
-    taken: Floats
-    """(R, R) what smooth loads take up of a displacement."""
-    force: Floats
-    """(3,) total of the smooth loads."""
-    covariance: Floats
-    """(3, 3) of that."""
+    mean: Floats  # (R,) of the smooth loads' coefficients
+    square: Floats  # (H, 3, 3) precision of each contact's force by what the smooth loads can't explain
+    pull: Floats  # (H, 3) that, times the force
+    taken: Floats  # (R, R) what smooth loads take up of a displacement
+    force: Floats  # (3,) total of the smooth loads
+    covariance: Floats  # (3, 3) of that

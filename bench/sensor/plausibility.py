@@ -1,12 +1,13 @@
-"""Whether a force sensor's record can be that of the film: unit, sign, axes, clock, and whether it measures.
+"""Plausibility of a force sensor's record, given the video: unit, sign, axes, clock, and saturation.
 
-No method is trusted for this; but what all of them contradict alike is the sensor's, or what they share.
+No single method is trusted for this; what all of them contradict alike is the sensor's, or what they share.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,33 @@ from synth.recording_flow.finding import Finding
 
 Curve = NDArray[np.float64]
 
-_ODD_UNIT, _ANOTHER_UNIT = 12.0, 50.0  # factors that all methods are off by, to the same side
-_METHODS = 2  # fewer may be what is wrong themselves
-_PRESSED, _ALIKE = 0.3, 0.7  # share of a peak, correlation: what a unit is judged by
-_SIDEWAYS = 0.2  # of the force must lie in the axes that are seen
-_LITTLE, _MUCH, _APART = 0.2, 0.7, 0.5  # cosine of what doesn't agree, of what does, and between them
-_LATE_S = 1.5
-_SURE, _LESS = 0.96, 0.3  # correlation; share of what it lacks that another clock must leave
-_TRIED = 30  # lags either way, and places of a gap, at most
-_LEAST_PART = 4  # frames before a gap, and after it
-_COMMON = 0.6  # share of the frames that another clock must leave
-_STANDS_FRAMES, _MOVES = 3, 0.25  # share of the largest motion
-_LEAST_FRAMES = 8
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When a record is implausible: by hand, between the corrupted and the clean recordings of
+    docs/results/scoring/stability, which says what is found and what is wrongly named."""
+
+    frames: int = 8  # at least
+    odd_unit: float = 12.0  # factor by which all methods are off, to the same side
+    another_unit: float = 50.0  # such a factor that no force may be given
+    methods: int = 2  # that a unit needs: a single one may be wrong itself
+    pressed: float = 0.3  # share of the peak; of these frames a unit is judged
+    alike: float = 0.7  # correlation of a method that may judge a unit
+    sideways: float = 0.2  # share of the force that must lie in the observed axes
+    disagree: float = 0.2  # cosine of two forces, at most
+    agree: float = 0.7  # at least, in other axes
+    apart: float = 0.5  # between the two
+    late_s: float = 1.5  # of a clock, either way
+    sure: float = 0.96  # correlation of force and motion at which no clock is doubted
+    left: float = 0.3  # of what correlation lacks to 1, share that another clock may leave
+    tried: int = 30  # lags either way, and places of a gap, at most: time
+    part: int = 4  # frames before a gap and after it, at least
+    common: float = 0.6  # share of the frames that another clock must leave
+    stands: int = 3  # frames of one value that are no saturation
+    moves: float = 0.25  # share of the largest motion meanwhile that makes them one
+
+
+LIMITS = Thresholds()
 
 
 def judge_sensor(
@@ -44,7 +60,7 @@ def judge_sensor(
     known = np.isfinite(axes_mn).all(axis=1) & np.isfinite(moved)
     t, axes, moved = time_s[known], axes_mn[known], moved[known]
     size = np.linalg.norm(axes, axis=1)
-    if len(t) < _LEAST_FRAMES or not np.ptp(moved) > 0:
+    if len(t) < LIMITS.frames or not np.ptp(moved) > 0:
         return []
     if not np.ptp(axes, axis=0).any():
         said = f"force.csv says {size[0]:.3g} mN all the time, while the tissue moves"
@@ -52,7 +68,7 @@ def judge_sensor(
         return [Finding("bad" if size[0] else "odd", "sensor", said)]
     told = [np.nan_to_num(force[known]) for force in forces]
     n = seen_axes or 3
-    sideways = np.linalg.norm(axes[:, :n]) > _SIDEWAYS * np.linalg.norm(axes)
+    sideways = np.linalg.norm(axes[:, :n]) > LIMITS.sideways * np.linalg.norm(axes)
     found = _unit(axes[:, :n], [force[:, :n] for force in told]) if sideways else []
     found += _axes(axes, told, n) if sideways and seen_axes else []
     return [*found, *_clock(t, size, moved), *_stands(t, axes, moved)]
@@ -62,18 +78,18 @@ def _unit(axes: Curve, forces: Sequence[Curve]) -> list[Finding]:
     """By the median over the frames that are pressed on, of methods that follow the sensor."""
     gains, size = [], np.linalg.norm(axes, axis=1)
     for force in (np.linalg.norm(one, axis=1) for one in forces):
-        pressed = force > _PRESSED * float(np.quantile(force, 0.98))
-        if _correlation(size, force) > _ALIKE and pressed.any():
+        pressed = force > LIMITS.pressed * float(np.quantile(force, 0.98))
+        if _correlation(size, force) > LIMITS.alike and pressed.any():
             gains.append(float(np.log(max(np.median(size[pressed] / force[pressed]), 1e-9))))
     least = min(map(abs, gains), default=0.0)
-    if len(gains) < _METHODS or least < np.log(_ODD_UNIT) or not (min(gains) > 0 or max(gains) < 0):
+    if len(gains) < LIMITS.methods or least < np.log(LIMITS.odd_unit) or min(gains) < 0 < max(gains):
         return []
     factor, more = np.exp(abs(np.median(gains))), "larger" if gains[0] > 0 else "smaller"
     said = (
         f"the sensor's force is {factor:.2g} times {more} than every method's: a unit is wrong "
         "(mN for N, and Pa or MPa for kPa, make 1000, grams 102, cm for mm 100)"
     )
-    return [Finding("odd" if least < np.log(_ANOTHER_UNIT) else "bad", "sensor", said)]
+    return [Finding("odd" if least < np.log(LIMITS.another_unit) else "bad", "sensor", said)]
 
 
 def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
@@ -89,7 +105,7 @@ def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
         for signs in itertools.product((1, -1), repeat=n)
     }
     best, now = max(found, key=lambda key: found[key]), float(np.trace(both))
-    if now > _LITTLE or found[best] < max(_MUCH, now + _APART):
+    if now > LIMITS.disagree or found[best] < max(LIMITS.agree, now + LIMITS.apart):
         return []
     names = ", ".join(f"{'-' * (sign < 0)}f{'xyz'[j]}_n" for j, sign in zip(*best, strict=True))
     said = f"the tissue moves as if the force along the camera's axes were {names} of force.csv"
@@ -100,13 +116,13 @@ def _axes(axes: Curve, forces: Sequence[Curve], n: int) -> list[Finding]:
 
 def _clock(time_s: Curve, size: Curve, moved: Curve) -> list[Finding]:
     """Whether force and motion agree much better at another clock, from some frame on, or backwards."""
-    best, found = _LESS, ""
-    for said, at in _clocks(time_s) if _correlation(size, moved) < _SURE else ():
+    best, found = LIMITS.left, ""
+    for said, at in _clocks(time_s) if _correlation(size, moved) < LIMITS.sure else ():
         inside = (at >= time_s[0]) & (at <= time_s[-1])
-        if inside.sum() < max(_COMMON * len(at), _LEAST_FRAMES):
+        if inside.sum() < max(LIMITS.common * len(at), LIMITS.frames):
             continue
         now, other = (_correlation(np.interp(t[inside], time_s, size), moved[inside]) for t in (time_s, at))
-        if now < _SURE and other > _MUCH + _LITTLE and (1 - other) / (1 - now) < best:
+        if now < LIMITS.sure and other > LIMITS.agree + LIMITS.disagree and (1 - other) / (1 - now) < best:
             best = (1 - other) / (1 - now)
             found = f"force and motion correlate by {now:.2f}, but by {other:.2f} if {said}"
     return [Finding("odd", "clocks", found)] if found else []
@@ -116,14 +132,14 @@ def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
     """What may be wrong with a clock, and when its frames (T,) then were [s]."""
     frame = float(np.median(np.diff(time_s)))
     yield "the film runs backwards", time_s[0] + time_s[-1] - time_s
-    most = round(_LATE_S / frame)
-    for k in range(-most, most + 1, max(1, 2 * most // _TRIED)):
+    most = round(LIMITS.late_s / frame)
+    for k in range(-most, most + 1, max(1, 2 * most // LIMITS.tried)):
         if k == 0:
             continue
         if abs(k) > 1:  # tissue that creeps is as late
             yield f"the sensor's clock is moved by {k * frame:+.2f} s", time_s - k * frame
         said = f"{abs(k) * frame:.2f} s of the film are {'missing' if k < 0 else 'shown twice'}"
-        for start in time_s[_LEAST_PART : -_LEAST_PART : max(1, len(time_s) // _TRIED)]:
+        for start in time_s[LIMITS.part : -LIMITS.part : max(1, len(time_s) // LIMITS.tried)]:
             yield f"{said} at {start:.2f} s", np.where(time_s < start, time_s, time_s - k * frame)
 
 
@@ -131,8 +147,8 @@ def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:
     """Saturated or stuck: a component that keeps one value while the tissue goes on moving."""
     for k, values in enumerate(axes.T):
         for run in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
-            stands = len(run) > _STANDS_FRAMES and values[run[0]] and np.ptp(values)
-            if stands and np.ptp(moved[run]) > _MOVES * np.ptp(moved):
+            stands = len(run) > LIMITS.stands and values[run[0]] and np.ptp(values)
+            if stands and np.ptp(moved[run]) > LIMITS.moves * np.ptp(moved):
                 span = f"{time_s[run[0]]:.3g} to {time_s[run[-1]]:.3g} s"
                 said = f"f{'xyz'[k]}_n stands at {values[run[0]]:.3g} mN from {span} while the tissue moves"
                 return [Finding("odd", "sensor", said + ": saturated, or stuck?")]

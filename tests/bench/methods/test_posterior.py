@@ -99,10 +99,10 @@ def test_the_tissues_own_motion_is_learnt_where_nothing_touches(basis: LoadBasis
 
 @pytest.mark.slow
 def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadBasis) -> None:
-    rng, inside, count = np.random.default_rng(2), 0, 150
+    rng, inside, count, model = np.random.default_rng(2), 0, 150, posterior.MODEL
     sizes = np.array([0.02, 0.02, 0.05])
     for _ in range(count):
-        spread, size = rng.choice(posterior._SPREAD), np.array(rng.choice(posterior._CONTACTS))
+        spread, size = rng.choice(model.smooth), np.array(rng.choice(model.contacts))
         smooth = spread * basis.size * rng.normal(size=len(basis.size))
         contact = size * rng.normal(size=3)
         inward = basis.contacts[:, rng.integers(basis.contacts.shape[1])] @ contact
@@ -112,9 +112,7 @@ def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadB
         moved = (basis.motion @ coefficients).reshape(3, -1)
         # The model counts variances threefold; what it draws has them so.
         local = basis.around @ np.square(moved).mean(axis=0)
-        noise = np.sqrt(
-            posterior._CORRELATED * (0.02**2 + posterior.LEAST_MM**2 + posterior._MISFIT**2 * local)
-        )
+        noise = np.sqrt(model.correlated * (0.02**2 + model.least_mm**2 + model.misfit**2 * local))
         drawn = Observation(moved + noise * rng.normal(size=moved.shape), np.full(moved.shape, 0.02))
         low, high = physics.size_interval(posterior.infer(basis, drawn, sizes).force, 0.0)
         inside += low <= np.linalg.norm(force) <= high
@@ -162,5 +160,7 @@ def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
     assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}
     # What no frame speaks of is as likely as it was beforehand.
     nothing = physics.weigh_tissues(scene, [], STILL)
-    thick = sum(one > 5 for one in physics.MEMBRANES) / sum(one > 0 for one in physics.MEMBRANES)
+    thick = sum(one > 5 for one in physics.TISSUES.membranes_mm) / sum(
+        one > 0 for one in physics.TISSUES.membranes_mm
+    )
     assert nothing.membrane == pytest.approx(0.33 * thick, abs=0.01)
