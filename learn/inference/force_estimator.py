@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import repeat
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.clips import UNKNOWN_YOUNG_KPA
-from learn.inference.grid_placement import GridPlacement, Point, share_at_border
-from learn.inference.predict import ForceMap, Predictor, force_size, net_force
+from learn.inference.grid_placement import GridPlacement, Point
+from learn.inference.predict import ForceMap, Predictor, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_unseen
@@ -23,8 +22,6 @@ from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
 from synth.recording_flow.frame_motion import FrameMotion
-
-_MUCH_AT_BORDER = 0.1  # share of the force; what is spread evenly has a quarter there
 
 
 def predict_force(
@@ -85,8 +82,7 @@ class FrameForce:
     force_mn: NDArray[np.float64]
     """(3,) total force on the tissue in camera axes [mN], that of no motion subtracted; of a model without
     direction the size in x, the rest NaN."""
-    map: ForceMap
-    """As the network predicts it, nothing subtracted."""
+    map: ForceMap  # as the network predicts it, nothing subtracted
     bands: dict[float, Band]
     """By level, the intervals of the force, T = 1 [mN]; empty of a model without intervals."""
 
@@ -113,7 +109,6 @@ class ForceEstimator:
         self._at_rest: dict[Point, ForceMap] = {}
         self.placement = GridPlacement(tissue, scale_mm_per_px, predictor.grid)
         """Where the network's grid lies."""
-        self._at_border = self._in_all = 0.0
         self._seen: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each frame that was followed
 
     def estimate(self, frame: FrameMotion) -> FrameForce:
@@ -129,10 +124,6 @@ class ForceEstimator:
             self._seen.append(found.motion)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]
-        share = share_at_border(found.magnitude, found.view.mask)
-        if not self.placement.fits and math.isfinite(share):
-            size = float(force_size(force))
-            self._at_border, self._in_all = self._at_border + share * size, self._in_all + size
         return FrameForce(force, found, self._bound(force, found))
 
     @property
@@ -145,9 +136,6 @@ class ForceEstimator:
         wide = self._predictor.grid.extent_mm
         note = f"the tissue is wider than the network's {wide:g} mm: it looks at what moves most"
         note += f", and was moved there {self.placement.moves} times" if self.placement.moves else ""
-        share = self._at_border / self._in_all if self._in_all > 0 else 0.0
-        if share > _MUCH_AT_BORDER:
-            note += f"; {100 * share:.0f}% of the force lies at the border of that, what is beyond is lost"
         return [*notes, note]
 
     @property

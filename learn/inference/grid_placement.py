@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +12,11 @@ from synth.flow.confidence import DOUBTFUL
 Point = tuple[float, float]
 """(x, y) px."""
 
+# By hand.
 _CUT_OFF = 0.005  # share of the tissue beyond the grid that doesn't count
 _STILL_PX = 0.5  # motion that says where something happens
 _COARSE = 8  # the place is looked for on a map this much coarser
 _STRAYED = 0.25  # of the grid's width: nearer than that to its centre, motion doesn't move the grid
-_RIM = 16  # the border is this part of the grid's width
 
 
 class GridPlacement:
@@ -73,14 +71,3 @@ class GridPlacement:
             low, high = low + self._half, high - self._half
             placed.append(min(max(value, low), high) if low < high else (low + high) / 2)
         return placed[0], placed[1]
-
-
-def share_at_border(density: NDArray[np.float32], mask: NDArray[np.float32]) -> float:
-    """Share of the force that lies at the grid's own border; NaN where there is none.
-
-    `density`: (N, N) lengths; `mask`: (N, N) where there is tissue.
-    """
-    rim = max(1, len(mask) // _RIM)
-    weight = density * (mask > 0)
-    whole = float(weight.sum())
-    return 1 - float(weight[rim:-rim, rim:-rim].sum()) / whole if whole > 0 else math.nan

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from synth.flow import toolnet
 
+# By hand, on renders and photographs of cortex; `mask_selection` doesn't rely on what they find.
 _CLIPPED = 240.0  # grey levels: at least two channels this high have no texture left
 _ABOVE = 45.0  # grey levels above the local median
 _SOME = 0.1  # mean probability of a grey body that counts as an instrument

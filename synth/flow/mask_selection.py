@@ -20,15 +20,25 @@ from synth.flow import image
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb
 from synth.flow.track import Solution, Tracker
 
-_LARGEST = 0.4  # of the tissue: more is no instrument and no highlight
-_UNEXPLAINED = 0.12  # local deviations by which the residual exceeds that elsewhere
-_GAIN = 0.01  # local deviations by which masking lowers the residual around a block
-_SURE = 3.0  # standard errors by which a block has to show it: small pictures' blocks hold few pixels
-_RING_PX = 6  # what is "around" a block
-_SMALLEST_PX = 20  # so much that was not judged is something new
-_CELLS = 6  # blocks on the longer side
-_GROWN_PX = 0.5  # masks are selected anew as motion grows by so much, or when something new turns up ...
-_FIRST, _EVERY = 4, 60  # ... so often at first, and once in so many frames
+
+@dataclass(frozen=True)
+class SelectionConstants:
+    """When a proposal is masked: chosen on the foreign videos of docs/results/flow/recordings, where always
+    used masks cost 0.55 px and chosen ones 0.17; a local deviation is a picture's unit of contrast."""
+
+    largest: float = 0.4  # share of the tissue: more is no instrument and no highlight
+    unexplained: float = 0.12  # local deviations by which the residual exceeds that elsewhere
+    gain: float = 0.01  # local deviations by which masking lowers the residual around a block
+    sure: float = 3.0  # standard errors by which a block shows either: few pixels show either by chance
+    ring_px: int = 6  # what is "around" a block
+    new_px: int = 20  # so much that was not judged is something new
+    cells: int = 6  # blocks on the longer side
+    grown_px: float = 0.5  # masks are selected anew as motion grows by so much, or at something new ...
+    first: int = 4  # ... so often at first, for time
+    every: int = 60  # ... and once in so many frames
+
+
+SELECTION = SelectionConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +47,11 @@ class Proposal:
 
     glare: Flags
     tool: Flags
-    known: Flags
-    """Masked in any case."""
+    known: Flags  # masked in any case
 
     def within(self, tissue: Flags) -> Proposal:
         """Without the kind that takes more of the tissue than anything real does."""
-        most = _LARGEST * np.count_nonzero(tissue)
+        most = SELECTION.largest * np.count_nonzero(tissue)
         glare, tool = (
             kind if np.count_nonzero(kind & tissue) <= most else np.zeros_like(kind)
             for kind in (self.glare, self.tool)
@@ -57,7 +66,7 @@ class Proposal:
     def blocks(self) -> NDArray[np.int16]:
         """(2, H, W) numbers from 1 on of the squares of glare and of those of tool; 0: neither."""
         height, width = self.glare.shape
-        side = max(1, max(height, width) // _CELLS)
+        side = max(1, max(height, width) // SELECTION.cells)
         row, column = np.arange(height, dtype=np.int16) // side, np.arange(width, dtype=np.int16) // side
         square = 1 + row[:, None] * (column[-1] + 1) + column
         return np.stack([self.glare * square, self.tool * (square + square[-1, -1])])
@@ -106,7 +115,7 @@ class SelectingTracker:
         found = found.within(tracker.tissue)
         verdict = self._verdict[found.blocks()]
         self.blocked = found.known | (verdict > 0).any(0)
-        new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= _SMALLEST_PX
+        new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= SELECTION.new_px
         # Near a proposal the confidence speaks of the proposal, too.
         tracker.unsure = _grown(found.either | self.rest_found.either)
         resets = tracker.resets
@@ -114,9 +123,9 @@ class SelectingTracker:
         first, low_confidence = tracker.last, not tracker.trusted
         assert first is not None
         self._frames += 1
-        due = new or low_confidence or self._motion(flow) > self._tested_px + _GROWN_PX
+        due = new or low_confidence or self._motion(flow) > self._tested_px + SELECTION.grown_px
         proposed = (found.either | self.rest_found.either).any()
-        if due and proposed and self._selections < _FIRST + self._frames / _EVERY:
+        if due and proposed and self._selections < SELECTION.first + self._frames / SELECTION.every:
             self._selections += 1
             better = self._select(frame, found, first)
             if better is not first:
@@ -195,8 +204,10 @@ class SelectingTracker:
                 covered, around = mean(residual, layer, inside), mean(residual, near, common)
                 gain = mean(residual - left, near, common)
                 usually = np.where(np.isfinite(around[1]) & local, around, [[usual], [0.0]])
-                margin = _UNEXPLAINED + _SURE * np.hypot(covered[1], usually[1])
-                chosen |= (covered[0] > usually[0] + margin) | (gain[0] > _GAIN + _SURE * gain[1])
+                margin = SELECTION.unexplained + SELECTION.sure * np.hypot(covered[1], usually[1])
+                chosen |= (covered[0] > usually[0] + margin) | (
+                    gain[0] > SELECTION.gain + SELECTION.sure * gain[1]
+                )
             chosen[0] = False
             return chosen
 
@@ -221,13 +232,13 @@ def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
 
 
 def _widened(number: NDArray[np.int16]) -> NDArray[np.int16]:
-    """(H, W) numbers with `_RING_PX` around each, the larger number first."""
-    wide = 2 * _RING_PX + 1
+    """(H, W) numbers with a ring around each, the larger number first."""
+    wide = 2 * SELECTION.ring_px + 1
     return np.asarray(cv2.dilate(number, np.ones((wide, wide), np.uint8)), np.int16)
 
 
 def _grown(piece: Flags) -> Flags:
-    """(H, W) with `_RING_PX` around it."""
+    """(H, W) with a ring around it."""
     return _widened(piece.astype(np.int16)) > 0
 
 

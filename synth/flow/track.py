@@ -12,12 +12,20 @@ from synth.flow import mask_detection
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
-_DOUBTED = 0.5  # mean confidence of what is visible; frames below it are tried again from nothing
-_MATCHED = 0.1  # share of what is visible that is no lost pixel; below it motion is no better than a guess
-_LEAST = 0.02  # of the tissue must be free of masks for anything to be concluded
-_WIDER = 0.2  # mean confidence that the surroundings must add to be followed with the tissue
-_TRIES = 3  # frames that are asked whether they do
-_DROP = 0.85  # a fall below this share of the last trusted frame's confidence is looked into
+
+@dataclass(frozen=True)
+class TrackingConstants:
+    """When a frame is solved again or lost; by hand where no source is given."""
+
+    low: float = 0.5  # mean confidence of what is visible; frames below it are solved again from nothing
+    drop: float = 0.85  # and so are those below this share of the last trusted frame's
+    matched: float = 0.1  # share of what is visible that is no lost pixel; below it motion is a guess
+    free: float = 0.02  # share of the tissue that must be free of masks for anything to be concluded
+    wider: float = 0.2  # confidence that surroundings must add: else they cost a tenth of error (design.md)
+    tries: int = 3  # frames in which they may: time
+
+
+TRACKING = TrackingConstants()
 
 
 @dataclass(frozen=True)
@@ -36,21 +44,16 @@ class Track:
 class Solution:
     """One answer for a frame."""
 
-    flow: Flow
-    """(H, W, 2) px."""
-    confidence: Map
-    """(H, W) in 0..1; 0 outside the tissue and where it is masked."""
-    level: float
-    """Mean confidence over what is not masked."""
-    matched: float
-    """Share of that whose confidence says that it is not lost."""
-    visible: float
-    """Share of the tissue that is not masked."""
+    flow: Flow  # (H, W, 2) px
+    confidence: Map  # (H, W) in 0..1; 0 outside the tissue and where it is masked
+    level: float  # mean confidence over what is not masked
+    matched: float  # share of that whose confidence says that it is not lost
+    visible: float  # share of the tissue that is not masked
 
     @property
     def is_matched(self) -> bool:
         """Whether enough of what is visible is found again."""
-        return self.matched >= _MATCHED
+        return self.matched >= TRACKING.matched
 
 
 class Tracker:
@@ -120,11 +123,11 @@ class Tracker:
 
         Where tissue is faint, what lies still around it holds the flow; elsewhere it pulls at the rim.
         """
-        if self.widened or self._tries >= _TRIES:
+        if self.widened or self._tries >= TRACKING.tries:
             return found
         self.widened, self._tries = True, self._tries + 1
         wider = self.solve(frame, blocked, None)
-        self.widened = wider.level > found.level + _WIDER
+        self.widened = wider.level > found.level + TRACKING.wider
         return wider if self.widened else found
 
     def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solution:
@@ -134,7 +137,7 @@ class Tracker:
         confidence = confidence * self.tissue
         seen = self.usable & ~blocked
         where, tissue = seen & ~self.unsure, int(np.count_nonzero(self.tissue))
-        if np.count_nonzero(where) < _LEAST * tissue:
+        if np.count_nonzero(where) < TRACKING.free * tissue:
             where = seen
         inside = confidence[where] if where.any() else np.zeros(1, np.float32)
         level = float(inside.mean(dtype=np.float64))
@@ -148,13 +151,13 @@ class Tracker:
 
     def is_doubtful(self, found: Solution) -> bool:
         """Whether an answer is so much worse than the last good one's that others are tried."""
-        return found.level < max(_DOUBTED, _DROP * self._level)
+        return found.level < max(TRACKING.low, TRACKING.drop * self._level)
 
     def accept(self, found: Solution) -> tuple[Flow, Map]:
         """Makes it the frame's answer; the next one starts from it if it can be trusted."""
         self.last = found
         self.lost = ""
-        if found.visible < _LEAST:
+        if found.visible < TRACKING.free:
             self.lost = f"masks leave {100 * found.visible:.2g}% of the tissue"
         elif not found.is_matched:
             self.lost = f"only {100 * found.matched:.0f}% of what is visible matches the rest frame"

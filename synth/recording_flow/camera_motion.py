@@ -1,9 +1,9 @@
-"""The camera's own motion in a film: a similarity of the picture, found on what doesn't deform, and undone.
+"""The camera's own motion in a video: a similarity of the picture, found on what doesn't deform, and undone.
 
 A microscope is bumped, sways, zooms and turns, and a method takes that for the tissue's motion. Corners (Shi
 & Tomasi, CVPR 1994) of the rest frame's surroundings, rim, drape and bone, are followed into each frame
 (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is fitted to them, robustly. Where too
-little of the surroundings shows, the tissue's own motion has to say it: `shared_motion`.
+little of the surroundings is visible, it is found in the tissue's motion: `shared_motion`.
 """
 
 from __future__ import annotations
@@ -19,30 +19,41 @@ from synth.flow.estimator import Flags, Rgb
 
 Floats = NDArray[np.float64]
 
-_CORNERS, _APART_PX, _RIM_PX = 200, 5, 4  # the rim between tissue and surroundings may show either
-_SMOOTH_PX = 1.0  # bilinear sampling of sharper pictures is off by up to 0.03 px
-_WINDOW = (13, 13)
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
-_FAR_PX = 5.0  # of jumps beyond that many corners are lost
-_LEAST_POINTS, _ROUNDS, _SINGULAR = 20, 6, 1e8
-_OUTLIER = 4.0  # standard deviations from which on a corner counts nothing (Tukey's biweight)
-_LEAST_SPREAD_PX = 0.03  # of followed corners
-_TOGETHER = 3.0  # neighbouring corners err alike: so many count as one
-_UNCERTAIN_PX = 0.15  # deviation over the tissue from which on corners show too little
-_UNLIKE = 0.1  # of the motion, by which surroundings near and far differ that deform
-_STILL_PX, _SURE = 0.05, 4.0  # motion of less, or of so few deviations, is a still camera's
+
+
+@dataclass(frozen=True)
+class CornerConstants:
+    """Constants of the fit: by hand, on moved textures (tests/synth/recording_flow/test_camera_motion.py)."""
+
+    corners: int = 200  # at most
+    apart_px: int = 5  # from corner to corner, at least
+    rim_px: int = 4  # between tissue and surroundings, which may show either
+    smooth_px: float = 1.0  # bilinear sampling of sharper pictures is off by up to 0.03 px
+    window: tuple[int, int] = (13, 13)  # px, of local contrast and of Lucas & Kanade
+    far_px: float = 5.0  # of jumps beyond that many corners are lost
+    points: int = 20  # corners, at least
+    rounds: int = 6  # of the robust fit
+    singular: float = 1e8  # condition number of a fit that says nothing
+    outlier: float = 4.0  # standard deviations from which on a corner counts nothing (Tukey's biweight)
+    spread_px: float = 0.03  # of followed corners, at least
+    correlated: float = 3.0  # neighbouring corners err alike: so many count as one
+    uncertain_px: float = 0.15  # deviation over the tissue from which on corners show too little
+    unlike: float = 0.1  # of the motion, by which surroundings near and far differ that deform
+    still_px: float = 0.05  # motion of less is a still camera's
+    sure: float = 4.0  # and of so few deviations
+
+
+CORNERS = CornerConstants()
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
     """How a picture is shifted, turned and scaled against the rest frame's."""
 
-    matrix: Floats
-    """(2, 3): from the rest frame's pixels to the picture's."""
-    deviation_px: float = 0.0
-    """Standard deviation of the shift that it gives the tissue."""
-    length_px: float = 0.0
-    """Root mean square of that shift."""
+    matrix: Floats  # (2, 3): from the rest frame's pixels to the picture's
+    deviation_px: float = 0.0  # standard deviation of the shift that it gives the tissue
+    length_px: float = 0.0  # root mean square of that shift
 
     def undo(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture (H, W[, C]) uint8 as a camera at rest would have taken it."""
@@ -79,10 +90,8 @@ class Similarity:
 class CameraPath:
     """Where the camera was in the frames of a recording."""
 
-    time_s: Floats
-    """(T,), rising."""
-    found: tuple[Similarity | None, ...]
-    """By time; None: it had stood still since the rest frame."""
+    time_s: Floats  # (T,), rising
+    found: tuple[Similarity | None, ...]  # by time; None: it had stood still since the rest frame
 
     def at(self, time_s: float) -> Similarity | None:
         """Where it was; between frames where it was in the one before."""
@@ -135,10 +144,10 @@ class CameraTracker:
         """Starts at the rest frame (H, W, 3); `tissue`: (H, W) may deform; `blocked`: (H, W) tool, glare."""
         self._basis = SimilarityBasis(tissue.shape)
         self._rest = _contrast(rest)
-        element = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
+        element = np.ones((2 * CORNERS.rim_px + 1,) * 2, np.uint8)
         near, hidden = (cv2.dilate(one.astype(np.uint8), element) > 0 for one in (tissue, blocked))
         self._points = _corners(self._rest, ~near & ~hidden)
-        self.is_blind = len(self._points) < _LEAST_POINTS
+        self.is_blind = len(self._points) < CORNERS.points
         """Too little of the surroundings shows in the rest frame."""
         rows, columns = np.nonzero(tissue)
         some = slice(None, None, max(1, len(rows) // 100))
@@ -156,17 +165,17 @@ class CameraTracker:
         last = self._last
         before = last or Similarity(np.eye(2, 3))
         found = self._find(now, before)
-        if found is None and self._length((jump := self._jump(now)) - before.matrix) > _FAR_PX:
+        if found is None and self._length((jump := self._jump(now)) - before.matrix) > CORNERS.far_px:
             found = self._find(now, Similarity(jump))
         if found is None:
             self._unknown_s.append(time_s or 0.0)
             if last is not None:
                 self._last = replace(last, deviation_px=float(np.hypot(last.deviation_px, self._usual_px())))
         # Once it has moved, what is less is still more than nothing.
-        elif last is not None or found.length_px > max(_STILL_PX, _SURE * found.deviation_px):
+        elif last is not None or found.length_px > max(CORNERS.still_px, CORNERS.sure * found.deviation_px):
             step = self._length(found.matrix - before.matrix)
             self._course.append((time_s or 0.0, found, step))
-            if last is not None and step < _SURE * found.deviation_px:
+            if last is not None and step < CORNERS.sure * found.deviation_px:
                 # No more than it may err by, as where a contact moves much: it goes on as it usually does.
                 share = 1 / (1 + (found.deviation_px / max(self._usual_px(), 1e-3)) ** 2)
                 found = replace(found, matrix=last.matrix + share * (found.matrix - last.matrix))
@@ -198,10 +207,10 @@ class CameraTracker:
         if self.is_blind:
             return None
         start = (points @ near.matrix[:, :2].T + near.matrix[:, 2]).astype(np.float32)
-        how = None, None, _WINDOW, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
+        how = None, None, CORNERS.window, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
         there, status, _ = cv2.calcOpticalFlowPyrLK(self._rest, now, points, start, *how)
         known = (status[:, 0] > 0) & ((there > 3) & (there < np.array(now.shape[::-1]) - 4)).all(axis=1)
-        if known.sum() < _LEAST_POINTS:
+        if known.sum() < CORNERS.points:
             return None
         at, shift = points[known].astype(np.float64), (there - points)[known].astype(np.float64)
         guess, _ = cv2.estimateAffinePartial2D(at, at + shift, ransacReprojThreshold=0.5)
@@ -209,17 +218,18 @@ class CameraTracker:
             return None
         design, answer = self._basis.design(at), np.zeros(4)
         left = at + shift - (at @ guess[:, :2].T + guess[:, 2])
-        for _ in range(_ROUNDS):
+        for _ in range(CORNERS.rounds):
             off = np.linalg.norm(left, axis=1)
             weight, spread = weigh_outliers(off, off)
             weighed = np.repeat(weight, 2)[:, None] * design
             normal = weighed.T @ design
-            if weight.sum() < _LEAST_POINTS / 2 or np.linalg.cond(normal) > _SINGULAR:
+            if weight.sum() < CORNERS.points / 2 or np.linalg.cond(normal) > CORNERS.singular:
                 return None
             answer = np.linalg.solve(normal, weighed.T @ shift.ravel())
             left = shift - (design @ answer).reshape(-1, 2)
         tissue = self._basis.design(self._tissue)
-        variance = _TOGETHER * spread**2 * 2 * ((tissue @ np.linalg.inv(normal)) * tissue).sum(axis=1).mean()
+        leverage = ((tissue @ np.linalg.inv(normal)) * tissue).sum(axis=1).mean()
+        variance = CORNERS.correlated * spread**2 * 2 * leverage
         matrix = self._basis.matrix(answer)
         length = self._length(matrix - np.eye(2, 3))
         # What moves more beside the tissue than far from it is tissue that the mask leaves out.
@@ -228,8 +238,8 @@ class CameraTracker:
         apart = [
             (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum() for half in (beside, ~beside)
         ]
-        deforms = np.linalg.norm(apart[0] - apart[1]) > max(_UNLIKE * length, _STILL_PX)
-        if deforms or variance > _UNCERTAIN_PX**2:
+        deforms = np.linalg.norm(apart[0] - apart[1]) > max(CORNERS.unlike * length, CORNERS.still_px)
+        if deforms or variance > CORNERS.uncertain_px**2:
             return None
         return Similarity(matrix, float(np.sqrt(variance)), length)
 
@@ -240,20 +250,20 @@ class CameraTracker:
 
 def weigh_outliers(off: Floats, typical: Floats) -> tuple[Floats, float]:
     """(N,) Tukey's biweight of distances [px], and the deviation of a component that `typical` ones show."""
-    spread = max(float(np.median(typical)) / 1.18, _LEAST_SPREAD_PX)  # Rayleigh's median
-    return np.maximum(1 - (off / (_OUTLIER * spread)) ** 2, 0) ** 2, spread
+    spread = max(float(np.median(typical)) / 1.18, CORNERS.spread_px)  # Rayleigh's median
+    return np.maximum(1 - (off / (CORNERS.outlier * spread)) ** 2, 0) ** 2, spread
 
 
 def _contrast(rgb: Rgb) -> NDArray[np.uint8]:
     """(H, W) local contrast."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), _SMOOTH_PX)
-    return image.local_contrast(grey, _WINDOW)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return image.local_contrast(cv2.GaussianBlur(grey, (0, 0), CORNERS.smooth_px), CORNERS.window)
 
 
 def _corners(picture: NDArray[np.uint8], where: Flags) -> NDArray[np.float32]:
     """(N, 2) px."""
     mask = where.astype(np.uint8) * 255
-    found = cv2.goodFeaturesToTrack(picture, _CORNERS, 0.01, _APART_PX, mask=mask, blockSize=7)
+    found = cv2.goodFeaturesToTrack(picture, CORNERS.corners, 0.01, CORNERS.apart_px, mask=mask, blockSize=7)
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
 
 

@@ -1,6 +1,8 @@
-"""What is no tissue, and no mask knows: it stands in front of it, moves unlike it, or came between."""
+"""Foreground that no mask holds: it stands in front of the tissue, moves unlike it, or came between."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,14 +13,26 @@ from synth.flow.estimator import Flags, Flow, Map
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion
 
-_IN_FRONT_MM, _SIGMAS, _FRONT_SHARE = 2.5, 5.0, 0.005  # more than relief and noise; of the tissue
-_STEP_PX, _STEP_SHARE = 0.25, 0.2  # a jump of the flow: at least this, and this share of the largest motion
-_LEAST_PX = 0.7  # largest motion below which no jump can be told
-_ACROSS_PX = 5  # a jump is looked for across so much to either side
-_LONG = 0.12  # of the picture's width: what an edge extends over, and a contact's rim doesn't
-_LOST_SHARE = 0.02  # of the tissue, in one piece
-_NEAR_PX = 8  # so near to what is masked nothing is concluded
-_ROUNDS = 8
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When something is foreground: by hand, on videos; 13 of 17 with foreign objects are reported, none of
+    19 clean ones (docs/design.md)."""
+
+    front_mm: float = 2.5  # in front of the tissue's surface: more than relief
+    sigmas: float = 5.0  # of the depth about that surface: more than noise
+    front: float = 0.005  # share of the tissue, in one piece
+    step_px: float = 0.25  # that the flow jumps by, at least
+    step: float = 0.2  # and this share of the largest motion
+    least_px: float = 0.7  # largest motion below which no jump is looked for
+    across_px: int = 5  # to either side of a jump
+    long: float = 0.12  # of the picture's width: an edge extends over this, a contact's rim doesn't
+    lost: float = 0.02  # share of the tissue without a match, in one piece
+    near_px: int = 8  # so near to masks nothing is concluded
+    rounds: int = 8  # of the surface's robust fit
+
+
+LIMITS = Thresholds()
 
 
 class ForegroundSearch:
@@ -37,22 +51,24 @@ class ForegroundSearch:
         for known in (frame.masked, frame.rest_masked, frame.confidence == 0 if frame.is_rest else None):
             masked = masked if known is None else masked | known
         self._masked |= masked
-        free = cv2.erode((~masked).astype(np.uint8), _square(_NEAR_PX), borderValue=1) > 0
+        free = cv2.erode((~masked).astype(np.uint8), _square(LIMITS.near_px), borderValue=1) > 0
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)
             surface, deviation = self._surface
             with np.errstate(invalid="ignore"):
-                high = surface - depth_mm > max(_IN_FRONT_MM, _SIGMAS * deviation)
-            self._note("stands in front of the tissue", high & free, frame, _FRONT_SHARE)
+                high = surface - depth_mm > max(LIMITS.front_mm, LIMITS.sigmas * deviation)
+            self._note("stands in front of the tissue", high & free, frame, LIMITS.front)
         if frame.is_rest or not frame.trusted:
             return
         lost = free & (frame.confidence > 0) & (frame.confidence < DOUBTFUL)
-        self._note("hides what was there at rest", lost, frame, _LOST_SHARE)
+        self._note("hides what was there at rest", lost, frame, LIMITS.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
-        if motion > _LEAST_PX:
-            inner = cv2.erode(free.astype(np.uint8), _square(2 * _ACROSS_PX), borderValue=0) > 0
-            jump = flow_jump(frame.flow) > max(_STEP_PX, _STEP_SHARE * motion)
-            self._note("moves unlike tissue", jump & inner & (frame.confidence > DOUBTFUL), frame, 0.0, _LONG)
+        if motion > LIMITS.least_px:
+            inner = cv2.erode(free.astype(np.uint8), _square(2 * LIMITS.across_px), borderValue=0) > 0
+            jump = flow_jump(frame.flow) > max(LIMITS.step_px, LIMITS.step * motion)
+            self._note(
+                "moves unlike tissue", jump & inner & (frame.confidence > DOUBTFUL), frame, 0.0, LIMITS.long
+            )
 
     @property
     def findings(self) -> list[Finding]:
@@ -93,7 +109,7 @@ def fit_surface(depth_mm: Map, tissue: Flags) -> tuple[Map, float]:
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     known = tissue & np.isfinite(depth_mm)
     used, surface, deviation = known, np.full(depth_mm.shape, np.nan), 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(LIMITS.rounds):
         if np.count_nonzero(used) < 10 * terms.shape[-1]:
             break
         surface = terms @ np.linalg.lstsq(terms[used], depth_mm[used], rcond=None)[0]
@@ -114,7 +130,7 @@ def flow_jump(flow: Flow) -> Map:
         shift, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), (flow.shape[1], flow.shape[0])
         return np.asarray(cv2.warpAffine(flow, shift, size, borderMode=cv2.BORDER_REPLICATE))
 
-    most, near, far = np.zeros(flow.shape[:2], np.float32), _ACROSS_PX, 2.5 * _ACROSS_PX
+    most, near, far = np.zeros(flow.shape[:2], np.float32), LIMITS.across_px, 2.5 * LIMITS.across_px
     for dx, dy in ((1, 0), (0, 1), (0.7, 0.7), (0.7, -0.7)):
         a, b, c, d = (beside(k * dx, k * dy) for k in (near, -near, far, -far))
         # Across lie 2 widths, on either side 1.5.

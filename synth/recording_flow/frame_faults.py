@@ -1,9 +1,8 @@
-"""Pictures that show nothing to follow, and films whose pictures were spoilt on their way from the camera.
-
-Thresholds lie between 50 films of the renderer as they are and the same films spoilt.
-"""
+"""Pictures that show nothing to follow, and videos whose pictures were corrupted after the camera."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,22 +10,31 @@ from numpy.typing import NDArray
 
 from synth.recording_flow.finding import Finding
 
-_LEAST_SIDE = 24  # px of the picture; below it no window of any estimator fits
-_LEAST_TISSUE = 400  # px
-_DARK = 12.0  # grey levels that 95% of the tissue stay below
-_FLAT = 0.5  # grey levels of detail; a camera's own noise is more
-_DIM = 60.0  # as `_DARK`; 196 and more in films that are well lit
-_NOISY = 12.0  # grey levels, one standard deviation; below 5
-_SOFT = 0.34  # detail finer than 1 px over that of 1 to 4 px; 0.6 and more, 0.4 after strong compression
-_GRID = 3.0  # steps at every eighth pixel over those between; 1.1, and 2.5 of JPEG at quality 10
-_BLURRED = 0.5  # of the rest frame's finest detail; 0.87 and more
-_COMBED = 1.4  # squared steps to the next row over those to the one after it; 1.1, and 1.2 of noise
-_BAR = 0.14  # of the picture's level, that a black bar stays below: 16 of 255 may be black
-_EVEN = 4.0  # grey levels, spread within a row of it
-_SAME = 0.1  # of the usual change from picture to picture
-_STILL = 0.2  # grey levels by which even the quietest part of a camera's picture changes
-_CAUGHT_UP = 1.6  # usual changes after pictures that stood still
-_LEAPT = 3.0  # times as much change as from the pictures on either side
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When a picture or a video is faulty: between 50 rendered videos, whose values stand last, and the same
+    corrupted; docs/results/scoring/stability has what they find."""
+
+    side: int = 24  # px of the picture at least: no window of any estimator fits into less
+    tissue: int = 400  # px at least
+    dark: float = 12.0  # grey levels that 95% of the tissue stay below
+    flat: float = 0.5  # grey levels of detail; a camera's own noise is more
+    dim: float = 60.0  # as `dark`; 196 and more
+    noisy: float = 12.0  # grey levels, one standard deviation; below 5
+    soft: float = 0.34  # detail finer than 1 px over that of 1 to 4 px; 0.6 and more, strongly compressed 0.4
+    grid: float = 3.0  # steps at every eighth pixel over those between; 1.1, of JPEG at quality 10 2.5
+    blurred: float = 0.5  # of the rest frame's finest detail; 0.87 and more
+    combed: float = 1.4  # squared steps to the next row over those to the one after it; 1.1, of noise 1.2
+    bar: float = 0.14  # of the picture's level, that a black bar stays below: 16 of 255 may be black
+    even: float = 4.0  # grey levels, spread within a row of it
+    same: float = 0.1  # of the usual change from picture to picture
+    still: float = 0.2  # grey levels by which even the stillest part of a camera's picture changes
+    caught_up: float = 1.6  # usual changes after pictures that stood still
+    leapt: float = 3.0  # times as much change as from the pictures on either side
+
+
+LIMITS = Thresholds()
 _SOME = 5  # of a list that are named
 _STRIDE = 4  # every such pixel is compared, unsmoothed: noise tells two pictures apart
 
@@ -39,16 +47,16 @@ def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
         tissue: (H, W).
     """
     height, width = tissue.shape
-    if min(height, width) < _LEAST_SIDE:
+    if min(height, width) < LIMITS.side:
         return f"only {width} x {height} px large"
     count = int(tissue.sum())
-    if count < _LEAST_TISSUE:
+    if count < LIMITS.tissue:
         return f"only {count} px of it are tissue"
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    if float(np.percentile(grey[tissue], 95)) < _DARK:
+    if float(np.percentile(grey[tissue], 95)) < LIMITS.dark:
         return "black"
     detail = grey - cv2.GaussianBlur(grey, (0, 0), 3)
-    if float(detail[tissue].std()) < _FLAT:
+    if float(detail[tissue].std()) < LIMITS.flat:
         return "of one colour, without any detail"
     return ""
 
@@ -56,9 +64,9 @@ def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
 def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(H, W) True on the black bars along the borders of a picture (H, W, 3)."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    bars, least = np.zeros(grey.shape, bool), _BAR * float(np.percentile(grey, 95))
+    bars, least = np.zeros(grey.shape, bool), LIMITS.bar * float(np.percentile(grey, 95))
     for lines, across in ((grey, bars), (grey.T, bars.T)):
-        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < _EVEN)
+        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < LIMITS.even)
         across |= (np.minimum.accumulate(dark) | np.minimum.accumulate(dark[::-1])[::-1])[:, None]
     return bars & ~bars.all()
 
@@ -93,10 +101,16 @@ class FilmFaults:
         self._rest = [
             said
             for wrong, said in (
-                (level < _DIM, f"the film is dim: 95% of the tissue is below grey level {level:.0f} of 255"),
-                (noise > _NOISY, f"the film is noisy: {noise:.0f} grey levels"),
-                (soft < _SOFT, "the rest frame has no fine detail: out of focus, or strongly compressed?"),
-                (min(steps) > _GRID, "the pictures fall into blocks of 8 px: strongly compressed"),
+                (
+                    level < LIMITS.dim,
+                    f"the film is dim: 95% of the tissue is below grey level {level:.0f} of 255",
+                ),
+                (noise > LIMITS.noisy, f"the film is noisy: {noise:.0f} grey levels"),
+                (
+                    soft < LIMITS.soft,
+                    "the rest frame has no fine detail: out of focus, or strongly compressed?",
+                ),
+                (min(steps) > LIMITS.grid, "the pictures fall into blocks of 8 px: strongly compressed"),
             )
             if wrong
         ]
@@ -115,13 +129,13 @@ class FilmFaults:
     def look(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
         """A picture that is followed, and the same as flow is computed on."""
         fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
-        if fine < _BLURRED * self._fine:
+        if fine < LIMITS.blurred * self._fine:
             self._blurred.append(time_s)
         green = rgb[:, ::2, 1].astype(np.float32)
         near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
         # The most torn blocks: elsewhere the picture may be at rest.
         torn = (near / (far + 1))[8::16, 4::8]
-        if torn.size and np.percentile(torn, 98) > _COMBED:
+        if torn.size and np.percentile(torn, 98) > LIMITS.combed:
             self._combed.append(time_s)
 
     def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
@@ -134,10 +148,10 @@ class FilmFaults:
         if not change.any():
             return surely, maybe
         usual = float(np.median(change[change > 0]))
-        noisy = float(np.median(quiet[change > 0])) > _STILL
-        same = np.concatenate([[False], change < _SAME * usual, [False]]).astype(int)
+        noisy = float(np.median(quiet[change > 0])) > LIMITS.still
+        same = np.concatenate([[False], change < LIMITS.same * usual, [False]]).astype(int)
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
-            caught_up = stop < len(change) and change[stop] > _CAUGHT_UP * usual
+            caught_up = stop < len(change) and change[stop] > LIMITS.caught_up * usual
             shown = self._numbers[first - 1] if first else -1
             (surely if noisy or caught_up else maybe).update(dict.fromkeys(self._numbers[first:stop], shown))
         return surely, maybe
@@ -147,7 +161,7 @@ class FilmFaults:
         # An instrument may come in at once; a cut or a bump changes most of the picture.
         again, change = self.repeats()[0], [middling for *_, middling in self._changes]
         beside = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
-        leaps = [k for k, other in enumerate(beside, 1) if change[k] > _LEAPT * other]
+        leaps = [k for k, other in enumerate(beside, 1) if change[k] > LIMITS.leapt * other]
         at = dict(zip(self._numbers, self._times, strict=True))
         found = [Finding("odd", "pictures", said) for said in self._rest]
         for times, said in (

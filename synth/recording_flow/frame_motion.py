@@ -19,37 +19,24 @@ _ODD = 0.2
 class FrameMotion:
     """Motion of the tissue from the rest frame to one frame, on the rest frame's pixels."""
 
-    flow: NDArray[np.float32]
-    """(h, w, 2) px."""
-    confidence: NDArray[np.float32]
-    """(h, w) in 0..1."""
-    trusted: bool = True
-    """Whether the frame could be followed."""
-    reinitialised: bool = False
-    """It could, but only from nothing or with other masks."""
-    is_rest: bool = False
-    """It is the rest frame itself."""
-    masked: Flags | None = None
-    """(h, w) what was masked in the picture; None: nothing."""
-    rest_masked: Flags | None = None
-    """(h, w) what was masked in the rest frame for it; None: nothing."""
+    flow: NDArray[np.float32]  # (h, w, 2) px
+    confidence: NDArray[np.float32]  # (h, w) in 0..1
+    trusted: bool = True  # whether the frame could be followed
+    reinitialised: bool = False  # it could, but only from nothing or with other masks
+    is_rest: bool = False  # it is the rest frame itself
+    masked: Flags | None = None  # (h, w) what was masked in the picture; None: nothing
+    rest_masked: Flags | None = None  # (h, w) what was masked in the rest frame for it; None: nothing
     camera: Similarity | None = None
     """The camera's motion, undone before anything was followed; None: it stood still."""
-    motion: Moved | None = None
-    """In three dimensions; None without a second eye or a depth camera."""
-    index: int = 0
-    """Number in the film."""
-    time_s: float | None = None
-    """On the film's clock; only the rest frame may be without."""
+    motion: Moved | None = None  # in three dimensions; None without a second eye or a depth camera
+    index: int = 0  # number in the film
+    time_s: float | None = None  # on the film's clock; only the rest frame may be without
     rgb: Rgb = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
     """(h, w, 3) the picture, as small as the flow was computed, and as a camera at rest had taken it."""
     cpu_s: float = 0.0
-    wall_s: float = 0.0
-    """Time that the flow took."""
-    masking_s: float = 0.0
-    """Time that shrinking, masking and the camera's motion took."""
-    peak_bytes: int = 0
-    """Memory of the process that computed it, if it was another."""
+    wall_s: float = 0.0  # time that the flow took
+    masking_s: float = 0.0  # time that shrinking, masking and the camera's motion took
+    peak_bytes: int = 0  # memory of the process that computed it, if it was another
 
     @classmethod
     def none(cls, size: tuple[int, ...], *, trusted: bool) -> FrameMotion:
@@ -64,12 +51,10 @@ class TrackingSummary:
     frames: int = 0
     lost: int = 0
     reinitialised: int = 0
-    masked: float = 0.0
-    """Sum over frames of the share of tissue that was masked."""
+    masked: float = 0.0  # sum over frames of the share of tissue that was masked
     masked_count: NDArray[np.float32] | None = None
     """(h, w) in how many frames a pixel of the picture was masked."""
-    rest_masked: Flags | None = None
-    """(h, w) what of the rest frame was masked at last."""
+    rest_masked: Flags | None = None  # (h, w) what of the rest frame was masked at last
 
     def add(self, frame: FrameMotion, tissue: Flags) -> None:
         """Counts a frame, not the rest frame."""

@@ -12,13 +12,29 @@ from scipy.optimize import minimize_scalar
 Floats = NDArray[np.float64]
 Span = tuple[float, float]
 
-HARMONICS, KNOT_S, FOLDS = 3, 4.0, 6  # of a phase, between its corrections, of the time
-RATES_HZ = (0.08, 3.5)  # slowest breath, quickest heart
-LEAST_PERIODS = 3.0  # that the frames must span: fewer are a drift
-MOST = 3  # rhythms (heart, breath, what is left of either), and as many attempts that are none
-PREDICTED = 0.3  # share of the variance that a rhythm predicts in frames it was not fitted to
-EVEN = 3.0  # 95th percentile of amplitude over median: without, 4 of 23 films of contacts have a pulse
-LEAST_PX = 0.03  # of amplitude; less is the flow's own error
+
+@dataclass(frozen=True)
+class RhythmConstants:
+    """What a rhythm is: by hand, on the videos of tests/synth/recording_flow/test_pulse.py."""
+
+    harmonics: int = 3  # of a phase, at most
+    knot_s: float = 4.0  # between corrections of the phase
+    bend: float = 0.3  # of the phase's second differences, over the data's mean weight
+    small: float = 0.01  # the same of the phase itself
+    rounds: int = 6  # of Gauss-Newton
+    folds: int = 6  # of the time, each predicted from the others
+    predicted: float = 0.3  # share of the variance that a rhythm predicts in frames it was not fitted to
+    rates_hz: Span = (0.08, 3.5)  # slowest breath, quickest heart
+    periods: float = 3.0  # that the frames must span: fewer are a drift
+    most: int = 3  # rhythms (heart, breath, what is left of either), and as many attempts that are none
+    even: float = 3.0  # 95th percentile of amplitude over median: without, 4 of 23 videos have a false pulse
+    least_px: float = 0.03  # of amplitude; less is the flow's own error
+    main: int = 6  # components of the motion that rates are searched in; the rest is noise
+    faster: float = 0.95  # share of the loss at a rate that twice or three times that rate must be below
+    alike: float = 0.03  # relative distance of a rate from another's harmonic that is the same
+
+
+RHYTHM = RhythmConstants()
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +42,8 @@ class Rhythm:
     """A motion of the whole surface that follows the harmonics of one phase."""
 
     rate_hz: float
-    knots_s: Floats
-    """(K,) times at which the phase is corrected."""
-    lead: Floats
-    """(K,) by how much it is ahead of the rate there [rad]."""
+    knots_s: Floats  # (K,) times at which the phase is corrected
+    lead: Floats  # (K,) by how much it is ahead of the rate there [rad]
     harmonics: int
     modes: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
     """(2 H, B, C) coefficients of the polynomials, for each wave; empty before the fit."""
@@ -76,7 +90,7 @@ def find_rhythms(
     found: list[Rhythm] = []
     best: list[Rhythm] = []
     accepted: list[bool] = []
-    while accepted.count(True) < MOST and accepted.count(False) < MOST:
+    while accepted.count(True) < RHYTHM.most and accepted.count(False) < RHYTHM.most:
         rate = _strongest_rate(t, y, found)
         if rate is None:
             break
@@ -84,9 +98,9 @@ def find_rhythms(
         if _is_harmonic(found):
             break
         size = fit(t, y, found, back)[-1].amplitude(basis)
-        if np.median(size) < LEAST_PX:
+        if np.median(size) < RHYTHM.least_px:
             break
-        accepted.append(periodic and bool(np.percentile(size, 95) <= EVEN * np.median(size)))
+        accepted.append(periodic and bool(np.percentile(size, 95) <= RHYTHM.even * np.median(size)))
         # What comes after the last rhythm is noise, and fitting it would do harm.
         best = found if accepted[-1] else best
     fitted = list(zip(fit(t, y, best, back), accepted, strict=False))
@@ -110,8 +124,8 @@ def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[R
 
 def visible_rates(t: Floats) -> Span | None:
     """Lowest and highest rate that frames at times (T,) s can show [Hz]; None: they show none."""
-    low = max(RATES_HZ[0], LEAST_PERIODS / max(float(np.ptp(t)), 1e-9))
-    high = min(RATES_HZ[1], 0.45 / float(np.median(np.diff(t))))
+    low = max(RHYTHM.rates_hz[0], RHYTHM.periods / max(float(np.ptp(t)), 1e-9))
+    high = min(RHYTHM.rates_hz[1], 0.45 / float(np.median(np.diff(t))))
     return (low, high) if low < high else None
 
 
@@ -130,7 +144,7 @@ def _design(t: Floats, rhythms: Sequence[Rhythm]) -> Floats:
 
 def _harmonics(t: Floats, rate_hz: float) -> int:
     """As many as the frames can tell apart."""
-    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, HARMONICS))
+    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, RHYTHM.harmonics))
 
 
 def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | None:
@@ -139,9 +153,8 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
     if rates_hz is None:
         return None
     known = _design(t, rhythms)
-    # A few components hold what moves together; the rest is noise.
     u, s, _ = np.linalg.svd(y - known @ np.linalg.lstsq(known, y, rcond=None)[0], full_matrices=False)
-    main = u[:, :6] * s[:6]
+    main = u[:, : RHYTHM.main] * s[: RHYTHM.main]
 
     def loss(rate: float) -> float:
         columns = np.concatenate([known, _waves(2 * np.pi * rate * t, _harmonics(t, rate))], axis=1)
@@ -156,7 +169,7 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
         if order * best < rates_hz[1]:
             around = np.linspace(order * best - 2 * step, order * best + 2 * step, 17)
             faster: float = min(around.tolist(), key=loss)
-            if loss(faster) < 0.95 * loss(best):
+            if loss(faster) < RHYTHM.faster * loss(best):
                 best = faster
                 break
     return float(minimize_scalar(loss, bounds=(best - step, best + step), method="bounded").x)
@@ -167,21 +180,21 @@ def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) ->
 
     Few frames can't tell three harmonics: it has as many as predict what they weren't fitted to.
     """
-    count = max(2, round(float(np.ptp(t)) / max(KNOT_S, 3 / rate)) + 1)
+    count = max(2, round(float(np.ptp(t)) / max(RHYTHM.knot_s, 3 / rate)) + 1)
     knots = np.linspace(t[0], t[-1], count)
     refined: list[Rhythm] = []
     for harmonics in range(_harmonics(t, rate), 0, -1):
         refined = _refine(t, y, [*rhythms, Rhythm(rate, knots, np.zeros(count), harmonics)])
         if _predicts(t, y, refined):
             # Its phase, running behind, may have made it too slow to repeat in so short a time.
-            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= LEAST_PERIODS - 0.5
+            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= RHYTHM.periods - 0.5
     return refined, False
 
 
 def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
     """The phases' leads by Gauss-Newton on the residual, smooth by a prior."""
     now = list(rhythms)
-    for _ in range(6):
+    for _ in range(RHYTHM.rounds):
         design = _design(t, now)
         weights = np.linalg.lstsq(design, y, rcond=None)[0]
         left, at = y - design @ weights, 2
@@ -196,28 +209,28 @@ def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
             normal = (hats * np.square(change).sum(axis=1)[:, None]).T @ hats
             bend = np.diff(np.eye(count), 2, axis=0) if count > 2 else np.zeros((1, count))
             weight = float(np.trace(normal)) / count
-            normal += weight * (0.3 * bend.T @ bend + 0.01 * np.eye(count))
-            pull = hats.T @ (change * left).sum(axis=1) - weight * 0.3 * bend.T @ (bend @ one.lead)
+            normal += weight * (RHYTHM.bend * bend.T @ bend + RHYTHM.small * np.eye(count))
+            pull = hats.T @ (change * left).sum(axis=1) - weight * RHYTHM.bend * bend.T @ (bend @ one.lead)
             now[k] = replace(one, lead=one.lead + np.linalg.solve(normal, pull))
     return now
 
 
 def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
     """Whether the last rhythm, fitted to five sixths of the time, predicts the last sixth, each in turn."""
-    fold = np.arange(len(t)) * FOLDS // len(t)
+    fold = np.arange(len(t)) * RHYTHM.folds // len(t)
 
     def error(design: Floats) -> float:
         total = 0.0
-        for k in range(FOLDS):
+        for k in range(RHYTHM.folds):
             out = fold == k
             predicted = design[out] @ np.linalg.lstsq(design[~out], y[~out], rcond=None)[0]
             total += float(np.square(y[out] - predicted).sum())
         return total
 
-    return error(_design(t, rhythms)) < (1 - PREDICTED) * error(_design(t, rhythms[:-1]))
+    return error(_design(t, rhythms)) < (1 - RHYTHM.predicted) * error(_design(t, rhythms[:-1]))
 
 
 def _is_harmonic(rhythms: Sequence[Rhythm]) -> bool:
     """Whether the last rate is one of the others, or a harmonic of it."""
     *others, last = (one.rate_hz for one in rhythms)
-    return any(abs(last - order * rate) < 0.03 * last for rate in others for order in (0.5, 1, 2, 3))
+    return any(abs(last - order * rate) < RHYTHM.alike * last for rate in others for order in (0.5, 1, 2, 3))

@@ -24,10 +24,23 @@ from synth.recording_flow.harmonic_fit import Floats, Rhythm, Span, find_rhythms
 
 Flags = NDArray[np.bool_]
 
-COLUMNS, DEGREE = 20, 4  # cells across the picture; of the polynomials in x and y
-VISIBLE = 0.3  # share of a cell that must be visible for its motion to count
-LEAST_FRAMES = 30  # without contact: a contact alone, 2.5 s at 10 Hz, shows no rhythm
-REST_NOISE_PX = 0.15  # by which noise of the rest frame displaces a cell at most; more is a motion
+
+@dataclass(frozen=True)
+class CellConstants:
+    """Cells of a surface, and frames free of contact: by hand, on videos of `evidence.scoring.pulse`."""
+
+    columns: int = 20  # cells across the picture
+    degree: int = 4  # of the polynomials in x and y
+    visible: float = 0.3  # share of a cell that must be visible for its motion to count
+    frames: int = 30  # without contact, at least: a contact alone, 2.5 s at 10 Hz, shows no rhythm
+    rest_noise_px: float = 0.15  # by which noise of the rest frame displaces a cell at most; more is a motion
+    smoothest: float = 0.2  # share of the frames that is surely free of contact
+    smooth: float = 2.0  # their largest misfit that others may have
+    explained: float = 2.5  # the smooth frames' median misfit that frames explained by rhythms may have
+    noise_px: float = 1e-3  # added to both
+
+
+CELLS = CellConstants()
 
 
 @dataclass
@@ -38,13 +51,10 @@ class SurfaceMotion:
     then across: all in pixels of the rest frame.
     """
 
-    tissue: Flags
-    """(h, w)."""
+    tissue: Flags  # (h, w)
     time_s: list[float] = field(default_factory=list)
-    motion: list[NDArray[np.float32]] = field(default_factory=list)
-    """(r, c, C) each."""
-    visible: list[NDArray[np.float32]] = field(default_factory=list)
-    """(r, c) share of each cell that is."""
+    motion: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c, C) each
+    visible: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c) share of each cell that is
     depth_weight: float = 1.0
     """Of motion along the view where rhythms are looked for: less, the less certain it is."""
 
@@ -61,7 +71,7 @@ def in_cells(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(r, c, C) mean over each cell of a motion (h, w, C), weighed by (h, w), and (r, c) the weight's."""
     height, width = weight.shape
-    size = (COLUMNS, max(2, round(COLUMNS * height / width)))
+    size = (CELLS.columns, max(2, round(CELLS.columns * height / width)))
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
     parts = [motion[..., k : k + 3] for k in range(0, motion.shape[2], 3)]  # cv2: 4 channels at most
     total = np.dstack([cv2.resize(p * weight[..., None], size, interpolation=cv2.INTER_AREA) for p in parts])
@@ -74,8 +84,7 @@ class PulseEstimate:
     """All rhythms of one recording, in the components of its surface motion."""
 
     rhythms: tuple[Rhythm, ...]
-    basis: NDArray[np.float32]
-    """(h, w, B) at the pixels, 0 outside the tissue."""
+    basis: NDArray[np.float32]  # (h, w, B) at the pixels, 0 outside the tissue
     offset: Floats
     """(B, C) coefficients of the rest frame's own place in the rhythms, from which motion is measured."""
     rest_noise: NDArray[np.float32]
@@ -101,14 +110,10 @@ class PulseEstimate:
 class PulseSearch:
     """What a search for rhythms found, and in which frames."""
 
-    pulse: PulseEstimate | None
-    """None: there is none, or too little shows it."""
-    free_s: Floats
-    """Times of the followed frames that were taken for free of contact."""
-    rates_hz: Span | None
-    """Between which rhythms were looked for; None: they weren't."""
-    reason: str = ""
-    """Why they weren't."""
+    pulse: PulseEstimate | None  # None: there is none, or too little shows it
+    free_s: Floats  # times of the followed frames that were taken for free of contact
+    rates_hz: Span | None  # between which rhythms were looked for; None: they weren't
+    reason: str = ""  # why they weren't
     camera: CameraPath | None = None
     """The camera's motion in what the rhythms leave; None: there is none, or its surroundings show it."""
 
@@ -139,7 +144,7 @@ def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = (
             periodic motion are taken.
     """
     time_s = np.array(surface.time_s)
-    if len(time_s) < LEAST_FRAMES:
+    if len(time_s) < CELLS.frames:
         return _too_few(time_s)
     cells = _Cells(surface, np.array([1.0, 1.0, surface.depth_weight])[: surface.motion[0].shape[2]])
     if len(cells.basis) < 2 * cells.basis.shape[1]:
@@ -150,8 +155,11 @@ def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = (
     else:
         # As smooth as the smoothest fifth: a contact's motion is not.
         misfit = cells.misfit(cells.coefficients)
-        smooth = usable & (misfit <= 2 * np.quantile(misfit[usable], 0.2) + 1e-3) if usable.any() else usable
-    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= LEAST_FRAMES else None
+        smooth = usable
+        if usable.any():
+            most = CELLS.smooth * np.quantile(misfit[usable], CELLS.smoothest) + CELLS.noise_px
+            smooth = usable & (misfit <= most)
+    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= CELLS.frames else None
     if rates_hz is None:
         return _too_few(time_s[smooth])
     rhythms, others, fitted = _least_trimmed(cells, usable, smooth, rounds=1 if free_s else 4)
@@ -181,11 +189,11 @@ class _Cells:
         places = np.column_stack([x.ravel() / columns, y.ravel() / rows])
         visible = visible.reshape(count, -1)
         self.time_s = np.array(surface.time_s)
-        self.used = np.median(visible, axis=0) > VISIBLE
+        self.used = np.median(visible, axis=0) > CELLS.visible
         """(r c,) which of all cells they are."""
         self.basis = _polynomials(places[self.used])
         """(P, B)."""
-        self.weight = np.where(visible[:, self.used] > VISIBLE, visible[:, self.used], 0.0)
+        self.weight = np.where(visible[:, self.used] > CELLS.visible, visible[:, self.used], 0.0)
         """(T, P)."""
         motion = np.stack(surface.motion).reshape(*visible.shape, -1).astype(np.float64)[:, self.used]
         self.motion = motion if weight is None else motion[..., : len(weight)] * weight
@@ -216,7 +224,7 @@ class _Cells:
         noise[enough] = np.nanmedian(left[:, enough], axis=0)
         for part in (noise[:, :2], noise[:, 2:3], noise[:, 3:]):
             length = np.linalg.norm(part, axis=1, keepdims=True)
-            part *= np.minimum(1, REST_NOISE_PX / np.maximum(length, 1e-9))
+            part *= np.minimum(1, CELLS.rest_noise_px / np.maximum(length, 1e-9))
         return noise
 
 
@@ -229,7 +237,7 @@ def _least_trimmed(
     others: tuple[Rhythm, ...] = ()
     for _ in range(rounds):
         fitted = free
-        if fitted.sum() < LEAST_FRAMES:
+        if fitted.sum() < CELLS.frames:
             return (), (), fitted
         rhythms, others = find_rhythms(cells.time_s[fitted], cells.coefficients[fitted], cells.basis)
         if not rhythms:
@@ -237,7 +245,7 @@ def _least_trimmed(
         own = _sum((*rhythms, *others), cells.time_s)
         misfit = cells.misfit(own + (cells.coefficients - own)[fitted].mean(axis=0))
         # Of them as little is left as of most smooth frames; as of most fitted ones would let contacts in.
-        free = usable & (misfit <= 2.5 * np.median(misfit[smooth]) + 1e-3)
+        free = usable & (misfit <= CELLS.explained * np.median(misfit[smooth]) + CELLS.noise_px)
         if (free == fitted).all():
             break
     return rhythms, others, fitted
@@ -278,7 +286,7 @@ def _sum(rhythms: Sequence[Rhythm], time_s: Floats) -> Floats:
 
 
 def _polynomials(at: Floats) -> Floats:
-    """(P, B) products of Legendre polynomials up to `DEGREE` at places (P, 2) in 0..1."""
-    x, y = (np.polynomial.legendre.legvander(2 * axis - 1, DEGREE) for axis in at.T)
-    pairs = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+    """(P, B) products of Legendre polynomials up to `CELLS.degree` at places (P, 2) in 0..1."""
+    x, y = (np.polynomial.legendre.legvander(2 * axis - 1, CELLS.degree) for axis in at.T)
+    pairs = [(i, j) for i in range(CELLS.degree + 1) for j in range(CELLS.degree + 1 - i)]
     return np.stack([x[:, i] * y[:, j] for i, j in pairs], axis=1)

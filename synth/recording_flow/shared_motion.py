@@ -1,14 +1,16 @@
 """The camera's motion where tissue fills the picture: the similarity in its flow that no contact explains.
 
 A contact moves all tissue too, most near itself, and always in much the same shape: elasticity is linear. So
-what a frame's motion has beside its similarity is a few shapes times amounts, which no camera changes; each
-has a similarity of its own, which stays. A Kalman filter (J. Basic Eng. 82, 1960) tells the camera's, which
-goes its own way, from these. Before a shape has been seen without the camera's motion, its similarity is
-that of the least forces on an elastic half-space (Johnson, Contact Mechanics, 1985, ch. 3) that make the
-rest of it. A recording's is smoothed from both ends (Rauch, Tung & Striebel, AIAA J. 3, 1965).
+what a frame's motion has besides its similarity is a few shapes times amounts, which no camera changes; each
+has a constant similarity of its own. A Kalman filter (J. Basic Eng. 82, 1960) separates the camera's, which
+changes, from these. Before a shape has been observed without the camera's motion, its similarity is that of
+the least forces on an elastic half-space (Johnson, Contact Mechanics, 1985, ch. 3) that make the rest of it.
+A recording's is smoothed from both ends (Rauch, Tung & Striebel, AIAA J. 3, 1965).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +24,33 @@ from synth.recording_flow.camera_motion import (
     SimilarityBasis,
     weigh_outliers,
 )
-from synth.recording_flow.pulse import VISIBLE, PulseEstimate, SurfaceMotion, in_cells
+from synth.recording_flow.pulse import CELLS, PulseEstimate, SurfaceMotion, in_cells
 
-_LEAST_PX, _PURE = 0.3, 0.2  # of the first motion that is a camera's, and of it at most what is no similarity
-_JUMP = 5.0  # usual steps: what is sudden
-_USUAL = 8  # steps
-_NOISE_PX = 0.02  # of a frame's similarity
-_CALM_PX = 0.005  # by which a camera at rest moves from frame to frame
-_ROUNDS, _MOST = 4, 0.7  # of a fit
-_MOST_SHAPES, _NEW, _NEW_PX = 4, 0.15, 0.12  # what shapes leave of a motion is another's, if so much
-_DOUBT = 0.5  # of the similarity of a shape of 1 px, as a half-space has it
-_LEFT = 1.0  # px of similarity that go with a px that no shape explains
-_NODES, _POISSON, _NORMAL, _RIDGE = 8, 0.45, 0.3, 0.2  # the half-space's; insensitive, see the tests
+
+@dataclass(frozen=True)
+class MotionModel:
+    """Constants of the filter: by hand, on closed forms (tests/.../test_shared_motion.py)."""
+
+    least_px: float = 0.3  # of a first or sudden motion that is a camera's
+    impure: float = 0.2  # share of it that may be no similarity
+    jump: float = 5.0  # usual steps: what is sudden
+    usual: int = 8  # steps whose median is usual
+    noise_px: float = 0.02  # of a frame's similarity
+    calm_px: float = 0.005  # by which a camera at rest moves from frame to frame
+    rounds: int = 4  # of a robust fit
+    most: float = 0.7  # quantile over cells: less is left of most; a tool and its shadow are in the rest
+    shapes: int = 4  # of contacts, at most
+    new_px: float = 0.12  # what shapes leave of a motion is another shape's, if it is more
+    new: float = 0.15  # and if it is more than this share of the motion
+    doubt: float = 0.5  # deviation of the half-space's similarity, for a shape of 1 px [px]
+    nodes: int = 8  # of the half-space's lattice, across the picture
+    poisson: float = 0.45  # of the half-space
+    normal: float = 0.3  # motion across that a load along the view makes, over that of one across
+    blunt: float = 0.7  # of loads, in spacings of the lattice
+    ridge: float = 0.2  # of least forces, over the mean of the Gram matrix's diagonal
+
+
+MODEL = MotionModel()
 
 
 class SharedMotion:
@@ -75,31 +92,31 @@ class SharedMotion:
             motion: (r, c, 2) px of the cells, see `in_cells`.
             visible: (r, c) share of each that is.
         """
-        weight = np.where(visible > VISIBLE, visible * self._inside, 0.0).ravel().astype(np.float64)
+        weight = np.where(visible > CELLS.visible, visible * self._inside, 0.0).ravel().astype(np.float64)
         now = motion.reshape(-1).astype(np.float64)
-        if np.count_nonzero(weight) < 2 * (self._columns.shape[1] + _MOST_SHAPES):
+        if np.count_nonzero(weight) < 2 * (self._columns.shape[1] + MODEL.shapes):
             return self.course[-1][1] if self.course else None
         plain, _, rest = self._fit(now, weight, self.shapes[:, :0])
         alike, amounts, left = self._fit(now, weight, self.shapes)
         left_px = self._size(left, weight)
         if (
             self._grows
-            and self.shapes.shape[1] < _MOST_SHAPES
-            and left_px > max(_NEW_PX, _NEW * self._size(rest, weight))
+            and self.shapes.shape[1] < MODEL.shapes
+            and left_px > max(MODEL.new_px, MODEL.new * self._size(rest, weight))
         ):
             self._learn(left)
             alike, amounts, left = self._fit(now, weight, self.shapes)
             left_px = self._size(left, weight)
-        usual = float(np.median(self._steps[-_USUAL:])) if self._steps else 0.0
+        usual = float(np.median(self._steps[-MODEL.usual :])) if self._steps else 0.0
         change = self._sudden(now, weight, usual, (self._length(plain), self._size(rest, weight)))
         self._before = now, weight
-        moves = change or (max(usual, _CALM_PX) if self._starts else 0.0)
+        moves = change or (max(usual, MODEL.calm_px) if self._starts else 0.0)
         self._starts = self._starts or (len(self._times) + 1 if change else 0)
         count = len(self._state)
         predicted = self._covariance.copy()
         predicted[range(4), range(4)] += np.square(moves / self._unit) / (1 if change else 2)
         seen = np.hstack([np.eye(4), *(amount * np.eye(4) for amount in amounts)])
-        noise = np.diag((_NOISE_PX**2 + (_LEFT * left_px) ** 2) / np.square(self._unit) / 2)
+        noise = np.diag((MODEL.noise_px**2 + left_px**2) / np.square(self._unit) / 2)
         gain = predicted @ seen.T @ np.linalg.inv(seen @ predicted @ seen.T + noise)
         last = self._state
         self._state = last + gain @ (alike - seen @ last)
@@ -110,10 +127,8 @@ class SharedMotion:
         if not self._starts:
             self._steps.append(0.0)
             return None
-        step, found = (
-            self._length(self._state[:4] - last[:4]),
-            self._similarity(self._state, self._covariance),
-        )
+        step = self._length(self._state[:4] - last[:4])
+        found = self._similarity(self._state, self._covariance)
         if found.deviation_px < max(0.05, 0.3 * step):
             self._steps.append(step)
         self.course.append((time_s, found, step))
@@ -139,7 +154,7 @@ class SharedMotion:
         """(4,) similarity, (S,) amounts of shapes, (2 P,) what is left, of the P cells that are visible."""
         both, left = np.hstack([self._columns, shapes]), motion
         answer, sure = np.zeros(both.shape[1]), weight
-        for _ in range(_ROUNDS):
+        for _ in range(MODEL.rounds):
             weighed = np.repeat(sure, 2)[:, None] * both
             answer = np.linalg.lstsq(weighed.T @ both, weighed.T @ motion, rcond=1e-9)[0]
             left = motion - both @ answer
@@ -157,7 +172,7 @@ class SharedMotion:
         count = len(self._state)
         covariance = np.zeros((count, count))
         covariance[:-4, :-4] = self._covariance
-        covariance[range(count - 4, count), range(count - 4, count)] = np.square(_DOUBT / self._unit) / 2
+        covariance[range(count - 4, count), range(count - 4, count)] = np.square(MODEL.doubt / self._unit) / 2
         self._covariance = covariance
 
     def _sudden(self, now: Floats, weight: Floats, usual: float, since_rest: tuple[float, float]) -> float:
@@ -169,7 +184,11 @@ class SharedMotion:
                 alike, _, left = self._fit(now - self._before[0], both, self.shapes[:, :0])
                 found.append((self._length(alike), self._size(left, both)))
         return max(
-            (size for size, left in found if size > max(_LEAST_PX, _JUMP * usual) and left < _PURE * size),
+            (
+                size
+                for size, left in found
+                if size > max(MODEL.least_px, MODEL.jump * usual) and left < MODEL.impure * size
+            ),
             default=0.0,
         )
 
@@ -189,7 +208,7 @@ class SharedMotion:
     @staticmethod
     def _size(left: Floats, weight: Floats) -> float:
         """Less than this is left of most cells: of a tool's, or its shadow's, it may be much."""
-        return float(np.quantile(np.linalg.norm(left.reshape(-1, 2), axis=1)[weight > 0], _MOST))
+        return float(np.quantile(np.linalg.norm(left.reshape(-1, 2), axis=1)[weight > 0], MODEL.most))
 
 
 def find_path(surface: SurfaceMotion, pulse: PulseEstimate | None) -> CameraPath | None:
@@ -214,17 +233,17 @@ def _half_space(at: Floats, size: tuple[int, ...], columns: Floats) -> Floats:
     Cerruti's and Boussinesq's solutions on a lattice of nodes in and around a picture (h, w), blunted by
     their spacing; along the view with the share in the plane that blunt tips have on a surface that bulges.
     """
-    apart = size[1] / _NODES
+    apart = size[1] / MODEL.nodes
     x, y = (apart * (np.arange(-1, round(length / apart) + 1) + 0.5) for length in size[::-1])
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     dx, dy = np.moveaxis(at[:, None] - nodes, -1, 0)
-    r = np.sqrt(dx**2 + dy**2 + (0.7 * apart) ** 2)
-    along, mixed = (1 - _POISSON) / r, _POISSON / r**3
-    across_x = [along + mixed * dx**2, mixed * dx * dy, _NORMAL * dx / r**2]
-    across_y = [mixed * dx * dy, along + mixed * dy**2, _NORMAL * dy / r**2]
+    r = np.sqrt(dx**2 + dy**2 + (MODEL.blunt * apart) ** 2)
+    along, mixed = (1 - MODEL.poisson) / r, MODEL.poisson / r**3
+    across_x = [along + mixed * dx**2, mixed * dx * dy, MODEL.normal * dx / r**2]
+    across_y = [mixed * dx * dy, along + mixed * dy**2, MODEL.normal * dy / r**2]
     moved = np.stack([np.hstack(across_x), np.hstack(across_y)], 1).reshape(2 * len(at), -1)
     inverse = np.linalg.pinv(columns)
     beside = moved - columns @ (inverse @ moved)
     gram = beside @ beside.T
-    gram += _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
+    gram += MODEL.ridge * np.trace(gram) / len(gram) * np.eye(len(gram))
     return np.asarray(inverse @ moved @ np.linalg.solve(gram, beside).T, np.float64)

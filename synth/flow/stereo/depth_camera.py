@@ -8,11 +8,11 @@ import numpy as np
 from synth.errors import UserError
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map
-from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, fine
+from synth.flow.stereo.depth_motion import Change, Solver, fine
 from synth.flow.stereo.rig import Floats
 from synth.flow.stereo.track import Moved
 
-_CAUTION = 1.5  # the plate's own deviation knows nothing of depth that errs alike over many pixels
+_CAUTION = 1.5  # factor of the plate's deviation, which ignores correlated errors of depth; by hand
 
 
 class DepthTracker:
@@ -22,9 +22,7 @@ class DepthTracker:
     plate that softens where tissue strains, Student's weights, the noise from the residuals' median.
     """
 
-    def __init__(
-        self, K: Floats, rest: Map, blocked: Flags, tissue: Flags, settings: DepthMotionSettings | None = None
-    ) -> None:
+    def __init__(self, K: Floats, rest: Map, blocked: Flags, tissue: Flags) -> None:
         """Starts at rest.
 
         Args:
@@ -32,7 +30,6 @@ class DepthTracker:
             rest: (H, W) mm, depth in the rest frame along the camera's axis; not finite or <= 0: unknown.
             blocked: (H, W), tool and glare in the rest frame.
             tissue: (H, W).
-            settings: of the smoothing; None: the default.
 
         Raises:
             UserError: shapes that don't fit, or no depth of the tissue.
@@ -46,7 +43,7 @@ class DepthTracker:
         self._rest = np.where(self._known, rest, np.median(rest[self._known])).astype(np.float32)
         self.distance_mm = float(np.median(rest[self._known]))
         """Median of the tissue's, at rest."""
-        self.solver = Solver((tissue.shape[0], tissue.shape[1]), settings)
+        self.solver = Solver((tissue.shape[0], tissue.shape[1]))
         self.noise_mm = float("nan")
         """Median deviation of depth motion over the tissue in the last frame."""
 

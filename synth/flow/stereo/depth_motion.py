@@ -35,6 +35,7 @@ from synth.flow import kernels
 from synth.system.jit import vectorised
 
 Map = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 _FREEDOM = np.float32(4.0)  # of Student's distribution
 _CHANNELS = np.float32(3.0)
@@ -45,19 +46,17 @@ _ONE, _EIGHT, _TWELFTH, _HALF = np.float32(1), np.float32(8), np.float32(1 / 12)
 
 
 @dataclass(frozen=True)
-class DepthMotionSettings:
-    """The prior and the effort."""
+class DepthMotionConstants:
+    """The prior and the effort: by hand, on renders (docs/results/flow/stereo)."""
 
-    columns: int = 40
-    """Cells across the picture."""
-    bend_mm: float = 0.004
-    """k where nothing is strained: second differences of depth motion between cells."""
-    strained_mm: float = 2.0
-    """Added to k for each px/px of the flow's gradient."""
-    cold: int = 4
-    """Linearisations from nothing."""
-    warm: int = 2
-    """Linearisations from the frame before."""
+    columns: int = 40  # cells across the picture
+    bend_mm: float = 0.004  # k where nothing is strained: second differences of depth motion between cells
+    strained_mm: float = 2.0  # added to k for each px/px of the flow's gradient
+    cold: int = 4  # linearisations from nothing
+    warm: int = 2  # linearisations from the frame before
+
+
+DEPTH = DepthMotionConstants()
 
 
 @dataclass(frozen=True)
@@ -65,10 +64,8 @@ class StereoPictures:
     """The four contrast-normalised pictures, on rectified pixels, and where each is usable; all (H, W)."""
 
     left_rest: Map
-    right_rest: Map
-    """Already on the left rest pixels."""
-    rest_usable: Map
-    """Of both."""
+    right_rest: Map  # already on the left rest pixels
+    rest_usable: Map  # of both
     left: Map
     right: Map
     left_usable: Map
@@ -79,18 +76,13 @@ class StereoPictures:
 class Change:
     """What was found."""
 
-    px: Map
-    """(H, W) change of disparity."""
-    precision: Map
-    """(h, w) by cell: how much the pictures say, in 1/px^2; 0 where nothing is seen."""
-    pull: Map
-    """(h, w) by cell: precision times the change that the pictures alone would have, in 1/px."""
-    stiffness: Map
-    """(h, w) by cell: 1 / k^2, in 1/px^2."""
+    px: Map  # (H, W) change of disparity
+    precision: Map  # (h, w) by cell: how much the pictures say, in 1/px^2; 0 where nothing is seen
+    pull: Map  # (h, w) by cell: precision times the change that the pictures alone would have, in 1/px
+    stiffness: Map  # (h, w) by cell: 1 / k^2, in 1/px^2
     misfit: Map
     """(h, w) by cell: mean square of the residuals left, in their median's; 1 where nothing is seen."""
-    visible: Map
-    """(H, W) 0 or 1: in all four pictures."""
+    visible: Map  # (H, W) 0 or 1: in all four pictures
     lag: float = 0.0
     """Share of the left eye's motion that the right one doesn't show: of eyes that aren't of one moment."""
 
@@ -104,15 +96,10 @@ class Change:
 class Solver:
     """The depth solver of one size of picture, with what all frames share."""
 
-    def __init__(self, size: tuple[int, int], settings: DepthMotionSettings | None = None) -> None:
-        """
-        Args:
-            size: (height, width) [px].
-            settings: None: the default.
-        """
-        self.settings = settings or DepthMotionSettings()
+    def __init__(self, size: tuple[int, int]) -> None:
+        """`size`: (height, width) [px]."""
         height, width = size
-        self.cell = max(1, round(width / self.settings.columns))
+        self.cell = max(1, round(width / DEPTH.columns))
         self.shape = (-(-height // self.cell), -(-width // self.cell))
         self._bends = second_differences(self.shape)
 
@@ -133,7 +120,6 @@ class Solver:
             px_per_mm: change of disparity of a point that moves 1 mm away (its size).
             initial: (H, W) px to start from, of the frame before; None: from 0.
         """
-        s = self.settings
         warped, seen = np.empty_like(disparity), np.empty_like(disparity)
         kernels.warp_into(pictures.left, pictures.left_usable, flow, warped, seen)
         left_now, left_rest = self._stacked(warped), self._stacked(pictures.left_rest)
@@ -146,7 +132,7 @@ class Solver:
         sums = np.zeros((4, *self.shape), np.float64)
         here = np.empty_like(flow)
         here[1] = flow[1]
-        for _ in range(s.cold if initial is None else s.warm):
+        for _ in range(DEPTH.cold if initial is None else DEPTH.warm):
             here[0] = flow[0] - disparity - change
             kernels.warp_into(pictures.right, pictures.right_usable, here, warped, seen)
             both = mask * seen
@@ -175,7 +161,7 @@ class Solver:
         change = np.zeros_like(samples)
         misfit = np.ones(self.shape, np.float32)
         information, pull = np.zeros((2, *self.shape), np.float32)
-        for _ in range(self.settings.cold):
+        for _ in range(DEPTH.cold):
             off = samples - change
             known = weight > 0
             noise = float(np.median(np.square(off[known]))) / _MEDIAN if known.any() else 1.0
@@ -198,8 +184,7 @@ class Solver:
 
     def _stiffness(self, flow: Map, px_per_mm: float) -> Map:
         """1 / k^2 by cell, (h, w), in 1/px^2."""
-        s = self.settings
-        bend = px_per_mm * (s.bend_mm + s.strained_mm * self.steepness(flow))
+        bend = px_per_mm * (DEPTH.bend_mm + DEPTH.strained_mm * self.steepness(flow))
         return np.asarray(1 / bend**2, np.float32)
 
     def _stacked(self, picture: Map) -> Map:
@@ -219,14 +204,8 @@ class Solver:
     def coarse(self, field: Map) -> Map:
         """Means of a field (H, W) by cell, (h, w); the last cells hold fewer pixels."""
         rows, columns = self.shape
-        wide = cv2.copyMakeBorder(
-            field,
-            0,
-            rows * self.cell - field.shape[0],
-            0,
-            columns * self.cell - field.shape[1],
-            cv2.BORDER_REPLICATE,
-        )
+        below, right = rows * self.cell - field.shape[0], columns * self.cell - field.shape[1]
+        wide = cv2.copyMakeBorder(field, 0, below, 0, right, cv2.BORDER_REPLICATE)
         return np.asarray(cv2.resize(wide, (columns, rows), interpolation=cv2.INTER_AREA))
 
     def _prior(self, stiffness: Map) -> sparse.csr_matrix:
@@ -291,15 +270,7 @@ def _lag(residual: Map, slope: Map, down: Map, mask: Map, noise: np.float32) -> 
 
 @vectorised
 def gather(
-    now: Map,
-    rest: Map,
-    lefts: Map,
-    less: Map,
-    mask: Map,
-    change: Map,
-    noise: Map,
-    cell: int,
-    sums: NDArray[np.float64],
+    now: Map, rest: Map, lefts: Map, less: Map, mask: Map, change: Map, noise: Map, cell: int, sums: Floats
 ) -> None:
     """Normal equations of one linearisation, summed over cells.
 

@@ -20,34 +20,24 @@ from synth.flow.tvl1 import Tvl1, one_thread
 Map = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-_STEP = 16  # OpenCV takes ranges in multiples of it
-_BLOCK = 5
-_SIXTEENTHS = 16.0
-_ALIKE, _ENOUGH = 0.5, 0.05  # local correlation of what matches, and the share of the tissue that must
-_TRUSTED_PX = 1.5  # a refinement by more found something else
+_STEP = 16  # OpenCV takes ranges in multiples of it, and gives sixteenths of a pixel
+_BLOCK = 5  # px of a match; the penalties are OpenCV's for it
+_ALIKE = 0.5  # local correlation of a match; by hand
+_ENOUGH = 0.05  # share of the tissue that must match; by hand
+_TRUSTED_PX = 1.5  # a refinement by more found something else; by hand
 
 
 @dataclass(frozen=True)
 class Rest:
     """The pair at rest, on rectified left pixels."""
 
-    disparity: Map
-    """(H, W) px: the left eye's column less the right eye's; finite everywhere."""
-    found: Flags
-    """(H, W), False where it was filled in from around."""
+    disparity: Map  # (H, W) px: the left eye's column less the right eye's; finite everywhere
+    found: Flags  # (H, W), False where it was filled in from around
     epipolar_px: float
     """Median distance of what matches from its row: how far off the calibration is. NaN: not refined."""
 
 
-def match(
-    left: Map,
-    right: Map,
-    left_usable: Flags,
-    right_usable: Flags,
-    reach: tuple[int, int] | None = None,
-    *,
-    refine: bool = True,
-) -> Rest:
+def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, refine: bool = True) -> Rest:
     """Rest disparity of a rectified pair.
 
     Args:
@@ -55,15 +45,14 @@ def match(
         right: the same of the right eye.
         left_usable: (H, W), tissue that is neither under the tool nor in glare.
         right_usable: (H, W), the same of the right eye.
-        reach: least and largest disparity [px] to look for; None: an eighth of the width to both sides.
         refine: to a part of a pixel; else as semi-global matching finds it.
 
     Raises:
-        UserError: nothing matches.
+        UserError: nothing matches within an eighth of the width to both sides.
     """
     left, right = (np.atleast_3d(one.T).T.mean(axis=0, dtype=np.float32) for one in (left, right))
     width = left.shape[1]
-    low, high = reach or (-width // 8, width // 8)
+    low, high = -width // 8, width // 8
     count = max(1, -(-(high - low + 1) // _STEP)) * _STEP
     matcher = cv2.StereoSGBM.create(
         minDisparity=low,
@@ -81,7 +70,7 @@ def match(
     padded = [
         cv2.copyMakeBorder(_bytes(one), 0, 0, room, room, cv2.BORDER_REPLICATE) for one in (left, right)
     ]
-    raw = matcher.compute(*padded)[:, room:-room].astype(np.float32) / _SIXTEENTHS
+    raw = matcher.compute(*padded)[:, room:-room].astype(np.float32) / 16
     found = (raw >= low) & left_usable
     if not found.any():
         raise UserError(f"stereo: the two eyes' rest pictures don't match between {low} and {high} px")

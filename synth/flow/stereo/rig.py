@@ -26,10 +26,8 @@ _PARALLEL = 1e-9  # rotations nearer to none than this are none
 class Eye:
     """One camera."""
 
-    K: Floats
-    """(3, 3) px."""
-    distortion: Floats
-    """(n,) k1, k2, p1, p2, k3, ... as OpenCV orders them."""
+    K: Floats  # (3, 3) px
+    distortion: Floats  # (n,) k1, k2, p1, p2, k3, ... as OpenCV orders them.
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,9 @@ class StereoRig:
 
     left: Eye
     right: Eye
-    rotation: Floats
-    """(3, 3): x_right = rotation @ x_left + translation."""
-    translation: Floats
-    """(3,) mm."""
-    size: tuple[int, int]
-    """Width, height of both pictures [px]."""
+    rotation: Floats  # (3, 3): x_right = rotation @ x_left + translation
+    translation: Floats  # (3,) mm
+    size: tuple[int, int]  # width, height of both pictures [px]
 
     @property
     def baseline_mm(self) -> float:
@@ -55,13 +50,7 @@ class Rectified:
     """Maps between a rig's pictures and the rectified ones, whose rows are epipolar lines."""
 
     def __init__(self, rig: StereoRig) -> None:
-        """
-        Args:
-            rig: the pair.
-
-        Raises:
-            UserError: the right camera is not to the right of the left one.
-        """
+        """`rig`: the pair. UserError: its right camera is not to the right of the left one."""
         self.size, turns = rig.size, _turns(rig)
         # Where the turned right lens sits, seen from the turned left one.
         across = turns[1] @ rig.translation
@@ -153,13 +142,8 @@ def _turns(rig: StereoRig) -> tuple[Floats, Floats]:
     if parallel and np.abs(rig.translation[1:]).max() < _PARALLEL:
         return np.eye(3), np.eye(3)
     left, right, *_ = cv2.stereoRectify(
-        rig.left.K,
-        rig.left.distortion,
-        rig.right.K,
-        rig.right.distortion,
-        rig.size,
-        rig.rotation,
-        rig.translation[:, None],
+        *(rig.left.K, rig.left.distortion, rig.right.K, rig.right.distortion),
+        *(rig.size, rig.rotation, rig.translation[:, None]),
         flags=0,
     )
     return np.asarray(left, np.float64), np.asarray(right, np.float64)

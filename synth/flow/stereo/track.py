@@ -14,16 +14,25 @@ from synth.flow import image, kernels
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.stereo import depth_correction, rest
-from synth.flow.stereo.depth_motion import Change, DepthMotionSettings, Solver, StereoPictures, fine
+from synth.flow.stereo.depth_motion import Change, Solver, StereoPictures, fine
 from synth.flow.stereo.rig import Rectified, StereoRig
 
-_STILL_PX = 0.3  # frames whose flow is nearly everywhere below this are at rest
-_RESTS = 4
-_IN_TIME = 0.12  # share of the motion that eyes of one moment may seem to differ by
-_FOLLOWED = 0.3  # confidence of the flow: less under a tool that no mask knows, 0.9 and more on tissue
-_ACROSS, _ALONG = 1.15, 1.3  # multiples of the networks' deviations, by the coverage at contacts
-_ADDED = 0.4  # share of what the depth's correction adds that may be wrong
-_LOST = 0.05  # of what is visible at rest: a frame that shows less is no place to start from
+
+@dataclass(frozen=True)
+class StereoConstants:
+    """Constants of motion in three dimensions; by hand where no source is given."""
+
+    still_px: float = 0.3  # frames whose flow is nearly everywhere below this are at rest
+    rests: int = 4  # of these, at most
+    in_time: float = 0.12  # share of the motion that cameras of one moment may seem to differ by
+    followed: float = 0.3  # confidence of the flow: less under a tool that no mask holds; on tissue 0.9
+    across: float = 1.15  # factor of the flow network's deviation, by its coverage at contacts
+    along: float = 1.3  # the same of the depth network's
+    added: float = 0.4  # share of what the depth's correction adds that may be wrong
+    lost: float = 0.05  # of what is visible at rest: the next frame doesn't start from one that shows less
+
+
+STEREO = StereoConstants()
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,6 @@ class StereoTracker:
         left_blocked: Flags,
         right_blocked: Flags,
         tissue: Flags,
-        settings: DepthMotionSettings | None = None,
     ) -> None:
         """Starts at rest.
 
@@ -66,17 +74,12 @@ class StereoTracker:
             left_blocked: (H, W), tool and glare in the rest frame.
             right_blocked: (H, W), the same of the right eye.
             tissue: (H, W), where there is tissue, in the left eye.
-            settings: of the depth solver; None: the default.
 
         Raises:
             UserError: the rest pictures don't match, or shapes that don't fit.
         """
         width, height = rig.size
-        if (
-            lefts.shape != rights.shape
-            or lefts.shape[1:3] != (height, width)
-            or tissue.shape != (height, width)
-        ):
+        if lefts.shape != rights.shape or not lefts.shape[1:3] == tissue.shape == (height, width):
             raise UserError(
                 f"stereo: pictures {lefts.shape[1:3]} and {rights.shape[1:3]}, tissue {tissue.shape} and "
                 f"calibration {(height, width)} differ"
@@ -90,7 +93,7 @@ class StereoTracker:
         ]
         self.rest = rest.match(greys[0], greys[1], *usable)
         """Rest disparity, and how far off the calibration is."""
-        self.solver = Solver((height, width), settings)
+        self.solver = Solver((height, width))
         self._left, _ = self._normalised(lefts[0], usable[0], 0)
         right, known = self._normalised(rights[0], usable[1], 1)
         self._right, self._usable = np.empty_like(right), np.empty_like(right)
@@ -116,13 +119,7 @@ class StereoTracker:
         return r.back(cv2.dilate(found, np.ones((3, 5), np.uint8)), 1) > 0
 
     def step(
-        self,
-        left: Rgb,
-        right: Rgb,
-        left_blocked: Flags,
-        right_blocked: Flags,
-        flow: Flow,
-        confidence: Map,
+        self, left: Rgb, right: Rgb, left_blocked: Flags, right_blocked: Flags, flow: Flow, confidence: Map
     ) -> Moved:
         """Motion since rest in the next frame.
 
@@ -138,11 +135,11 @@ class StereoTracker:
         now, now_usable = self._normalised(left, r.flags(~left_blocked, 0), 0)
         other, other_usable = self._normalised(right, r.flags(~right_blocked, 1), 1)
         # Where the left eye lost the tissue, what both eyes see there is what came between.
-        followed = self._usable * (r.picture(confidence, 0) > _FOLLOWED)
+        followed = self._usable * (r.picture(confidence, 0) > STEREO.followed)
         pictures = StereoPictures(self._left, self._right, followed, now, other, now_usable, other_usable)
         straight = r.flow(flow)
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
-        lost = float(change.visible.sum()) < _LOST * float(self._usable.sum())
+        lost = float(change.visible.sum()) < STEREO.lost * float(self._usable.sum())
         self._change = None if lost else change.px
         return self._moved(change, straight, confidence, lost)
 
@@ -155,9 +152,11 @@ class StereoTracker:
         if lost:  # of a second eye that shows nothing there is nothing to correct
             added = np.zeros_like(added)
         # What the second eye doesn't see is known by the plate alone.
-        off = np.maximum(np.hypot(_ALONG * off, _ADDED * added), change.deviation / self.px_per_mm)
+        off = np.maximum(
+            np.hypot(STEREO.along * off, STEREO.added * added), change.deviation / self.px_per_mm
+        )
         # What of another moment's motion passes for depth.
-        late = np.sqrt(max(change.lag**2 - _IN_TIME**2, 0.0)) * solver.coarse(
+        late = np.sqrt(max(change.lag**2 - STEREO.in_time**2, 0.0)) * solver.coarse(
             np.abs(flow[0]) + np.abs(change.px)
         )
         off = np.hypot(off, late / self.px_per_mm)
@@ -166,7 +165,7 @@ class StereoTracker:
         nearer = here / (here + fine(added, solver.cell, disparity.shape))
         px = (disparity + change.px + r.shift) * nearer - r.shift - disparity
         motion = r.motion(disparity, px, flow)
-        across = _ACROSS * self._mm_per_px * spread
+        across = STEREO.across * self._mm_per_px * spread
         # Logarithms: a deviation that falls steeply would be interpolated to below 0.
         logs = [fine(np.log(part), solver.cell, disparity.shape) for part in (across, across, off)]
         planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
@@ -208,9 +207,9 @@ def _filled(field: Map, known: Flags) -> Map:
 def still_frames(flow: NDArray[np.float32], tissue: Flags) -> int:
     """How many of the first frames of a flow (T, H, W, 2) px are at rest: 1 to 4."""
     count = 1
-    while count < min(len(flow), _RESTS):
+    while count < min(len(flow), STEREO.rests):
         length = np.linalg.norm(flow[count][tissue], axis=-1)
-        if length.size and np.quantile(length, 0.98) > _STILL_PX:
+        if length.size and np.quantile(length, 0.98) > STEREO.still_px:
             break
         count += 1
     return count

@@ -122,8 +122,8 @@ def test_rest_disparity_of_a_slope_with_a_step() -> None:
         x = COLUMNS + 4.3 + 0.03 * (x - 80) + 3.0 * (ROWS > 60)
     right = seen(picture, x, ROWS)[..., 0].astype(np.float32)
     every = np.ones(truth.shape, bool)
-    found = rest.match(left, right, every, every, (-16, 31))
-    coarse = rest.match(left, right, every, every, (-16, 31), refine=False)
+    found = rest.match(left, right, every, every)
+    coarse = rest.match(left, right, every, every, refine=False)
     inner = (slice(8, -8), slice(16, -16))
     error, before = (np.abs(one.disparity - truth)[inner] for one in (found, coarse))
     assert np.median(error) < 0.05
