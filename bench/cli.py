@@ -263,7 +263,7 @@ def _score(
     threadpool_limits(set_threads(None))
     result = score(
         opened,
-        model or require_model(opened.has_two_eyes),
+        model or require_model(opened.has_stereo),
         methods={name: Model(Path(at)) for name, at in (also or {}).items()},
         settings=settings,
         out=folder,
@@ -329,7 +329,7 @@ def live(
     drawn = video.parent / "tissue.png"
     tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
     # Without a scale there is no force: flow alone is what is asked for.
-    model = model or (choose_model(two_eyes=False) if scale else None)
+    model = model or (choose_model(stereo=False) if scale else None)
     method = None if model is None else Model(model)
 
     def show(frame: live.LiveFrame) -> None:

@@ -59,7 +59,7 @@ def shared(work: Path) -> list[Step]:
     """Datasets that several experiments read."""
     return [
         _render("mission", "mission", work, sequences=400),
-        _render("mission-unseen", _CURVES / "mission-unseen.yaml", work, sequences=80),
+        _render("mission-ood", _CURVES / "mission-ood.yaml", work, sequences=80),
         _render("stereo-640", "stereo", work, sequences=8, seed=77, **{"render.size": "[640, 480]"}),
         _render("stereo-320", "stereo", work, sequences=8, seed=77, **{"render.size": "[320, 240]"}),
     ]
@@ -67,7 +67,7 @@ def shared(work: Path) -> list[Step]:
 
 def rooms(work: Path) -> list[Step]:
     """What needs neither a photograph nor another Python."""
-    mission, unseen = str(work / "mission"), str(work / "mission-unseen")
+    mission, unseen = str(work / "mission"), str(work / "mission-ood")
     labels, clips = str(work / "labels"), str(work / "clips")
     networks = [word for name in ("mono", "stereo") for word in ("--model", f"{name}=learn/models/{name}")]
     return [

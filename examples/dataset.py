@@ -63,10 +63,10 @@ def main(root: Path, sequences: int) -> None:
             case = synth.draw_scenario(job, k)
             # ... and the look, the camera's path and the tool's path, which are ours.
             look = replace(
-                case.look,
+                case.appearance,
                 gyrus_albedo=(0.80, 0.62, 0.55),
-                pial_absorbance=0.2 * case.look.pial_absorbance,
-                sensor=replace(case.look.sensor, exposure=0.8 * case.look.sensor.exposure),
+                pial_absorbance=0.2 * case.appearance.pial_absorbance,
+                sensor=replace(case.appearance.sensor, exposure=0.8 * case.appearance.sensor.exposure),
             )
             case = replace(case, look=look, sway=Arc(rng.uniform(4, 10)))
             motion = stir(radius_mm=rng.uniform(1, 2), turns=rng.choice([-1.0, 1.0]), frames=FRAMES)
@@ -74,7 +74,7 @@ def main(root: Path, sequences: int) -> None:
             scene = synth.simulate(job, k, case=case, motions=[motion])
             path = synth.write_scene(scene, folder)
             peak = np.linalg.norm(scene.force, axis=1).max()
-            print(f"{path.name}: {peak:.2f} mN at most, {case.look.family}")
+            print(f"{path.name}: {peak:.2f} mN at most, {case.appearance.family}")
 
 
 if __name__ == "__main__":

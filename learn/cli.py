@@ -261,7 +261,7 @@ def predict_command(
     Exit code 2 if no frame has a force.
     """
     from learn.inference.apply import apply
-    from learn.inference.motion import VideoOptions, has_second_eye, motions
+    from learn.inference.motion import VideoOptions, has_right_camera, motions
     from learn.inference.predict import load_model
     from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.shipped import NONE, choose_model, shipped
@@ -269,12 +269,12 @@ def predict_command(
     from synth.recording_flow.video_flow import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
-    from synth.video.read import is_film
+    from synth.video.read import is_video
 
     set_threads(threads)
     if source is None:
         source = model
-        chosen = choose_model(has_second_eye(source)) if shipped() else None
+        chosen = choose_model(has_right_camera(source)) if shipped() else None
         if chosen is None:
             raise UserError(f"{source}: say the model's folder before it: {NONE}")
         model = chosen
@@ -291,7 +291,7 @@ def predict_command(
         found = apply(predictor, motion, young, membrane)
         write_prediction(found, out / motion.name)
         if overlay:
-            one = source.is_file() or source.suffix == ".zarr" or is_film(source)
+            one = source.is_file() or source.suffix == ".zarr" or is_video(source)
             write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
         size = found["total_force_mn"][found["trusted"]]
         peak = peaks[motion.name] = float(size.max()) if len(size) else None

@@ -6,7 +6,7 @@ percentile, says what a low force is; `spread`, its root mean square over tissue
 divided by. The squared-error and the R² term then are of one size and their weights mean what they say. (In
 the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
 
-Why another loss against false background force, the "ghosts" (`ghostless`): a squared price, times three or
+Why another loss against false background force, the "ghosts" (`off-target`): a squared price, times three or
 not, fades with the ghost itself, so it moves large ones a little and small ones not at all. A linear price
 does: where the best guess in the mean would be q (in `spread`s) on tissue that is free with probability p, it
 says q − p·BACKGROUND/2, or nothing. Cells that are surely in contact (p = 0) aren't touched. What it costs in
@@ -23,30 +23,30 @@ from torch import Tensor
 
 from synth.errors import UserError
 
-Loss = Literal["mse", "mse-frame", "antighost", "ghostless"]
+Loss = Literal["mse", "mse-frame", "antighost", "off-target"]
 """`mse`: squared error. `mse-frame`: squared error and every frame's own 1 − R², in equal parts. `antighost`:
 of Heraoui et al., squared error, dearer where a low force is over-predicted, and 1 − R² of the batch.
-`ghostless`: `mse-frame` and a linear price of force on contact-free tissue, which took the ghosts away at no
+`off-target`: `mse-frame` and a linear price of force on contact-free tissue, which took the ghosts away at no
 cost in R² (docs/results/learn): its numbers were chosen there."""
 
-R2_SHARE = {"mse": 0.0, "mse-frame": 0.5, "antighost": 0.3, "ghostless": 0.5}
+R2_SHARE = {"mse": 0.0, "mse-frame": 0.5, "antighost": 0.3, "off-target": 0.5}
 """Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
 FALSE_POSITIVE = 3.0
 """`antighost`: price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
 LOW = 0.05
 """`antighost`: a cell's force is low under this share of `unit`. (Heraoui et al. ask the frame's mean.)"""
 BACKGROUND = 8.0
-"""`ghostless`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
+"""`off-target`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
 FREE = 0.01
-"""`ghostless`: tissue is contact-free where its true density is under this share of `unit`."""
+"""`off-target`: tissue is contact-free where its true density is under this share of `unit`."""
 RAMP = (0.25, 0.75)
-"""`ghostless`: shares of the run between which the price grows from none to full. Paid from the start it is
+"""`off-target`: shares of the run between which the price grows from none to full. Paid from the start it is
 cheapest to say nothing, and a network learns that first."""
 
 
 def full(kind: Loss, progress: float) -> bool:
     """Whether nothing of the loss is still to come at a point 0..1 of the run."""
-    return kind != "ghostless" or progress >= RAMP[1]
+    return kind != "off-target" or progress >= RAMP[1]
 
 
 SHARES = ("error", "r2", "ghost")
@@ -89,7 +89,7 @@ def loss(
     r2 = background = squared.new_zeros(())
     if share > 0:
         r2 = unexplained(prediction, target, mask, spread, by_frame=kind != "antighost")
-    if kind == "ghostless":
+    if kind == "off-target":
         price = BACKGROUND * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
         background = price * background_force(prediction, target, mask, FREE * unit) / spread
     return Terms((1 - share) * fit, share * r2, background)

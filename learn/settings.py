@@ -39,7 +39,7 @@ class TrainingSettings(Section):
     schedule: Literal["plateau", "cosine"] = "plateau"
     """`plateau`: halved when the score stalls (the paper's); `cosine`: a warm-up over a twentieth of the run,
     then down to zero by a half cosine, for runs too short to wait for a plateau."""
-    sway_mm: NonNegative = 0.0
+    surface_motion_mm: NonNegative = 0.0
     """Standard deviation of a motion of the whole surface that half of the frames get on top, drawn anew:
     along the view (with `arch.depth`), a third of it across. It is even, tilted and bulged, as breath,
     heartbeat and a table that was pushed make it, and carries no force."""
@@ -88,7 +88,7 @@ _SHORT: dict[str, Any] = {
 _STEREO: dict[str, Any] = {
     "input": "motion-mixed",
     "loss": "mse-frame",
-    "sway_mm": 0.5,
+    "surface_motion_mm": 0.5,
     "learning_rate": 1e-3,
 }
 _STEREO_ARCH = Architecture(width=16, stem=4, confidence=True, depth=True, dropout=0.05, relative=True)
@@ -109,14 +109,14 @@ PRESETS: dict[str, TrainingSettings] = {
         # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
         # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
         arch=Architecture(width=16, stem=4, output="magnitude", dropout=0.05),
-        loss="ghostless",
+        loss="off-target",
         learning_rate=1e-3,
         **_SHORT,
     ),
     # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
     "live": TrainingSettings(
         arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
-        loss="ghostless",
+        loss="off-target",
         learning_rate=1e-3,
     ),
     # `cpu` and `live` given motion in three dimensions. Force is then seen along the view as well, so they

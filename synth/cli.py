@@ -147,7 +147,7 @@ def render(
     _end_on_terminate()
     read = load_job(job, overrides or [])
     if retry:
-        Folder(out).forgive()
+        Folder(out).clear_failures()
     options = Options(engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions)
     with RunBars() as bars:
         summary = run_job(read, out, options, bars)

@@ -26,7 +26,7 @@ def untrained() -> dict[str, Method]:
     return {PHYSICS: Physics()}
 
 
-def simpler_methods(train: Path | None, model: Path | None, two_eyes: bool = False) -> dict[str, Method]:
+def simpler_methods(train: Path | None, model: Path | None, stereo: bool = False) -> dict[str, Method]:
     """Those that need no data, those of installed packages, and, given the training data, ridge.
 
     Ridge is fitted on the model's own fit sequences, once for a model; for a recording with a second eye on
@@ -47,7 +47,7 @@ def simpler_methods(train: Path | None, model: Path | None, two_eyes: bool = Fal
     if not chosen:
         raise UserError(f"{train}: holds none of the sequences that {model} was fitted on")
     source = "recovered" if all("flow_recovered" in s for s in chosen) else "ideal"
-    if two_eyes and all("motion_recovered" in s for s in chosen):
+    if stereo and all("motion_recovered" in s for s in chosen):
         source = "motion"
 
     def fit() -> dict[str, baselines.Rule]:

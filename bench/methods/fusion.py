@@ -15,7 +15,7 @@ from bench.methods.force_mixture import size_interval
 from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
 from synth.errors import UserError
 
-# Both are chosen on even sequences of mission-unseen; odd ones: docs/results/scoring/together.
+# Both are chosen on even sequences of mission-ood; odd ones: docs/results/scoring/fusion.
 _COMMON = 0.3  # relative deviation of what both err by alike
 _CAUTION = 1.5  # factor of the network's stated deviation: recordings are less like its training
 

@@ -47,7 +47,7 @@ class TissueConstants:
     least: float = 0.05  # weight of a second tissue to be used
     gain: float = 0.25  # relative deviation of the force by relief, pose and the law at large strain
     stiffness: float = 0.5
-    """The same by a membrane's stiffness; of even sequences of mission-unseen (evidence.scoring.together)."""
+    """The same by a membrane's stiffness; of even sequences of mission-ood (evidence.scoring.fusion)."""
 
 
 TISSUES = TissueConstants()

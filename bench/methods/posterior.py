@@ -32,7 +32,7 @@ Axes = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ModelConstants:
-    """Constants of the model, by hand where no source is given; errors: docs/results/scoring/together."""
+    """Constants of the model, by hand where no source is given; errors: docs/results/scoring/fusion."""
 
     rank: int = 100  # directions of displacement that are kept of the compliance
     smooth_mm: float = 2.0  # correlation length of the smooth loads

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Force, Recording, open_recording
 from bench.recording.meta import Meta
-from bench.recording.second_eye import SecondEye, StereoQuality
+from bench.recording.right_camera import RightCamera, StereoQuality
 from bench.recording.tracking_picture import draw_tracking
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
@@ -105,7 +105,7 @@ def judge(
     """
     meta = recording.meta
     found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, video.size[1])]
-    found += video.findings if stereo is None else [*video.findings, *judge_eyes(stereo, mm_per_px)]
+    found += video.findings if stereo is None else [*video.findings, *judge_stereo(stereo, mm_per_px)]
     return found if recording.force is None else [*found, *judge_zero(recording.force, meta, video.rest_s)]
 
 
@@ -140,7 +140,7 @@ def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
     return found
 
 
-def judge_eyes(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
+def judge_stereo(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
     """Whether a second eye is of this film, at this scale."""
     found = [Finding("bad", "second eye", f"the second eye {stereo.fault}")] if stereo.fault else []
     if stereo.epipolar_px > _OTHER_ROWS_PX:
@@ -180,7 +180,7 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     first = recording.meta.rest_frame
     numbers = [number for number in recording.numbers() or range(_LOOKED_AT) if number >= first] or [first]
     only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _LOOKED_AT).astype(int))
-    second = SecondEye(recording, found.mm_per_px or 1.0) if recording.has_two_eyes else None
+    second = RightCamera(recording, found.mm_per_px or 1.0) if recording.has_stereo else None
     pictures = _counted(recording, found)
     film = replace(recording.film(pictures), only=only)
     video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), second=second)
@@ -203,7 +203,7 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     if video.summary.frames:
         found.judge(not video.summary.is_odd, "following", video.summary.describe())
     stereo = None if second is None else second.quality
-    if stereo is not None and not judge_eyes(stereo, found.mm_per_px or stereo.mm_per_px):
+    if stereo is not None and not judge_stereo(stereo, found.mm_per_px or stereo.mm_per_px):
         found.add("ok", "second eye", stereo.describe())
     found.findings += judge(recording, found.mm_per_px or 0.0, video, stereo)
 

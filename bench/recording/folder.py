@@ -77,7 +77,7 @@ class Recording:
     """Depth pictures by the frame; empty: none."""
 
     @property
-    def has_two_eyes(self) -> bool:
+    def has_stereo(self) -> bool:
         """Whether a second eye or a depth camera saw it too."""
         return bool(self.right or self.depths)
 

@@ -153,7 +153,7 @@ def _against_sensor(
         forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]
     time_s = np.array(tracked.time_s)[followed]
-    axes = 3 if recording.has_two_eyes else 2  # one eye doesn't see along the view
+    axes = 3 if recording.has_stereo else 2  # one eye doesn't see along the view
     return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, axes if sensor.in_camera_axes else 0)
 
 

@@ -161,7 +161,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
         "pulse": done.pulse,
-        "second_eye": done.stereo,
+        "right_camera": done.stereo,
         "aligned": result.aligned,
         "sync": result.sync,
         "turn": result.turn,

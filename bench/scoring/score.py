@@ -84,7 +84,7 @@ def score(
     if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
         raise UserError(f"methods: {min(taken)} is a name of ours; give yours another")
     if model is None and not methods:
-        model = require_model(opened.has_two_eyes)
+        model = require_model(opened.has_stereo)
     elif isinstance(model, (str, Path)):
         model = find_model(model)
     frames = len(opened.numbers()) or None
@@ -99,7 +99,7 @@ def score(
         bar = counting(f"scoring {opened.name}", frames)
     # The process is started first, for it takes seconds to begin; the methods are fitted meanwhile.
     with written, flow as elsewhere:
-        chosen = _choose_methods(model, methods or {}, opened.has_two_eyes, baselines, train)
+        chosen = _choose_methods(model, methods or {}, opened.has_stereo, baselines, train)
         scale = pixel_scale.find_scale(opened.meta, opened.folder)
         with bar as told:
             result = evaluate_recording(
@@ -120,7 +120,7 @@ def score(
 def _choose_methods(
     model: Path | Predictor | None,
     own: Mapping[str, Method],
-    two_eyes: bool,
+    stereo: bool,
     baselines: bool,
     train: str | Path | None,
 ) -> dict[str, Method]:
@@ -130,7 +130,7 @@ def _choose_methods(
         chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
     if baselines:
         folder = model if isinstance(model, Path) else None
-        simple = comparison.simpler_methods(Path(train) if train else None, folder, two_eyes)
+        simple = comparison.simpler_methods(Path(train) if train else None, folder, stereo)
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
     if model is not None and isinstance(chosen.get(PHYSICS), Physics):
         chosen = {FUSION: Fusion(MAIN, PHYSICS), **chosen}

@@ -14,7 +14,7 @@ from bench.methods.protocol import ForceEstimate, FusedEstimate, Method, MethodC
 from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta
-from bench.recording.second_eye import SecondEye, StereoQuality
+from bench.recording.right_camera import RightCamera, StereoQuality
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
@@ -66,7 +66,7 @@ class TrackedRecording:
     summary: TrackingSummary = field(default_factory=TrackingSummary)
     """What was masked, lost and reinitialised."""
     repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
-    """Frames that show an earlier one again, as of `FilmFaults.repeats`."""
+    """Frames that show an earlier one again, as of `VideoFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
     pictured: str = ""
     """The method whose force map they have."""
@@ -121,7 +121,7 @@ def track_recording(
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
 
     def once(pulse: PulseSearch | None) -> tuple[TrackedRecording, PulseSearch | None]:
-        second = SecondEye(recording, scale_mm_per_px) if recording.has_two_eyes else None
+        second = RightCamera(recording, scale_mm_per_px) if recording.has_stereo else None
         video = VideoFlow(recording.film(), settings, flow, pulse, second, watch=watch)
         forces = _Forces(methods, pictured, watch)
         for frame in video.frames(progress):

@@ -4,8 +4,8 @@ Every reader is fitted on 30, 100, 300, ... sequences of one dataset and asked a
 was fitted on, and about whole datasets of other worlds. A row is kept as soon as it is there: an
 interrupted run goes on.
 
-Run: python -m evidence.curves.experiment mission --unseen mission-unseen --sizes 30,100, of the datasets
-of the job `mission` and of mission-unseen.yaml beside this file.
+Run: python -m evidence.curves.experiment mission --unseen mission-ood --sizes 30,100, of the datasets
+of the job `mission` and of mission-ood.yaml beside this file.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import typer
 from joblib import Parallel, delayed
 
 from evidence import report, status
-from evidence.curves import readers
-from evidence.curves.readers import Reader, World
+from evidence.curves import estimators
+from evidence.curves.estimators import Reader, World
 from synth.errors import UserError
 
 _PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
@@ -32,7 +32,7 @@ def main(
     sizes: Annotated[
         str, typer.Option(help="Comma-separated numbers of fitted sequences.")
     ] = "300,1000,2800",
-    models: Annotated[str, typer.Option(help="Comma-separated readers.")] = ",".join(readers.MODELS),
+    models: Annotated[str, typer.Option(help="Comma-separated estimators.")] = ",".join(estimators.MODELS),
     inputs: Annotated[str, typer.Option(help="Comma-separated: recovered, exact.")] = "recovered",
     eyes: Annotated[str, typer.Option(help="Comma-separated: 1, 2.")] = "1,2",
     steps: Annotated[int, typer.Option(min=1, help="Batches that a network is trained with, about.")] = 4000,
@@ -66,7 +66,7 @@ def _wanted(
     sizes: Sequence[int], models: Sequence[str], inputs: Sequence[str], eyes: Sequence[int]
 ) -> list[Reader]:
     """Smallest first: what a short run leaves is a whole curve's beginning."""
-    for known, given, word in ((readers.MODELS, models, "models"), (readers.SOURCES, inputs, "inputs")):
+    for known, given, word in ((estimators.MODELS, models, "models"), (estimators.SOURCES, inputs, "inputs")):
         if unknown := set(given) - set(known):
             raise UserError(f"--{word}: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     return [

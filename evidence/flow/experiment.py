@@ -27,7 +27,7 @@ from synth.job import reader
 from synth.sequence.scene import simulate
 
 Row = dict[str, Any]
-_UNSEEN = report.CHECKOUT / "evidence/curves/mission-unseen.yaml"
+_UNSEEN = report.CHECKOUT / "evidence/curves/mission-ood.yaml"
 
 
 def main(

@@ -86,7 +86,7 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     view = camera.place(case.view, job.render)
     surface, tets = mechanics.build(job, case)
     motion = mechanics.move(job, case, surface, tets)
-    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.look, view.mm_per_px).shape
+    frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.appearance, view.mm_per_px).shape
     still = truth.trace_rest(view, Shape(surface.vertices, surface.faces), frame)
     resample = Resampler(
         (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid

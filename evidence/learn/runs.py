@@ -34,7 +34,7 @@ from synth.job import reader
 from synth.job.schema import Job
 
 JOB = report.RESULTS / "learn/data/labels.yaml"
-LOSSES: tuple[Loss, ...] = ("mse", "antighost", "ghostless")
+LOSSES: tuple[Loss, ...] = ("mse", "antighost", "off-target")
 SCORES = ("map_r2", "map_rmse", "force_mae", "ghost_relative", "stray_mn", "low_over_mn", "localisation_mm")
 """Of a tested sequence; `learn.evaluation.metrics` says what they are."""
 

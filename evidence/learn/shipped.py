@@ -1,6 +1,6 @@
 """What the networks that come along err by in every world, and whether their intervals hold.
 
-Run: python -m evidence.learn.shipped mission --model mono=MODEL --model stereo=MODEL --unseen mission-unseen
+Run: python -m evidence.learn.shipped mission --model mono=MODEL --model stereo=MODEL --unseen mission-ood
 With `--pack` they are written where the package looks for them, each with a card of these figures.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 import typer
 
 from evidence import report, status
+from evidence.curves.estimators import figures, map_figures
 from evidence.curves.experiment import percent
-from evidence.curves.readers import figures, map_figures
 from evidence.end_to_end import models
 from learn.data.clips import load_clips, scored
 from learn.evaluation.coverage import cover
@@ -35,7 +35,7 @@ _LIMITS = (
 _ONE_EYE = (
     "Along the line of sight one eye sees next to nothing; the interval there is wide.",
     "On recordings made with another finite-element code and another renderer it errs by more than the best "
-    "physics beside it in `bench score` (docs/results/learn/foreign/one-eye).",
+    "physics beside it in `bench score` (docs/results/learn/foreign/monocular).",
 )
 
 

@@ -28,7 +28,7 @@ from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.job import reader
 
-LOSSES: tuple[Loss, ...] = ("mse", "mse-frame", "ghostless")
+LOSSES: tuple[Loss, ...] = ("mse", "mse-frame", "off-target")
 RATES = (5e-4, 2e-3, 1e-2, 5e-2)
 NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))
 """Size [mm] and blob scale [mm] of noise on the displacement."""

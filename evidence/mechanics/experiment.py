@@ -20,7 +20,7 @@ from joblib import Parallel, delayed
 from evidence import report
 from evidence.end_to_end import models
 from evidence.end_to_end.models import RIDGE, Answer
-from evidence.mechanics.worlds import MIXTURE, PLAIN, WORLDS, Scenes, coarse, rendered
+from evidence.mechanics.conditions import MIXTURE, PLAIN, WORLDS, Scenes, coarse, rendered
 from learn.data.clips import Clip
 from learn.evaluation.statistics import Interval, interval, paired
 

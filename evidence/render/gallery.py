@@ -97,8 +97,10 @@ def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, capt
     )
     rest = at_rest(job)
     case = rest.scenario
-    look = replace(case.look, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery)
-    scene = replace(rest, scenario=replace(case, look=look, further=()))
+    appearance = replace(
+        case.appearance, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery
+    )
+    scene = replace(rest, scenario=replace(case, appearance=appearance, further=()))
     state = SceneState(rest.surface.vertices, *poised(case.gesture, rest.surface))
     shot = scene.renderer.render(state, scenario.frame_seeds(job, 0)[0])
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)

@@ -174,16 +174,16 @@ def _encode(path: Path, film: NDArray[np.uint8], how: tuple[int, str, int]) -> N
 
 
 @cache
-def _model(two_eyes: bool) -> Any:
-    return load_model(require_model(two_eyes), quick=True)
+def _model(stereo: bool) -> Any:
+    return load_model(require_model(stereo), quick=True)
 
 
 def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
     """Errors over the undegraded film's peak, how often the interval holds, and what is said."""
     row: dict[str, Any] = dict.fromkeys(("physics", "error", "over_time", "held"))
-    two_eyes = (folder / "stereo.yaml").exists()
+    stereo = (folder / "stereo.yaml").exists()
     try:
-        result = score(folder, _model(two_eyes), methods={PHYSICS: Physics()}, baselines=False)
+        result = score(folder, _model(stereo), methods={PHYSICS: Physics()}, baselines=False)
     except UserError as error:
         return {**row, "said": [str(error).replace(f"{folder}: ", "")]}
     row["said"] = [f"{one.what}: {one.message}" for one in result.findings]

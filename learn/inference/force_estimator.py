@@ -15,7 +15,7 @@ from learn.inference.grid_placement import GridPlacement, Point
 from learn.inference.predict import ForceMap, Predictor, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
-from learn.uncertainty.out_of_distribution import describe_unseen
+from learn.uncertainty.out_of_distribution import describe_out_of_distribution
 from synth.errors import UserError
 from synth.flow.confidence import DOUBTFUL
 from synth.flow.stereo.track import Moved
@@ -147,7 +147,9 @@ class ForceEstimator:
         ideal = ["intervals are of true motion: of recovered motion they are too narrow"]
         notes = ideal if found.source in ("ideal", "motion-ideal") else []
         return notes + (
-            describe_unseen(found.world, found.features, np.stack(self._seen)) if self._seen else []
+            describe_out_of_distribution(found.world, found.features, np.stack(self._seen))
+            if self._seen
+            else []
         )
 
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:

@@ -72,7 +72,7 @@ def motions(path: Path, source: str, options: VideoOptions | None = None) -> Ite
     instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for
     anything else, and for a video without a scale.
     """
-    if video.is_film(path):
+    if video.is_video(path):
         yield _video(path, options or VideoOptions())
     elif path.suffix == ".npz":
         yield _arrays(path)
@@ -81,9 +81,9 @@ def motions(path: Path, source: str, options: VideoOptions | None = None) -> Ite
             yield _stored(sequence, source)
 
 
-def has_second_eye(path: Path) -> bool:
+def has_right_camera(path: Path) -> bool:
     """Whether what `motions` reads holds motion in three dimensions; of a dataset its first sequence."""
-    if video.is_film(path):
+    if video.is_video(path):
         return False
     if path.suffix == ".npz":
         return "motion" in checked_file.read_arrays(path)
@@ -133,7 +133,7 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
     taken: list[str] = []
     frames_there = range(0 if path.is_dir() else video.count_frames(path) or 0)
     tool = options.tool.of_frames(frames_there, taken).read if options.tool else None
-    footage = Footage(video.read_film(path, video.FPS), str(path), tissue, tool)
+    footage = Footage(video.read_frames(path, video.FPS), str(path), tissue, tool)
     following = VideoFlow(footage, options.settings, pulse=pulse)
     frames = (replace(one, time_s=one.time_s or 0.0) for one in following.frames())
     rest = next(frames)

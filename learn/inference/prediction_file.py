@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from learn.inference.predict import length
 from synth.dataset.store import Sequence, open_sequence
-from synth.publish import film, picture
+from synth.publish import picture, sequence_video
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
 from synth.video import read as video
@@ -117,8 +117,8 @@ def _number(value: float) -> str:
 
 
 def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
-    if video.is_film(source):
-        return (one.rgb for one in video.read_film(source, video.FPS) if one.index in wanted)
+    if video.is_video(source):
+        return (one.rgb for one in video.read_frames(source, video.FPS) if one.index in wanted)
     if source.suffix != ".zarr":
         return None
     sequence: Sequence = open_sequence(source)
@@ -135,13 +135,13 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
         values = on_picture(size[t], found, t, rgb.shape[:2])
         values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
-            curve = film.draw_curve(times, force, small.shape[1])
+            curve = sequence_video.draw_curve(times, force, small.shape[1])
         known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
         ends = f" [{found['low_mn'][t]:.1f}, {found['high_mn'][t]:.1f}]" if "low_mn" in found else ""
         text = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
-        shown = film.glow(small, values, largest) if found["trusted"][t] else small
+        shown = sequence_video.glow(small, values, largest) if found["trusted"][t] else small
         shown = picture.caption(shown, f"{times[t]:.2f} s  {text}")
-        yield np.vstack([shown, film.mark(curve, t, len(force))])
+        yield np.vstack([shown, sequence_video.mark(curve, t, len(force))])
 
 
 def on_picture(

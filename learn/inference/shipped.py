@@ -37,15 +37,15 @@ def find_model(named: Path | str) -> Path:
     return shipped()[str(named)]
 
 
-def choose_model(two_eyes: bool) -> Path | None:
+def choose_model(stereo: bool) -> Path | None:
     """The one to use where none is named: `stereo` for what two eyes saw, else `mono`; None if not there."""
     found = shipped()
-    return next((found[name] for name in ("stereo", "mono")[not two_eyes :] if name in found), None)
+    return next((found[name] for name in ("stereo", "mono")[not stereo :] if name in found), None)
 
 
-def require_model(two_eyes: bool) -> Path:
+def require_model(stereo: bool) -> Path:
     """As `choose_model`. UserError if none comes along."""
-    found = choose_model(two_eyes)
+    found = choose_model(stereo)
     if found is None:
         raise UserError(f"say a model (--model): {NONE}")
     return found

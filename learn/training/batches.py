@@ -60,8 +60,8 @@ class FrameItem(NamedTuple):
     """Whether the network is told what is known of the membrane."""
 
 
-def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
-    """The batch with a motion of the whole surface on top of half of its frames, as `sway_mm` says.
+def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
+    """The batch with a motion of the whole surface on top of half of its frames, as `surface_motion_mm` says.
 
     `generator`: on the CPU, so that every device draws the same.
     """
@@ -72,7 +72,7 @@ def swayed(batch: Batch, settings: TrainingSettings, generator: torch.Generator)
     shapes = torch.stack([torch.ones_like(x), x, y, 1 - x**2 - y**2])
     amount = torch.randn(count, planes, len(shapes), generator=generator)
     along = torch.arange(planes) == 2
-    amount *= settings.sway_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
+    amount *= settings.surface_motion_mm * torch.where(along, 1.0, 1 / 3)[:, None] / len(shapes) ** 0.5
     amount *= (torch.rand(count, generator=generator) < 0.5)[:, None, None]
     sway = torch.einsum("bps,syx->bpyx", amount, shapes).to(moved)
     return batch._replace(displacement=moved + sway * batch.mask)

@@ -26,7 +26,7 @@ from learn.loss import SHARES, full, gradient_shares, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
 from learn.split import Split, name_parts
-from learn.training.batches import Batch, FrameDataset, inputs, measure_scales, swayed
+from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
 from learn.training.gpu_batches import place_frames
 from learn.training.log import Log
 from learn.training.threads import make_fabric
@@ -168,10 +168,10 @@ def _epoch(
     for i in range(batches):
         batch = frames.batch(order[i * step : (i + 1) * step][fabric.global_rank :: fabric.world_size])
         batch = batch.to(fabric.device)
-        if settings.sway_mm > 0:
+        if settings.surface_motion_mm > 0:
             draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])
             rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
-            batch = swayed(batch, settings, rng)
+            batch = add_surface_motion(batch, settings, rng)
         predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
         unit, spread = scales.target, scales.spread
@@ -271,7 +271,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    planned = len(sources(there.settings.input)) > 1 or there.settings.loss == "ghostless"
+    planned = len(sources(there.settings.input)) > 1 or there.settings.loss == "off-target"
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 USUAL = 0.99
 """Share of held-out frames that are no further than `OutOfDistribution.usual`."""
 UNSEEN = "unseen world"
-"""How `describe_unseen` begins."""
+"""How `describe_out_of_distribution` begins."""
 _MOST, _FRAMES = 0.95, 0.9  # share of recordings that are no unseen world, and of the frames that say how far
 _LEAST_SPREAD = 0.05  # of a feature: logarithms and shares tell no worlds apart by less
 
@@ -105,7 +105,7 @@ def shrunk_covariance(samples: Floats) -> Floats:
     return np.asarray((1 - share) * plain + share * mean * np.eye(parts))
 
 
-def describe_unseen(world: OutOfDistribution, names: Sequence[str], motion: Floats) -> list[str]:
+def describe_out_of_distribution(world: OutOfDistribution, names: Sequence[str], motion: Floats) -> list[str]:
     """A line for a person if a recording is further from what was fitted than 95% of held-out ones.
 
     Args:

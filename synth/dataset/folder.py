@@ -94,7 +94,7 @@ class Folder:
         write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
         self.sweep(index)
 
-    def forgive(self, indices: Sequence[int] | None = None) -> list[int]:
+    def clear_failures(self, indices: Sequence[int] | None = None) -> list[int]:
         """Forgets failures, all if `indices` is None; returns which."""
         indices = sorted(self.failures()) if indices is None else list(indices)
         for index in indices:
@@ -117,7 +117,7 @@ class Folder:
         for file in (*parts, *self.logs.glob("worker-*.log")):
             file.unlink()
 
-    def pass_turn(self) -> None:
+    def invalidate_workers(self) -> None:
         """Ends what other machines still do for an earlier run: they look at the turn."""
         try:
             before = int(self.turn_file.read_text())
@@ -126,7 +126,7 @@ class Folder:
         self.turn = before + 1
         write_whole(self.turn_file, str(self.turn), durable=False)
 
-    def vacate(self) -> None:
+    def discard(self) -> None:
         """Removes the traces of a run that finished nothing."""
         for name in (_NAME, "job.yaml", "index.parquet"):
             (self.root / name).unlink(missing_ok=True)
@@ -166,14 +166,14 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
             write_whole(root / _NAME, described.model_dump_json(indent=1) + "\n")
             head = "# The job of this dataset, every value said.\n"
             write_whole(root / "job.yaml", head + writer.dump_job(job))
-            folder.pass_turn()
+            folder.invalidate_workers()
             folder.sweep_all()
             try:
                 yield folder
             finally:
-                folder.pass_turn()
+                folder.invalidate_workers()
                 if fresh and not folder.sealed() and not folder.failures():
-                    folder.vacate()
+                    folder.discard()
                     if created:
                         root.rmdir()
     except OSError as error:

@@ -20,7 +20,7 @@ from synth.engine.journal import Journal, Watcher
 from synth.errors import UserError
 from synth.job.reader import as_job
 from synth.job.schema import Job
-from synth.publish import card, croissant, film
+from synth.publish import card, croissant, sequence_video
 from synth.render.camera import camera as cameras
 
 _TRIES = 3
@@ -163,7 +163,7 @@ def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
 
 
 def _publish(folder: Folder) -> None:
-    film.write_preview(folder.root)
+    sequence_video.write_preview(folder.root)
     card.write_card(folder)
     croissant.write_croissant(folder)
 
@@ -262,7 +262,7 @@ class _Pool:
             hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
         if hopeless and not self._folder.sealed():
             # The job itself is at fault: nothing of it stays.
-            self._folder.forgive([refused.index for refused in self._refused])
+            self._folder.clear_failures([refused.index for refused in self._refused])
             raise UserError("\n".join(sorted({refused.reason for refused in self._refused})))
 
 

@@ -17,7 +17,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard out
 
 def fit(
     photo: Photo,
-    out: Out = Path("look.yaml"),
+    out: Out = Path("appearance.yaml"),
     width_mm: Width = 35.0,
     mask: Marked = None,
     json: AsJson = False,

@@ -105,12 +105,12 @@ def nearest_family(given: Photograph) -> Family:
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
     """A default frame without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
-    look = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
+    appearance = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False}
-    job = Job.model_validate({**look, "appearance": {"families": [family]}, "render": view})
+    job = Job.model_validate({**appearance, "appearance": {"families": [family]}, "render": view})
     scene = at_rest(job, index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
-    drawn = scene.scenario.look.sensor
+    drawn = scene.scenario.appearance.sensor
     return TissueFrame(radiance, usable, replace(_USUAL, white=drawn.white, exposure=drawn.exposure))

@@ -93,7 +93,7 @@ def tile(pictures: Sequence[Rgb]) -> Rgb:
     return np.vstack([np.hstack(full[k : k + columns]) for k in range(0, len(full), columns)])
 
 
-def both_eyes(sequence: Sequence_, t: int) -> Rgb:
+def side_by_side(sequence: Sequence_, t: int) -> Rgb:
     """Frame t (H, W, 3); of a stereo sequence (H, 2W, 3), the left eye beside the right."""
     left = sequence["rgb"][t]
     return np.hstack([left, sequence["rgb_right"][t]]) if "rgb_right" in sequence else left

@@ -79,7 +79,7 @@ def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
     return bool(border.mean() > 0.5 and middle.mean() < 0.5)
 
 
-class FilmFaults:
+class VideoFaults:
     """What a film's pictures suffer from, gathered as they go by."""
 
     def __init__(self, rgb: NDArray[np.uint8], small: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> None:

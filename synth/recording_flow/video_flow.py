@@ -26,7 +26,7 @@ from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import CameraTracker, Course, Similarity, describe_course
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.foreground import ForegroundSearch
-from synth.recording_flow.frame_faults import FilmFaults, find_bars, find_fault, is_inside_out
+from synth.recording_flow.frame_faults import VideoFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.local_flow import LocalFlow
@@ -172,7 +172,7 @@ class VideoFlow:
         """Frames, and memory of the flow's own process."""
         self.found: list[Finding] = []
         """What was found wrong on the way; see `findings`."""
-        self.faults: FilmFaults | None = None
+        self.faults: VideoFaults | None = None
         """What its pictures suffer from; None before the rest frame."""
         self._flow, self._pace = flow or LocalFlow(), pace
         self._camera: CameraTracker | None = None  # from the rest frame on
@@ -325,7 +325,7 @@ class VideoFlow:
         self.tissue = shrink_mask(tissue & ~bars, self.shrink, 127)
         if not self.tissue.any():
             raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
-        self.faults = FilmFaults(rest.rgb, shrink_picture(rest.rgb, self.shrink), self.tissue)
+        self.faults = VideoFaults(rest.rgb, shrink_picture(rest.rgb, self.shrink), self.tissue)
         self.rest_s = rest.time_s
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)

@@ -16,7 +16,7 @@ from synth.render import instrument, truth
 from synth.render.anatomy import noise, rim, scenery, texture
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance import light, reflection
-from synth.render.appearance.look import Look
+from synth.render.appearance.appearance import Appearance
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, right_camera
 from synth.render.mitsuba.adapter import Body, Metal, Stage, Wet, forget, pick
@@ -90,7 +90,7 @@ class Renderer:
 
     Args:
         surface: the cortex at rest.
-        look: its appearance.
+        appearance: its appearance.
         camera: the microscope at rest.
         job: render settings, opening and photograph.
         gestures: kind of each instrument's gesture; an instrument that suits it is shown.
@@ -102,7 +102,7 @@ class Renderer:
     def __init__(
         self,
         surface: CortexSurface,
-        look: Look,
+        appearance: Appearance,
         camera: Camera,
         job: Job,
         gestures: Sequence[str] = ("pull",),
@@ -110,16 +110,16 @@ class Renderer:
         forget()  # of a renderer before this one
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
-        self._look, self._render, self._extra = look, job.render, job.store.extra
-        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, look, camera.mm_per_px)
+        self._appearance, self._render, self._extra = appearance, job.render, job.store.extra
+        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, appearance, camera.mm_per_px)
         self._coat = texture.cortex(
             surface,
-            look,
+            appearance,
             texture.resolution(surface.chart.extent_mm, camera.mm_per_px),
             job.appearance.photo,
             rim.shade(self._rim, surface),
         )
-        hand = np.random.default_rng([look.rim_seed, 2])
+        hand = np.random.default_rng([appearance.rim_seed, 2])
         kinds = instrument.choose(gestures if job.render.tool else (), hand)
         self._tool = instrument.build(kinds, instrument.finish(kinds, hand))
         """Without a vertex where the job shows no instruments."""
@@ -134,7 +134,7 @@ class Renderer:
         if job.render.stereo_mm:
             self.right = right_camera(camera, job.render.stereo_mm)
             self._right_rest = truth.trace_rest(self.right, rest, self._static)
-        self.lamps = light.lamps(camera, look.light)
+        self.lamps = light.lamps(camera, appearance.light)
         dull = np.full(len(self._blade.vertices), _DULL, np.float32)
         self._coating = np.concatenate([self._tool.coat, dull])
         """(V,) of `_steel`: 1 where it is coated black, and between where it is dull."""
@@ -219,7 +219,7 @@ class Renderer:
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
-        return camera_sensor.record(radiance, self._look.sensor, np.random.default_rng([seed, 1]))
+        return camera_sensor.record(radiance, self._appearance.sensor, np.random.default_rng([seed, 1]))
 
     def _posed(self, state: SceneState) -> Shape:
         return Shape(instrument.pose(self._tool, state.tips, state.shafts), self._tool.faces)
@@ -248,16 +248,16 @@ class Renderer:
         )
 
     def _expose(self, stage: Stage, camera: Camera, seed: int) -> Map:
-        spot = light.spot(camera, self.camera, self._look.light)
+        spot = light.spot(camera, self.camera, self._appearance.light)
         return stage.render(seed % 2**32, camera) * spot[..., None]
 
     def _bodies(self, state: SceneState) -> dict[str, Body]:
         """Everything in the scene with its material."""
-        surface, look = self.surface, self._look
+        surface, appearance = self.surface, self._appearance
         pixels = texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
-        frame = rim.paint(self._rim, look, pixels)
-        ambient = _AMBIENT * look.light.power * light.blackbody(look.light.kelvin)
-        wet = Wet(self._coat, look.roughness, look.dry_roughness, ambient, look.film_index)
+        frame = rim.paint(self._rim, appearance, pixels)
+        ambient = _AMBIENT * appearance.light.power * light.blackbody(appearance.light.kelvin)
+        wet = Wet(self._coat, appearance.roughness, appearance.dry_roughness, ambient, appearance.film_index)
         dura = Wet(frame, _RIM_ROUGHNESS, _RIM_DRY, ambient)
         bodies = {
             "cortex": Body(state.vertices, surface.faces, surface.uv, wet, self._film(state)),
@@ -275,9 +275,11 @@ class Renderer:
 
         One mesh of steel, and never without a face: scenes with a retractor and without share their kernel.
         """
-        if "retractor" in self._look.scenery:
+        if "retractor" in self._appearance.scenery:
             points = np.concatenate([self.surface.vertices, self._rim.shape.vertices])
-            return scenery.retractor(self._rim.edge, points, np.random.default_rng([self._look.rim_seed, 5]))
+            return scenery.retractor(
+                self._rim.edge, points, np.random.default_rng([self._appearance.rim_seed, 5])
+            )
         if self._tool.parts:
             return Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
         return Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32))
@@ -292,10 +294,12 @@ class Renderer:
         small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
         axis = noise.centres(_MIRRORED_PX, extent)
         inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
-        around = 0.5 * (np.asarray(self._look.dura_albedo) + np.asarray(self._look.surroundings_albedo))
+        around = 0.5 * (
+            np.asarray(self._appearance.dura_albedo) + np.asarray(self._appearance.surroundings_albedo)
+        )
         wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
-        lit = self._look.light.power * light.blackbody(self._look.light.kelvin)
-        return reflection.Theatre(wound, extent, tuple(self.lamps), lit, self._look.rim_seed)
+        lit = self._appearance.light.power * light.blackbody(self._appearance.light.kelvin)
+        return reflection.Theatre(wound, extent, tuple(self.lamps), lit, self._appearance.rim_seed)
 
     def _mirrored(self, steel: Shape) -> Floats:
         return reflection.glow(steel, self._coating, self.camera.centre, self._theatre)
@@ -309,11 +313,11 @@ class Renderer:
         uv = truth.blend(faces, face, bary, self.surface.uv)
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
         light_in = truth.blend(faces, face, bary, state.power * self._irradiance(state.vertices))
-        spot = light.spot(state.camera or self.camera, self.camera, self._look.light).ravel()[on]
+        spot = light.spot(state.camera or self.camera, self.camera, self._appearance.light).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
         excess = _mean(radiance.reshape(-1, 3))[on] - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
-        glare[on] = excess * self._look.sensor.exposure > _GLARE
+        glare[on] = excess * self._appearance.sensor.exposure > _GLARE
         return glare.reshape(height, width)
 
     def _irradiance(self, vertices: Floats) -> Floats:

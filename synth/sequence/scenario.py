@@ -19,9 +19,9 @@ from synth.job.mechanics import CLEAR_MM, InstrumentSection
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render.anatomy.surface import Relief
+from synth.render.appearance.appearance import Appearance
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
-from synth.render.appearance.look import Look
 from synth.render.camera.camera import CameraView, place, seen_radius
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
@@ -62,7 +62,7 @@ class Scenario:
     """What the first instrument does."""
     further: tuple[Gesture, ...]
     """What the other instruments do at the same time."""
-    look: Look
+    appearance: Appearance
     view: CameraView
     sway: CameraMotion
     pulse: Pulse | None
@@ -89,13 +89,13 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     tissue = draw_tissue(job.fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
     view = draw_view(job.render, generator(_VIEW))
-    sway = draw_sway(job.render, generator(_SWAY))
+    sway = draw_camera_motion(job.render, generator(_SWAY))
     opening_mm = job.anatomy.craniotomy.radius_mm
     seen_mm = seen_radius(place(view, job.render))
     rngs = generator(_GESTURE), generator(_FURTHER)
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, seen_mm)
-    look = draw_look(job, family, generator(_LOOK))
-    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], look, view, sway, pulse)
+    appearance = draw_appearance(job, family, generator(_LOOK))
+    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], appearance, view, sway, pulse)
 
 
 def frame_seeds(job: Job, index: int) -> list[int]:
@@ -285,12 +285,12 @@ def draw_view(render: RenderSection, rng: Random) -> CameraView:
     )
 
 
-def draw_sway(render: RenderSection, rng: Random) -> CameraMotion:
+def draw_camera_motion(render: RenderSection, rng: Random) -> CameraMotion:
     """How far the microscope drifts."""
     return CameraMotion(_uniform(rng, render.drift_mm), int(rng.integers(2**31)))
 
 
-def draw_look(job: Job, family: Family, rng: Random) -> Look:
+def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     """A look of `family` under the job's light, seen by its sensor."""
     lighting = draw_light(job.light, rng)
     ranges = vars(FAMILIES[family])
@@ -305,7 +305,7 @@ def draw_look(job: Job, family: Family, rng: Random) -> Look:
     drawn["bump"] *= 1 + 3 * square
     drawn["roughness"] += 0.12 * square
     drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
-    look = Look(
+    appearance = Appearance(
         family=family,
         **drawn,
         film_index=1.33 + 0.47 * square,
@@ -317,8 +317,8 @@ def draw_look(job: Job, family: Family, rng: Random) -> Look:
     )
     # From a seed of their own, so that nothing else changes.
     parts = job.render.scenery
-    shown = np.random.default_rng([look.rim_seed, 4]).random(len(parts)) < _SHOWN
-    return replace(look, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
+    shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
+    return replace(appearance, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
 
 
 def draw_light(light: LightSection, rng: Random) -> Lighting:

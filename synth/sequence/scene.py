@@ -67,7 +67,7 @@ class RestScene:
     def renderer(self) -> Renderer:
         """What renders this scene, its surface and instruments wherever they are said to be."""
         kinds = [gesture.kind for gesture in self.scenario.gestures]
-        return Renderer(self.surface, self.scenario.look, self.view, self.job, kinds)
+        return Renderer(self.surface, self.scenario.appearance, self.view, self.job, kinds)
 
     @property
     def tissue(self) -> NDArray[np.bool_]:
@@ -98,7 +98,7 @@ class Scene(RestScene):
     @cached_property
     def _timeline(self) -> Timeline:
         case = self.scenario
-        return Timeline(self.motion, self.view, case.sway, case.look.light, self.job.fps)
+        return Timeline(self.motion, self.view, case.sway, case.appearance.light, self.job.fps)
 
     @cached_property
     def _seeds(self) -> list[int]:

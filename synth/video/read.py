@@ -86,14 +86,14 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
             raise UserError(f"{path}: holds no frames")
 
 
-def is_film(path: Path) -> bool:
+def is_video(path: Path) -> bool:
     """Whether it is a video by its name, or a folder of PNGs beside no sequences."""
     if path.is_dir():
         return any(path.glob("*.png")) and not any(path.glob("*.zarr"))
     return path.suffix.lower() in SUFFIXES
 
 
-def read_film(path: Path, fps: float) -> Iterator[Picture]:
+def read_frames(path: Path, fps: float) -> Iterator[Picture]:
     """As `read_video`, of a folder its pictures by the numbers in their names, `fps` a second."""
     if not path.is_dir():
         return read_video(path, fps)

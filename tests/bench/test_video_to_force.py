@@ -32,7 +32,7 @@ def test_predict_and_score_agree_at_every_frame(
     marked[8:-8, 40:-90] = 255
     cv2.imwrite(str(folder / "tissue.png"), marked)
     # The other methods are slow, and no part of the question.
-    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, two_eyes=False: {})
+    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})
 
     words = [str(model), str(folder / "video.mp4"), "--scale", "0.2", "--tissue", str(folder / "tissue.png")]
     words += [] if young is None else ["--young", str(young)]

@@ -1,4 +1,4 @@
-"""Learning curves: readers find a force that is put in and ask what is held out."""
+"""Learning curves: estimators find a force that is put in and ask what is held out."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from made_clip import made_clip
 
-from evidence.curves import readers
-from evidence.curves.readers import GRID, Reader, World
+from evidence.curves import estimators
+from evidence.curves.estimators import GRID, Reader, World
 from learn.data.clips import Clip
 
 
@@ -37,8 +37,8 @@ def clips() -> list[Clip]:
 
 @pytest.fixture
 def world(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
-    monkeypatch.setattr(readers, "_load", lambda root, work: clips)
-    monkeypatch.setattr(readers, "_bare", lambda root: [k % 2 == 0 for k in range(12)])
+    monkeypatch.setattr(estimators, "_load", lambda root, work: clips)
+    monkeypatch.setattr(estimators, "_bare", lambda root: [k % 2 == 0 for k in range(12)])
     monkeypatch.setattr(World, "generation_cpu_s", lambda self: 3600.0)
     return World(tmp_path / "data", (), 4, 2, 10, tmp_path / "work")
 

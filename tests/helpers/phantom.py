@@ -58,7 +58,7 @@ def write(
     frames: int = 6,
     recovered: bool = True,
     family: str = "healthy",
-    two_eyes: bool = False,
+    stereo: bool = False,
     opening: str | None = None,
 ) -> Path:
     """One sequence: a contact somewhere, a direction, a ramp up to a peak; deterministic in `index`."""
@@ -66,8 +66,8 @@ def write(
     job = Job(
         frames=frames,
         flow={"backend": "opencv-tvl1" if recovered else "ideal"},  # type: ignore[arg-type]
-        render={"stereo_mm": 24.0 if two_eyes else 0.0},  # type: ignore[arg-type]
-        store={"without": ("flow_right", "visible_right", "depth_right") if two_eyes else ()},  # type: ignore[arg-type]
+        render={"stereo_mm": 24.0 if stereo else 0.0},  # type: ignore[arg-type]
+        store={"without": ("flow_right", "visible_right", "depth_right") if stereo else ()},  # type: ignore[arg-type]
     )
     rows, cols = SIZE
     young = float(np.exp(rng.uniform(np.log(0.5), np.log(3.0))))
@@ -103,7 +103,7 @@ def write(
             noisy = flow + NOISE_PX * rng.normal(size=flow.shape) * tissue[..., None]
             writer.put_frame("flow_recovered", t, noisy.astype(np.float32))
             writer.put_frame("flow_confidence", t, np.full(SIZE, 0.8, np.float32))
-        if two_eyes:
+        if stereo:
             depth = depth_motion(gx, gy, level * peak, young)[..., None] * tissue[..., None]
             motion = np.concatenate([flow * SCALE_MM_PER_PX, depth], axis=-1)
             writer.put_frame("motion", t, motion.astype(np.float32))

@@ -73,12 +73,12 @@ def test_what_a_page_shows_can_be_used(page: Path) -> None:
 
 
 KEPT = """
-.1% learn/foreign/two-eyes/pool.json methods/network and physics/scores/mae_of_peak/mean
-.1% learn/foreign/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
-.1% exvivo/two-eyes/pool.json methods/network and physics/scores/mae_of_peak/mean
-.1% exvivo/one-eye/pool.json methods/network and physics/scores/mae_of_peak/mean
-.0% scoring/together/together.json rows/20/held/0
-.0% scoring/together/together.json rows/2/held/0
+.1% learn/foreign/stereo/pool.json methods/network and physics/scores/mae_of_peak/mean
+.1% learn/foreign/monocular/pool.json methods/network and physics/scores/mae_of_peak/mean
+.1% exvivo/stereo/pool.json methods/network and physics/scores/mae_of_peak/mean
+.1% exvivo/monocular/pool.json methods/network and physics/scores/mae_of_peak/mean
+.0% scoring/fusion/fusion.json rows/20/held/0
+.0% scoring/fusion/fusion.json rows/2/held/0
 .0% learn/curves/curves.json rows/23/along/0
 .0% learn/curves/curves.json rows/21/along/0
 .0% gap/results.json flows/tvl1/closed/force_mae/R/share

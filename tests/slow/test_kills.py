@@ -59,7 +59,7 @@ def test_a_run_that_is_killed_again_and_again_makes_the_same_dataset(tmp_path: P
     while killed < KILLS:
         if run is None or run.poll() is not None:
             if root.exists():
-                Folder(root).forgive()
+                Folder(root).clear_failures()
             if len(list(root.glob("*.zarr"))) == JOB.sequences:  # all done before all kills
                 shutil.rmtree(root / "000002.zarr")
             run, starts = start(root, JOB, "slow"), starts + 1
@@ -69,7 +69,7 @@ def test_a_run_that_is_killed_again_and_again_makes_the_same_dataset(tmp_path: P
     assert run is not None
     run.wait()
     assert starts > 1, "no engine was killed"
-    Folder(root).forgive()
+    Folder(root).clear_failures()
     resumed = engine.run_job(JOB, root, options("sequence"), Silent())
     calm = engine.run_job(JOB, tmp_path / "calm", options("sequence"), Silent())
     assert resumed.content_hash == calm.content_hash

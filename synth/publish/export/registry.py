@@ -9,7 +9,7 @@ from typing import Any
 from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset
 from synth.errors import UserError
-from synth.publish import film
+from synth.publish import sequence_video
 from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, tapvid, webdataset
 from synth.system import checked_file
 
@@ -22,7 +22,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     "tapvid": tapvid.write_tracks,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
-    "video": film.write_films,
+    "video": sequence_video.write_videos,
 }
 """Every format by the name that `synth export --to` takes."""
 

@@ -20,7 +20,7 @@ from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, throug
 from synth.render.anatomy.scenery import Patty
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
-from synth.render.appearance.look import Look
+from synth.render.appearance.appearance import Appearance
 from synth.render.mitsuba.adapter import Coat
 
 Floats = npt.NDArray[np.float64]
@@ -110,9 +110,9 @@ class Rim:
     """(A,) mm beyond the edge where drapes begin; empty: there are none in view."""
 
 
-def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float) -> Rim:
+def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_per_px: float) -> Rim:
     """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` show."""
-    rng = np.random.default_rng([look.rim_seed, 0])
+    rng = np.random.default_rng([appearance.rim_seed, 0])
     around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
     part = np.linspace(0, 1, round(_OUT * around / _AROUND))
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
@@ -131,16 +131,21 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
     folds = 0.2 * noise.band(rng, 256, extent, 6.5, 0.5) + 0.05 * noise.band(rng, 256, extent, 1.8, 0.5)
     z = _under(surface, flat).reshape(away.shape) + up
     z += np.clip(away - 0.1, 0, 3.0) / 3.0 * sampled(folds)
-    patty = scenery.drawn_patty(rng, edge) if look.cottonoid else None
-    stitches = scenery.stitches(edge, rng)[: 0 if look.family == "calf" else None]  # on the bench nobody sews
+    patty = scenery.drawn_patty(rng, edge) if appearance.cottonoid else None
+    stitches = scenery.stitches(edge, rng)[
+        : 0 if appearance.family == "calf" else None
+    ]  # on the bench nobody sews
     asides = [scenery.aside(angle, stitch)[:, None] * float(edge.mean()) for stitch in stitches]
     wider, within = Flap.pulled
     dura = _ragged(rng, angle, *Flap.width) + sum(wider * ridge(aside[:, 0], within) for aside in asides)
     wall = dura + _ragged(rng, angle, *Wound.gutter)
-    cloth = wall + _ragged(rng, angle, *Drape.away) if "drape" in look.scenery else np.zeros(0)
+    cloth = wall + _ragged(rng, angle, *Drape.away) if "drape" in appearance.scenery else np.zeros(0)
     beyond = step((away - dura[:, None]) / 0.35 - 0.4)
     z += _folded(away, dura[:, None], _ragged(rng, angle, *Flap.sway)[:, None], asides) * (1 - beyond)
-    steps, bone = (wall + Wound.first, wall + _ragged(rng, angle, *Wound.second)), "bone" in look.scenery
+    steps, bone = (
+        (wall + Wound.first, wall + _ragged(rng, angle, *Wound.second)),
+        "bone" in appearance.scenery,
+    )
     risen = sum(high * step((away - at[:, None]) / 0.7) for at, high in zip(steps, Wound.rise, strict=True))
     lumps = sampled(noise.band(rng, 256, extent, 2.6, 0.6))
     lumpy = (0.12 if bone else 0.4) * np.minimum(risen, 1) * lumps
@@ -159,7 +164,7 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
         )
     ]
     cotton: tuple[Patty, ...] = () if patty is None else (patty,)
-    if "cottonoid" in look.scenery:
+    if "cottonoid" in appearance.scenery:
         # Their felt is painted in the middle of the maps, where the opening is.
         cotton += (Patty((0.0, 0.0), 0.0, scenery.PATTY_MM),)
         parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
@@ -168,9 +173,9 @@ def build(surface: CortexSurface, radius_mm: float, look: Look, mm_per_px: float
     return Rim(mesh, uv, extent, edge, cotton, stitches, dura, wall, bone, cloth)
 
 
-def paint(rim: Rim, look: Look, pixels: int) -> Coat:
+def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
     """Dura, blood and what lies beyond, as maps over the rim's square."""
-    rng = np.random.default_rng([look.rim_seed, 1])
+    rng = np.random.default_rng([appearance.rim_seed, 1])
     extent = rim.extent_mm
     wide = noise.fractal(rng, pixels, extent, 8.0, 2.6)
     mottle = noise.fractal(rng, pixels, extent, 2.2, 2.3)
@@ -185,7 +190,7 @@ def paint(rim: Rim, look: Look, pixels: int) -> Coat:
         ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
         weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
         maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
-    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, look, fibres), *maps)
+    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, fibres), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
     bent = normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent)
     return Coat(colour, bent, dry.astype(np.float32))
@@ -251,7 +256,7 @@ def _folded(away: Floats, dura: Floats, sway: Floats, asides: list[Floats]) -> F
     return np.asarray(np.where(away > 0, raised, 0.0))
 
 
-def _paint_rows(rim: Rim, look: Look, drawn: Map, *maps: Map) -> tuple[Map, Map, Map]:
+def _paint_rows(rim: Rim, appearance: Appearance, drawn: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
     x, y, wide, mottle, grain, swell, distance, radius, *cotton = maps
     angle = np.arctan2(y, x)
@@ -261,23 +266,23 @@ def _paint_rows(rim: Rim, look: Look, drawn: Map, *maps: Map) -> tuple[Map, Map,
     outer = step((away - reach) / 0.3 + 0.2 * mottle)
     gutter = outer * (1 - step(past / 0.9 + 0.25 * mottle))
     bumps = 0.035 * mottle + 0.006 * swell
-    beyond = _muscle(look, past, mottle, grain)
+    beyond = _muscle(appearance, past, mottle, grain)
     if rim.bone:
         beyond = _bone(beyond, past, mottle, grain)
         bumps *= np.where(past > 0.6, 0.4, 1.0).astype(np.float32)
-    colour = over(_dura(look, fibres, mottle, grain, distance, radius), beyond, outer[..., None])
+    colour = over(_dura(appearance, fibres, mottle, grain, distance, radius), beyond, outer[..., None])
     if not rim.bone:
         fat = 0.7 * step(wide * 1.5 - 1.4 + 0.4 * mottle) * step(past)
         colour = over(colour, speckled(Wound.fat, 0.10 * grain), fat[..., None])
-    blood = _blood(look.blood, 0.8 * wide + 0.25 * mottle + 0.3 * fibres, gutter)
+    blood = _blood(appearance.blood, 0.8 * wide + 0.25 * mottle + 0.3 * fibres, gutter)
     colour = _shadowed(through(colour, blood, Wound.blood), away, reach, past, gutter)
     dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood - 0.5 * gutter, 0.02, 1)
     if len(rim.cloth):
         cloth = away - _round(rim.cloth, angle)
-        colour, bumps, dry = _draped(look, cloth, mottle, grain, colour, bumps, dry)
+        colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
     colour, bumps = scenery.threaded(rim.stitches, angle, away, float(rim.edge.mean()), colour, bumps)
     for patty in rim.cotton:
-        colour, bumps = scenery.with_patty(patty, x, y, cotton, look.blood, colour, bumps)
+        colour, bumps = scenery.with_patty(patty, x, y, cotton, appearance.blood, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 
@@ -289,18 +294,20 @@ def _streaks(drawn: Map, angle: Map, away: Map, radius: float) -> Map:
     return np.asarray(cv2.remap(drawn, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
 
 
-def _dura(look: Look, fibres: Map, mottle: Map, grain: Map, distance: Map, radius: Map) -> Map:
+def _dura(appearance: Appearance, fibres: Map, mottle: Map, grain: Map, distance: Map, radius: Map) -> Map:
     """Colours of the flap; its vessels shimmer through its outer layer, with a flush beside them."""
     flush = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
     blood = 4.5 * thickness((distance, radius)) + flush
-    return through(speckled(look.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain), blood, Flap.vessel)
+    return through(
+        speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain), blood, Flap.vessel
+    )
 
 
-def _muscle(look: Look, past: Map, mottle: Map, grain: Map) -> Map:
+def _muscle(appearance: Appearance, past: Map, mottle: Map, grain: Map) -> Map:
     """What was cut shows its strands, and pale fascia at the edge of each step."""
-    strands = speckled(look.surroundings_albedo, 0.18 * mottle, 0.04 * grain)
+    strands = speckled(appearance.surroundings_albedo, 0.18 * mottle, 0.04 * grain)
     fascia = 0.45 * ridge(past - 1.0 - 0.3 * mottle, width=0.3)[..., None]
-    return np.asarray(over(strands, np.asarray(look.dura_albedo), fascia), np.float32)
+    return np.asarray(over(strands, np.asarray(appearance.dura_albedo), fascia), np.float32)
 
 
 def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
@@ -330,11 +337,11 @@ def _shadowed(colour: Map, away: Map, reach: Map, past: Map, gutter: Map) -> Map
 
 
 def _draped(
-    look: Look, past: Map, mottle: Map, grain: Map, colour: Map, bumps: Map, dry: Map
+    appearance: Appearance, past: Map, mottle: Map, grain: Map, colour: Map, bumps: Map, dry: Map
 ) -> tuple[Map, Map, Map]:
     """Colour, bumps and dryness with blue or green cloth `past` mm beyond its border, bled on there."""
-    cloth = speckled((Drape.blue, Drape.green)[look.rim_seed % 2], 0.10 * grain, 0.05 * mottle)
-    bled = np.clip(look.blood * (1.1 - past / 2.0) + 0.3 * mottle, 0, 1.2)[..., None]
+    cloth = speckled((Drape.blue, Drape.green)[appearance.rim_seed % 2], 0.10 * grain, 0.05 * mottle)
+    bled = np.clip(appearance.blood * (1.1 - past / 2.0) + 0.3 * mottle, 0, 1.2)[..., None]
     cloth = cloth * (1 - 0.6 * np.minimum(bled, 1)) + np.array(Drape.bled_on, np.float32) * 0.6 * bled
     cover = step(past / 0.3 - 0.5)
     colour = np.asarray(colour + (cloth - colour) * cover[..., None], np.float32)

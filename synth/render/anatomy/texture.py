@@ -19,7 +19,7 @@ from synth.errors import UserError
 from synth.render.anatomy import noise, tube
 from synth.render.anatomy.layers import Rgb, over, ridge, through
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.appearance.look import Look
+from synth.render.appearance.appearance import Appearance
 from synth.render.mitsuba.adapter import Coat
 from synth.system import checked_file
 from synth.system.jit import vectorised
@@ -36,7 +36,7 @@ _NARROW = 2  # power of the sulci's depth that is dark and wet: little is left a
 class Parenchyma:
     """Two tints in clouds, finely grained, under the blood of the pia and of vessels deeper in."""
 
-    grain: Rgb = (0.5, 1.0, 1.2)  # of `look.grain`, in each channel
+    grain: Rgb = (0.5, 1.0, 1.2)  # of `appearance.grain`, in each channel
     pia: Rgb = (0.16, 1.0, 1.3)  # absorption
     beside: tuple[float, float] = 0.7, 1.1  # blur of arteries and of veins, to which the pia is redder
     deep: float = 0.16  # blur of what lies under the pia
@@ -98,13 +98,13 @@ def resolution(extent_mm: float, mm_per_px: float) -> int:
 
 
 def cortex(
-    surface: CortexSurface, look: Look, pixels: int, photo: Path | None, shade: Map | None = None
+    surface: CortexSurface, appearance: Appearance, pixels: int, photo: Path | None, shade: Map | None = None
 ) -> Coat:
     """Parenchyma, vessels and wet film over the surface's chart.
 
     Args:
         surface: the cortex.
-        look: its appearance.
+        appearance: its appearance.
         pixels: side of the maps.
         photo: a picture that takes the place of the painted albedo.
         shade: (m, m) share of light that reaches the surface past what frames it; all of it if not given.
@@ -120,11 +120,11 @@ def cortex(
     }
     # Light and blood tell the clefts from the slopes above them.
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
-    albedo = _photograph(photo, pixels) if photo else _painted(rng, look, tubes, sulci, extent)
+    albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
         red_least = np.array([0.7, 1.0, 1.0], np.float32)
         albedo = albedo * cv2.resize(shade, (pixels, pixels))[..., None] ** red_least
-    height, dry = _film(rng, look, tubes, sulci, extent)
+    height, dry = _film(rng, appearance, tubes, sulci, extent)
     return Coat(albedo, normals(height, extent), dry)
 
 
@@ -155,7 +155,7 @@ def thickness(tube: tuple[Map, Map]) -> Map:
     return np.asarray(2 * np.sqrt(np.maximum(radius**2 - distance**2, 0)), np.float32)
 
 
-def _painted(rng: Random, look: Look, tubes: Tubes, sulci: Map, extent: float) -> Map:
+def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent: float) -> Map:
     pixels = len(sulci)
     wide = noise.fractal(rng, 256, extent, 12.0, 2.4)
     mottle = noise.fractal(rng, 256, extent, 3.0, 1.3)
@@ -165,44 +165,48 @@ def _painted(rng: Random, look: Look, tubes: Tubes, sulci: Map, extent: float) -
     chords = {name: thickness(drawn) for name, drawn in tubes.items()}
     beside = noise.blur(chords["arteries"], Parenchyma.beside[0], extent)
     beside = beside + noise.blur(chords["veins"], Parenchyma.beside[1], extent)
-    bled = _bleedings(rng, look.blood, pixels, extent)
+    bled = _bleedings(rng, appearance.blood, pixels, extent)
     even = cv2.resize(mottle, (pixels, pixels))
     deep = noise.blur(chords["deep"], Parenchyma.deep, extent)
     tissue = [crown, grain, sulci, beside, even, deep, _strands(rng, sulci, extent), bled]
     veins = _vein_maps(rng, tubes["veins"], extent)
     arteries = [cv2.resize(wide, (pixels, pixels)), *tubes["arteries"]]
-    (albedo,) = noise.in_rows(partial(_paint_rows, look), *tissue, *veins, *arteries)
+    (albedo,) = noise.in_rows(partial(_paint_rows, appearance), *tissue, *veins, *arteries)
     # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
     for channel, width in enumerate(Parenchyma.scatter):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
     return np.asarray(np.clip(albedo, 0.01, 0.95, out=albedo), np.float32)
 
 
-def _paint_rows(look: Look, *maps: Map) -> tuple[Map]:
+def _paint_rows(appearance: Appearance, *maps: Map) -> tuple[Map]:
     """Albedo (r, n, 3) of some rows: 6 maps of parenchyma, strands, bleedings, 7 of veins, 3 of arteries."""
-    tissue = _with_clefts(look, _parenchyma(look, *maps[:6]), sulci=maps[2], strands=maps[6])
-    veined = _veined(look, through(tissue, maps[7], Bleeding.blood), *maps[8:15])
-    return (_with_arteries(look, veined, *maps[15:]),)
+    tissue = _with_clefts(appearance, _parenchyma(appearance, *maps[:6]), sulci=maps[2], strands=maps[6])
+    veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:15])
+    return (_with_arteries(appearance, veined, *maps[15:]),)
 
 
-def _parenchyma(look: Look, crown: Map, grain: Map, sulci: Map, beside: Map, mottle: Map, deep: Map) -> Map:
+def _parenchyma(
+    appearance: Appearance, crown: Map, grain: Map, sulci: Map, beside: Map, mottle: Map, deep: Map
+) -> Map:
     """Albedo (r, n, 3) under the blood of the pia, most in sulci and beside vessels, and `deep` [mm]."""
-    gyrus, perfused = (np.asarray(c, np.float32) for c in (look.gyrus_albedo, look.perfused_albedo))
+    gyrus, perfused = (
+        np.asarray(c, np.float32) for c in (appearance.gyrus_albedo, appearance.perfused_albedo)
+    )
     albedo = over(perfused, gyrus, crown)
-    albedo = albedo * (1 + look.grain * grain[..., None] * np.array(Parenchyma.grain, np.float32))
-    blood = look.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * beside
-    blood = blood * np.clip(1 + 0.3 * mottle, 0.2, 2) + look.subpial_absorbance_per_mm * deep
+    albedo = albedo * (1 + appearance.grain * grain[..., None] * np.array(Parenchyma.grain, np.float32))
+    blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * beside
+    blood = blood * np.clip(1 + 0.3 * mottle, 0.2, 2) + appearance.subpial_absorbance_per_mm * deep
     return through(albedo, blood, Parenchyma.pia)
 
 
-def _with_clefts(look: Look, albedo: Map, sulci: Map, strands: Map) -> Map:
+def _with_clefts(appearance: Appearance, albedo: Map, sulci: Map, strands: Map) -> Map:
     """Albedo (r, n, 3) with fluid, haze and strands of arachnoid over the deepest sulci, and their dark."""
     haze = np.clip(0.45 * np.clip((sulci - 0.45) / 0.4, 0, 1) + 0.35 * strands, 0, 0.7)[..., None]
-    fluid = np.array(look.gyrus_albedo, np.float32) * np.array(Sulcus.fluid, np.float32)
+    fluid = np.array(appearance.gyrus_albedo, np.float32) * np.array(Sulcus.fluid, np.float32)
     milk = fluid + strands[..., None] * (np.array(Sulcus.strands, np.float32) - fluid)
-    albedo = albedo + haze * look.sulcus_shading * (milk - albedo)
+    albedo = albedo + haze * appearance.sulcus_shading * (milk - albedo)
     depth = Sulcus.depth[0] * sulci + Sulcus.depth[1] * np.clip(sulci - 0.5, 0, 1)
-    return through(albedo, look.sulcus_shading * depth, Sulcus.dark)
+    return through(albedo, appearance.sulcus_shading * depth, Sulcus.dark)
 
 
 def _strands(rng: Random, sulci: Map, extent: float) -> Map:
@@ -245,25 +249,25 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     return [across, thick, along, streak, cover, halo, depth]
 
 
-def _veined(look: Look, albedo: Map, *maps: Map) -> Map:
+def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their veins, of the maps of `_vein_maps`."""
     across, thick, along, streak, cover, halo, depth = maps
     slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.55)
     slate = np.clip(slate * (1 + 0.12 * streak), 0, 1)[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
-    side = over(thin, np.asarray(look.vein_side_albedo, np.float32), thick[..., None])
-    wall = over(side, np.asarray(look.vein_crest_albedo, np.float32), slate)
+    side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
+    wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), slate)
     cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
     return np.asarray(over(through(albedo, 1.7 * halo, Vein.missed), wall, cover), np.float32)
 
 
-def _with_arteries(look: Look, albedo: Map, wide: Map, distance: Map, radius: Map) -> Map:
+def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map, radius: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their arteries, redder here and paler there."""
     chord = thickness((distance, radius))
     most, soon = Artery.opaque
     reach = most * (1 - np.exp(-chord / soon)) + 0.08 * chord
     fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
-    red = through(albedo, look.arterial_absorption * reach * fade, Artery.absorption_per_mm)
+    red = through(albedo, appearance.arterial_absorption * reach * fade, Artery.absorption_per_mm)
     # A wide one's wall scatters light of its own, most along the crest.
     start, span = Artery.wide
     thick = np.clip((radius - start) / span, 0, 1) * (distance < radius)
@@ -272,26 +276,30 @@ def _with_arteries(look: Look, albedo: Map, wide: Map, distance: Map, radius: Ma
     return np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32)
 
 
-def _film(rng: Random, look: Look, tubes: Tubes, sulci: Map, extent: float) -> tuple[Map, Map]:
+def _film(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent: float) -> tuple[Map, Map]:
     """Height of the wet surface above the mesh, and where its film is thin, 0 to 1.
 
     The film evens out what is finer than itself; it gathers in sulci and leaves crowns and veins bare.
     """
     coarse = 512
     relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
-    relief = noise.blur(relief, look.film_smoothing_mm, extent)
+    relief = noise.blur(relief, appearance.film_smoothing_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
     # It lies in pools, in sulci and beside vessels; what is left of it elsewhere mirrors next to nothing.
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
     beside = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
-    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(beside, 0.25) + 1.6 * look.light.glare
+    wet = (
+        0.9 * cv2.resize(sulci, (coarse, coarse))
+        + 3.2 * np.minimum(beside, 0.25)
+        + 1.6 * appearance.light.glare
+    )
     dry = np.clip(3.8 + 1.5 * pools - 3 * wet, 0.05, 1.0)
     swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
     # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
-    height = relief + look.bump * (1 - 0.9 * on_vein) * swell
+    height = relief + appearance.bump * (1 - 0.9 * on_vein) * swell
     bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
     return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
 

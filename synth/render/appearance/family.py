@@ -12,7 +12,7 @@ Ends = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Middle colours, linear RGB, and ranges of what `look.Look` documents, in the order of drawing.
+    """Middle colours (linear RGB) and ranges of the quantities in `appearance.Appearance`, in drawing order.
 
     Defaults are those of healthy cortex. Chosen by eye on intra-operative photographs;
     `evidence.render.realism` measures colours against one.

@@ -179,7 +179,7 @@ def test_what_is_not_clear_is_refused(tmp_path: Path, use: dict[str, str]) -> No
 @pytest.mark.slow
 def test_a_bag_becomes_a_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One command each: import, score. The tissue slides with the force, in both eyes alike."""
-    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, two_eyes=False: {})  # slow
+    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})  # slow
     apart = round(FOCAL * BASE_MM / AWAY_MM)
     rest = texture(SIZE[1], SIZE[0] + apart)
     newtons = np.zeros((200, 3))

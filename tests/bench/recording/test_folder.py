@@ -171,4 +171,4 @@ def test_a_written_meta_is_read_as_what_it_stands_for(tmp_path: Path) -> None:
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
     assert set(meta.Stereo.model_fields) <= set(re.findall(r"\w+", meta.commented()))
     stills = Maker(tmp_path)(frames=4) / "frames"
-    assert [one.time_s for one in video.read_film(stills, 10.0)] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert [one.time_s for one in video.read_frames(stills, 10.0)] == pytest.approx([0, 0.1, 0.2, 0.3])

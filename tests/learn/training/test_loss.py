@@ -29,7 +29,7 @@ SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
         # Three times the price in the first cell alone: low, over-predicted.
         ("antighost", 0.7 * (3 * 0.04 + 0.0025 + 0.25) / 3, 0.3 * R2, 0.0),
         # The first cell alone is free (under 0.04).
-        ("ghostless", 0.5 * SQUARED, 0.5 * R2, 8 * 0.4 / 3 / 2.0),
+        ("off-target", 0.5 * SQUARED, 0.5 * R2, 8 * 0.4 / 3 / 2.0),
     ],
 )
 def test_by_hand(kind: Loss, error: float, r2: float, ghost: float) -> None:
@@ -41,7 +41,7 @@ def test_by_hand(kind: Loss, error: float, r2: float, ghost: float) -> None:
 
 def test_the_price_of_ghosts_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
     ghost = [
-        float(loss(SAID, TRUE, MASK, "ghostless", 4.0, 2.0, at).background) for at in (0.2, 0.5, 0.75, 1.0)
+        float(loss(SAID, TRUE, MASK, "off-target", 4.0, 2.0, at).background) for at in (0.2, 0.5, 0.75, 1.0)
     ]
     assert ghost == pytest.approx([0, ghost[3] / 2, ghost[3], ghost[3]])
 
@@ -74,6 +74,6 @@ def test_r2_frame_by_frame_gives_a_weak_frame_the_weight_of_a_strong_one() -> No
 def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
     said = torch.zeros(1, 3, 1, 2, requires_grad=True)
     true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
-    loss(said, true, ones, "ghostless", 4.0, 1.0).sum.backward()
+    loss(said, true, ones, "off-target", 4.0, 1.0).sum.backward()
     assert said.grad is not None
     assert torch.isfinite(said.grad).all()

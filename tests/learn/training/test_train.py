@@ -13,7 +13,7 @@ from learn.data.clips import Clip
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import Split, unseen
-from learn.training.batches import Batch, FrameDataset, FrameItem, measure_scales, swayed
+from learn.training.batches import Batch, FrameDataset, FrameItem, add_surface_motion, measure_scales
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
@@ -131,11 +131,11 @@ def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> Non
 
 
 def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force(clips: list[Clip]) -> None:
-    settings = small(sway_mm=0.5)
+    settings = small(surface_motion_mm=0.5)
     frames = FrameDataset(clips, settings)
     items = [FrameItem(c, t, "ideal") for c in range(len(clips)) for t in range(clips[c].frames)]
     still = frames.batch(items)
-    moved = swayed(still, settings, torch.Generator().manual_seed(0))
+    moved = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
     added = (moved.displacement - still.displacement).abs()
     assert (added * (1 - still.mask)).max() == 0
     touched = added.amax((1, 2, 3)) > 0
@@ -144,7 +144,7 @@ def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force
     assert 0.05 < size < 0.5  # a third of 0.5 mm across the view
     for name in ("mask", "confidence", "target"):
         assert torch.equal(getattr(moved, name), getattr(still, name))
-    again = swayed(still, settings, torch.Generator().manual_seed(0))
+    again = add_surface_motion(still, settings, torch.Generator().manual_seed(0))
     assert torch.equal(again.displacement, moved.displacement)
 
 

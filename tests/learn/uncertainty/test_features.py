@@ -12,7 +12,7 @@ from learn.uncertainty.features import (
     MOTION,
     motion_features,
 )
-from learn.uncertainty.out_of_distribution import describe_unseen, fit_distribution
+from learn.uncertainty.out_of_distribution import describe_out_of_distribution, fit_distribution
 
 Floats = NDArray[np.float64]
 
@@ -89,11 +89,11 @@ def test_of_recordings_like_those_it_was_calibrated_on_one_in_twenty_is_an_unsee
     world = fit_distribution(cloud(rng, 300), cloud(rng, 300))
     assert world is not None
     world = world.calibrated(cloud(rng, 400, frames=6))
-    said = [bool(describe_unseen(world, "abc", one)) for one in cloud(rng, 2000, frames=6)]
+    said = [bool(describe_out_of_distribution(world, "abc", one)) for one in cloud(rng, 2000, frames=6)]
     assert np.mean(said) == pytest.approx(0.05, abs=0.025)
     # The feature that is far is named, though all three go together.
     off = cloud(rng, 1)[0] + np.array([0.0, 0.0, -9.0])
-    (line,) = describe_unseen(world, ("one", "two", "three"), off)
+    (line,) = describe_out_of_distribution(world, ("one", "two", "three"), off)
     assert "three (low)" in line
     assert "one (" not in line
 

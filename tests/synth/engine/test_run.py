@@ -128,7 +128,7 @@ def test_trouble_costs_the_sequence_that_makes_it(tmp_path: Path, monkeypatch: p
     assert not list((tmp_path / "out").glob("*.part"))
     # Given up is given up until it is asked for; then it is done, and nothing tells it from the others.
     assert run(tmp_path / "out", job=job).done == 0
-    assert Folder(tmp_path / "out").forgive() == [1, 2, 3, 4, 6]
+    assert Folder(tmp_path / "out").clear_failures() == [1, 2, 3, 4, 6]
     healed = run(tmp_path / "out", job=job)
     assert (healed.done, healed.failed) == (5, {})
 

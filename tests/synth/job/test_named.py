@@ -24,7 +24,7 @@ def test_it_is_read_drawn_and_on_the_page(name: str) -> None:
 
 def test_what_the_missions_ask_about_is_never_shown() -> None:
     shown, bench, look = map(
-        reader.load_job, ("mission", f"{CURVES}/mission-bench.yaml", f"{CURVES}/mission-unseen.yaml")
+        reader.load_job, ("mission", f"{CURVES}/mission-bench.yaml", f"{CURVES}/mission-ood.yaml")
     )
     assert not set(look.appearance.families) & {*shown.appearance.families, *bench.appearance.families}
     assert look.anatomy.gyrus_mm[1] <= shown.anatomy.gyrus_mm[0]

@@ -24,7 +24,7 @@ from synth.dataset.torch_dataset import TorchDataset
 from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.job.schema import Job
-from synth.publish import film
+from synth.publish import sequence_video
 from synth.publish.export import endonerf, hugging_face
 from synth.publish.export.registry import export_dataset
 from synth.render.camera.camera import Camera, project, rays
@@ -153,7 +153,7 @@ def _keys(path: str) -> set[str]:
 
 
 def drawn(*words: Any) -> np.ndarray:
-    return np.stack(list(film.draw_film(*words)))
+    return np.stack(list(sequence_video.draw_video(*words)))
 
 
 def decoded(path: Path) -> list[tuple[float, np.ndarray]]:

@@ -8,7 +8,7 @@ import pytest
 from fake_recording import texture
 from numpy.typing import NDArray
 
-from synth.recording_flow.frame_faults import FilmFaults, find_bars, is_inside_out
+from synth.recording_flow.frame_faults import VideoFaults, find_bars, is_inside_out
 
 
 def _film() -> NDArray[np.uint8]:
@@ -36,7 +36,7 @@ def _spoilt(kind: str) -> NDArray[np.uint8]:
 )
 def test_what_spoils_a_film_is_named(kind: str) -> None:
     film = _spoilt(kind)
-    faults = FilmFaults(film[0], film[0], np.ones(film.shape[1:3], bool))
+    faults = VideoFaults(film[0], film[0], np.ones(film.shape[1:3], bool))
     for k, picture in enumerate(film[1:], 1):
         faults.see(k, k / 10, picture)
         faults.look(k / 10, picture, picture)
@@ -55,7 +55,7 @@ def test_a_bump_is_named_and_an_instrument_that_comes_in_at_once_is_not(jumped: 
             clean[20:80, 90:120] = 90  # 15% of the picture
         picture = np.asarray(np.clip(clean + rng.normal(0, 2, clean.shape), 0, 255), np.uint8)
         if faults is None:
-            faults = FilmFaults(picture, picture, np.ones((96, 128), bool))
+            faults = VideoFaults(picture, picture, np.ones((96, 128), bool))
         else:
             faults.see(k, k / 10, picture)
     assert faults is not None

@@ -46,8 +46,8 @@ def test_a_photograph_is_the_albedo(brain: CortexSurface, tmp_path: Path) -> Non
     picture[:, :45], picture[:, 45:] = (30, 60, 200), (40, 180, 60)  # red left, green right, as BGR
     path = tmp_path / "photo.png"
     cv2.imwrite(str(path), picture)
-    look = scenario.draw_look(JOB, "healthy", np.random.default_rng(0))
-    coat = texture.cortex(brain, look, 128, path)
+    appearance = scenario.draw_appearance(JOB, "healthy", np.random.default_rng(0))
+    coat = texture.cortex(brain, appearance, 128, path)
     assert coat.albedo[64, 20, 0] > 4 * coat.albedo[64, 20, 1]
     assert coat.albedo[64, 108, 1] > 4 * coat.albedo[64, 108, 0]
 

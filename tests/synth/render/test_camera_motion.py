@@ -14,7 +14,7 @@ LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), RENDER
 
 
 def test_drift_starts_at_rest_and_is_as_large_as_asked_for() -> None:
-    sway = scenario.draw_sway(RENDER, np.random.default_rng(5))
+    sway = scenario.draw_camera_motion(RENDER, np.random.default_rng(5))
     x = [sway.at(LENS, t).translation for t in np.arange(0, 2000, 0.5)]
     np.testing.assert_array_equal(x[0], LENS.translation)
     np.testing.assert_allclose(np.std(x, axis=0), 0.4 / np.sqrt(2), rtol=0.15)

@@ -32,8 +32,8 @@ def made(
     )
     surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
-    look = scenario.draw_look(job, "healthy", np.random.default_rng(4))
-    return Renderer(surface, look, camera.place(view, job.render), job), surface.vertices
+    appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
+    return Renderer(surface, appearance, camera.place(view, job.render), job), surface.vertices
 
 
 @pytest.mark.slow

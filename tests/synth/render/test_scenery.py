@@ -22,8 +22,8 @@ def made(parts: tuple[str, ...], tool: bool = False) -> tuple[Renderer, np.ndarr
     job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(render))
     surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
-    look = replace(scenario.draw_look(job, "healthy", np.random.default_rng(4)), scenery=parts)
-    return Renderer(surface, look, camera.place(view, job.render), job), surface.vertices
+    appearance = replace(scenario.draw_appearance(job, "healthy", np.random.default_rng(4)), scenery=parts)
+    return Renderer(surface, appearance, camera.place(view, job.render), job), surface.vertices
 
 
 @pytest.mark.slow

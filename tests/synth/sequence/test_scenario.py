@@ -30,7 +30,7 @@ def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
     for one, usual in zip(drawn, plain, strict=True):
         assert usual.pulse is usual.tissue.membrane is None
         assert one.tissue.young_kpa == usual.tissue.young_kpa
-        assert (one.gesture, one.look) == (usual.gesture, usual.look)
+        assert (one.gesture, one.appearance) == (usual.gesture, usual.appearance)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (640, 360)])

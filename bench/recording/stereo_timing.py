@@ -30,7 +30,7 @@ _BETTER = 0.75  # what another moment leaves of the difference; 0.98 and more of
 _LEAST_FRAMES = 4  # before it ends
 
 
-class EyeTiming:
+class StereoTiming:
     """Follows the tissue's corners in both eyes."""
 
     def __init__(self, stereo: StereoTracker, left: Rgb, right: Rgb, usable: Flags) -> None:

@@ -10,7 +10,7 @@ from synth.render.camera.camera_sensor import CameraSensor
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """One sequence's appearance; colours are linear RGB."""
 
     family: str

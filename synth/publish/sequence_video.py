@@ -33,19 +33,19 @@ def write_preview(root: Path) -> None:
     dataset = Dataset(root)
     chosen = np.unique(np.linspace(0, len(dataset) - 1, _PREVIEW_TILES).round().astype(int))
     sequences = [dataset[int(k)] for k in chosen]
-    width = drawing.both_eyes(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
+    width = drawing.side_by_side(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
     step = max(1, -(-width // _PREVIEW_PX))
 
     def compose(t: int) -> Rgb:
         return drawing.tile(
-            [drawing.both_eyes(one, min(t, one.frames - 1))[::step, ::step] for one in sequences]
+            [drawing.side_by_side(one, min(t, one.frames - 1))[::step, ::step] for one in sequences]
         )
 
     frames = range(max(one.frames for one in sequences))
     encode_video(root / "preview.mp4", map(compose, frames), float(sequences[0].attrs["fps"]))
 
 
-def write_films(
+def write_videos(
     dataset: Dataset,
     target: Path,
     overlays: Several[str] = ("flow", "force"),
@@ -66,12 +66,12 @@ def write_films(
     if unknown:
         raise UserError(f"{unknown[0]}: is not one of {', '.join(OVERLAYS)}")
     for sequence in dataset:
-        drawn = draw_film(sequence, overlays, interval_s)
+        drawn = draw_video(sequence, overlays, interval_s)
         file = target / f"{sequence.index:06d}.mp4"
         encode_video(file, drawn, float(sequence.attrs["fps"]), quality=_QUALITY)
 
 
-def draw_film(
+def draw_video(
     sequence: Sequence, overlays: Several[str], interval_s: tuple[float, float] | None = None
 ) -> Iterator[Rgb]:
     """The frames of that time, (h, w, 3) each; with `force` its curve is below. Raises as above."""

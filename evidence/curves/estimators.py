@@ -16,7 +16,7 @@ from sklearn.decomposition import TruncatedSVD
 from bench.methods import baselines
 from evidence import cache as kept
 from evidence.end_to_end import models
-from evidence.mechanics.worlds import coarse
+from evidence.mechanics.conditions import coarse
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
 from learn.evaluation.evaluate import evaluate

@@ -1,6 +1,6 @@
 """Can a small network tell crops of renderings from a photograph's? Held out by region and sequence.
 
-Run: python -m evidence.look.classifier cortex.jpg --frames 5 --epochs 8 --seed 31
+Run: python -m evidence.appearance.classifier cortex.jpg --frames 5 --epochs 8 --seed 31
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sklearn.metrics import roc_auc_score
 from torch import nn
 
 from evidence import report, status
-from evidence.look import crops
+from evidence.appearance import crops
 from evidence.render.realism import OUTLINE
 from synth.fit.fitting import fit_camera
 from synth.fit.photograph import read_photograph
@@ -39,7 +39,7 @@ _BLURRED_PX = 3.0
 
 def main(
     photo: Path,
-    out: Path = report.RESULTS / "render/look",
+    out: Path = report.RESULTS / "render/appearance",
     outline: str = OUTLINE,
     width_mm: float = 110.0,
     frames: int = 5,

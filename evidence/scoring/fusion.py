@@ -4,7 +4,7 @@ Every sequence's stored motion is read as a recording's is, by one eye and by tw
 and stated. The constants of `bench.methods.fusion`, and what physics' interval grows by under a membrane,
 were set on the half with even numbers; read the other.
 
-Run: python -m evidence.scoring.together mission-unseen --work work
+Run: python -m evidence.scoring.fusion mission-ood --work work
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(
     data: Path,
     work: Annotated[Path, typer.Option(help="Folder for answers, kept for the next run.")] = Path("work"),
     every: Annotated[int, typer.Option(help="1: odd numbers, 0: even ones.")] = 1,
-    out: Path = report.RESULTS / "scoring/together",
+    out: Path = report.RESULTS / "scoring/fusion",
 ) -> None:
     """What each errs by, and what its 90% intervals hold."""
     rows = []
@@ -64,7 +64,7 @@ def main(
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
     result = {"data": status.data(data), "rows": rows}
-    report.save(out, "together.json", result, page(result))
+    report.save(out, "fusion.json", result, page(result))
     report.show(result)
 
 

@@ -18,7 +18,7 @@ _BEHIND_PX = 1.0  # of disparity: what hides tissue is nearer than it
 _NEAR = np.ones((25, 25), np.uint8)
 
 
-class EyePairing:
+class StereoPairing:
     """Gathers, frame by frame, what tells."""
 
     def __init__(self) -> None:

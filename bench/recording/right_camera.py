@@ -9,9 +9,9 @@ from itertools import chain
 import cv2
 import numpy as np
 
-from bench.recording.eye_pairing import EyePairing
-from bench.recording.eye_timing import EyeTiming
 from bench.recording.folder import Recording
+from bench.recording.stereo_pairing import StereoPairing
+from bench.recording.stereo_timing import StereoTiming
 from synth.errors import UserError
 from synth.flow import image, mask_detection
 from synth.flow.estimator import Flags, Map, Rgb
@@ -53,7 +53,7 @@ class StereoQuality:
         return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
 
 
-class SecondEye:
+class RightCamera:
     """Follows the frames of a `VideoFlow`, each once and in order."""
 
     def __init__(self, recording: Recording, scale_mm_per_px: float) -> None:
@@ -65,8 +65,8 @@ class SecondEye:
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._shrink = 1
         self._noise: list[float] = []
-        self._pairing = EyePairing()
-        self._timing: EyeTiming | None = None
+        self._pairing = StereoPairing()
+        self._timing: StereoTiming | None = None
         self._pair: tuple[Rgb, Rgb] | None = None  # of the frame last followed, or
         self._seen: Map | None = None  # its depth
 
@@ -102,7 +102,7 @@ class SecondEye:
                 hidden = _mask_right(right, video.settings.masks, masked)
                 self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
                 self._pairing.add(frame.rgb, right, masked)
-                self._timing = EyeTiming(self._stereo, frame.rgb, right, tissue & ~masked)
+                self._timing = StereoTiming(self._stereo, frame.rgb, right, tissue & ~masked)
                 inside = self._stereo.right_tissue()
                 self._camera = CameraTracker(right, inside, mask_detection.blocked(right))
                 return Moved.nothing(tissue.shape)

@@ -42,7 +42,7 @@ def small(**changes: object) -> TrainingSettings:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("eyes")
     for index in range(8):
-        phantom.write(folder, index, anatomy_seed=index, two_eyes=True)
+        phantom.write(folder, index, anatomy_seed=index, stereo=True)
     return folder
 
 

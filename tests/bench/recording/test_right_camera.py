@@ -15,10 +15,10 @@ from skimage import data
 
 from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.recording import writer
-from bench.recording.check import judge_eyes
-from bench.recording.eye_timing import find_lag
+from bench.recording.check import judge_stereo
 from bench.recording.folder import open_recording
-from bench.recording.second_eye import StereoQuality
+from bench.recording.right_camera import StereoQuality
+from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import track_recording
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
@@ -202,7 +202,7 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
 
 
 def test_a_baseline_in_metres_is_named() -> None:
-    (found,) = judge_eyes(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
+    (found,) = judge_stereo(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
     assert found.state == "bad"
     assert "metres" in found.message
     assert "1000" in found.message
