@@ -29,6 +29,16 @@ def write_png(path: Path, picture: NDArray[Any]) -> None:
     path.write_bytes(as_png(picture))
 
 
+def write_exr(path: Path, radiance: NDArray[np.floating]) -> None:
+    """Linear light (H, W, 3) as an OpenEXR file in half floats; its folder is made."""
+    import OpenEXR
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.ascontiguousarray(radiance, np.float16)}) as file:
+        file.write(str(path))
+
+
 def as_npy(values: NDArray[Any]) -> bytes:
     """A .npy file of an array (...) of any shape."""
     file = io.BytesIO()

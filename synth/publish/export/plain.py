@@ -10,23 +10,24 @@ import numpy as np
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.fields import FIELDS
-from synth.publish.export.encoding import PICTURES, write_png
+from synth.publish.export.encoding import PICTURES, write_exr, write_png
 
 
 def write_folder(dataset: Dataset, target: Path) -> None:
     """`NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, attributes as `NNNNNN/attributes.json`.
 
-    A second lens's pictures are in `NNNNNN/rgb_right/`.
+    The right camera's pictures are in `NNNNNN/rgb_right/`, linear light in `NNNNNN/radiance/TTTT.exr`.
     """
     for sequence in dataset:
         here = target / f"{sequence.index:06d}"
         here.mkdir()
         for name in sequence.fields:
-            if name not in PICTURES:
+            if name not in (*PICTURES, "radiance"):
                 np.save(here / f"{name}.npy", sequence[name][:])
                 continue
             for t in range(sequence.frames):
-                write_png(here / name / f"{t:04d}.png", sequence[name][t])
+                write, ending = (write_png, "png") if name in PICTURES else (write_exr, "exr")
+                write(here / name / f"{t:04d}.{ending}", sequence[name][t])
         (here / "attributes.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
 
 

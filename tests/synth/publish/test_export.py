@@ -26,6 +26,7 @@ from synth.fields import FIELDS
 from synth.job.schema import Job
 from synth.publish import sequence_video
 from synth.publish.export import endonerf, hugging_face
+from synth.publish.export.encoding import write_exr
 from synth.publish.export.registry import export_dataset
 from synth.render.camera.camera import Camera, project, rays
 
@@ -48,6 +49,15 @@ def test_folder(root: Path, tmp_path: Path) -> None:
     for name in sequence.fields:
         assert name.startswith("rgb") or np.array_equal(np.load(here / f"{name}.npy"), sequence[name][:])
     assert json.loads((here / "attributes.json").read_text()) == sequence.attrs
+
+
+def test_linear_light_is_exported_as_exr(tmp_path: Path) -> None:
+    import OpenEXR
+
+    radiance = np.random.default_rng(0).random((6, 8, 3)).astype(np.float16)
+    write_exr(tmp_path / "radiance" / "0001.exr", radiance)
+    with OpenEXR.File(str(tmp_path / "radiance" / "0001.exr")) as file:
+        assert np.array_equal(file.channels()["RGB"].pixels, radiance)
 
 
 def test_hdf5(root: Path, tmp_path: Path) -> None:

@@ -11,11 +11,12 @@ import synth
 from synth.sequence.pipeline import render_sequence
 
 SMALL = ["seed=3", "frames=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=1", "render.size=[96,72]"]
+LINEAR = ["store.extra=[radiance]"]
 
 
 @pytest.fixture(scope="module")
 def job() -> synth.Job:
-    return synth.load_job("tiny", SMALL)
+    return synth.load_job("tiny", [*SMALL, *LINEAR])
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,8 @@ def test_it_is_what_a_dataset_holds(
     stored = synth.open_sequence(render_sequence(job, 1, tmp_path, lambda *_: None))
     for name in ("rgb", "flow", "visible", "depth", "tool", "glare", "traction"):
         np.testing.assert_array_equal(np.stack([getattr(one, name) for one in frames]), stored[name][:], name)
+    linear = np.stack([one.radiance for one in frames]).astype(np.float16)
+    np.testing.assert_array_equal(linear, stored["radiance"][:])
     for name in ("area", "tissue", "force"):
         np.testing.assert_array_equal(np.asarray(getattr(scene, name), stored[name].dtype), stored[name][:])
     assert [one.time_s for one in frames] == pytest.approx(stored["time"][:].tolist())
