@@ -123,7 +123,7 @@ _TABLE = (
           "radius of the circle of confusion of what this frame's pixel sees; 0 where nothing is hit",
           stored="asked", packed=0.5, low=0.0),
     Field("radiance", (*_VIDEO, "rgb"), "float16", "-",
-          "linear light that reaches the sensor, before exposure and noise; 1 is a white surface under the lamps",
+          "linear light at the sensor, before exposure and noise; 1 is a white surface under the lamps",
           length=3, stored="asked", packed=0.9, low=0.0),
     Field("camera", (TIME, "to", "from"), "float64", "mm",
           "world axes (homogeneous) to this frame's camera axes",
