@@ -94,7 +94,7 @@ def rooms(work: Path) -> list[Step]:
             *("gap.experiment", mission, "--unseen", unseen, "--fit", "300", "--epochs", "24"),
             *("--seeds", "1", "--flow", "tvl1", "--work", str(work / "gap")),
         ),
-        _script("scoring.together", unseen, "--work", str(work / "together")),
+        _script("scoring.fusion", unseen, "--work", str(work / "together")),
         _script("scoring.pulse", "--seconds", "20", "--count", "2", "--size", "160"),
         _script("scoring.cost", "learn/models/mono"),
         _script("scoring.stability", str(work / "films")),
