@@ -108,14 +108,14 @@ def look(photo: Path) -> list[Step]:
     """The look beside a photograph, as it comes and fitted."""
     return [
         _script("render.realism", str(photo), "--frames", "12", "--family", "healthy"),
-        _script("look.classifier", str(photo), "--frames", "5", "--epochs", "8"),
+        _script("appearance.classifier", str(photo), "--frames", "5", "--epochs", "8"),
     ]
 
 
 def exvivo(work: Path, photo: Path) -> list[Step]:
     """Pseudo ex vivo recordings of 30 s that differ from the training data in every family, scored."""
     steps: list[Step] = []
-    for number, eyes, model in ((1, "one-eye", "mono"), (2, "two-eyes", "stereo")):
+    for number, eyes, model in ((1, "monocular", "mono"), (2, "stereo", "stereo")):
         made = work / f"exvivo-{eyes}"
         about = ("--count", str(_EXVIVO), "--seconds", "30", "--fps", "10", "--eyes", str(number))
         _, words = _script("scoring.exvivo", "--out", str(made), *about, "--photo", str(photo))
@@ -132,7 +132,7 @@ def foreign(work: Path, mechanics: Path, pictures: Path) -> list[Step]:
     films = _script("foreign.recordings", str(made), "--count", str(_FOREIGN), *pythons, "--left", str(left))
     steps = [films]
     names = [f"{kind}-{k}" for kind in KINDS for k in range(_FOREIGN)]
-    for eyes, folder, model in (("two-eyes", made, "stereo"), ("one-eye", left, "mono")):
+    for eyes, folder, model in (("stereo", made, "stereo"), ("monocular", left, "mono")):
         out = report.RESULTS / "learn/foreign" / eyes
         steps += _scored(f"foreign {eyes}", films, [folder / name for name in names], model, out)
     return steps
