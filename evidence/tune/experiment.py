@@ -16,15 +16,14 @@ from evidence import report
 from learn.evaluation.statistics import interval
 from synth.job import reader
 from synth.tune import search
-from synth.tune.measurements import Measurements
+from synth.tune.grid import differences
 
 _WORDS = (
-    "The force is read from the displacement of a frame by a fixed linear rule "
-    "(`synth/tune/force_reading.py`). *Error*: how far the force read from recovered displacement is off the "
-    "truth of full fidelity, root mean square over frames as a part of the force, mean over sequences. A "
-    "setting *takes* of the budget by how much that is more than at full fidelity, or by how much the label "
-    "itself moves, whichever is more. Intervals are over fresh sequences; costs are CPU time of physics, "
-    "scene, rendering and flow.",
+    "The displacement of a frame stands for a force by a dual-weighted residual (`synth/tune/probe.py`). "
+    "*Error*: how far that of recovered displacement is off the truth of full fidelity, root mean square "
+    "over frames as a part of the force, mean over sequences. A setting *takes* of the budget by how much "
+    "that is more than at full fidelity, or by how much the label itself moves, whichever is more. Intervals "
+    "are over fresh sequences; costs are CPU time of physics, scene, rendering and flow.",
 )
 
 
@@ -42,20 +41,19 @@ def main(
         job = reader.load_job(str(out / f"{scene}.yaml"))
         journal = out / f"{scene}.part"
         # One budget after the other finds what was measured for the one before.
-        measurements = Measurements(job, journal)
+        measurements = search.Measurements(job, journal)
         for budget in map(search.parse_budget, budgets.split(",")):
             tuned = search.tune(measurements, budget, probes, checks)
             unseen = range(probes + checks, probes + checks + fresh)
             whole = {"full": tuned.full, "own": tuned.own, "best": tuned.best}
             again = {
-                kind: search.evaluate(measurements, kind, one.settings, unseen)
+                kind: measurements.evaluate(one.settings, unseen)
                 for kind, one in zip(("full", "before", "after"), whole.values(), strict=True)
             }
-            rows.append(
-                {"scene": scene, "budget": budget, "changes": dict(tuned.changes)}
-                | {kind: _described(one) for kind, one in whole.items()}
-                | {"fresh": {kind: _described(one) for kind, one in again.items()}}
-            )
+            changes = dict(differences(tuned.best.settings, tuned.own.settings))
+            described = {kind: _described(one) for kind, one in whole.items()}
+            checked = {kind: _described(one) for kind, one in again.items()}
+            rows.append({"scene": scene, "budget": budget, "changes": changes, **described, "fresh": checked})
         journal.unlink()
     kept = {"rows": rows}
     report.save(out, "tune.json", kept, page(kept))
@@ -65,8 +63,8 @@ def main(
 def _described(one: search.Evaluation) -> dict[str, Any]:
     """Ready for JSON; None where a sequence could not be carried out."""
     errors, totals, (cost,) = (
-        [value if np.isfinite(value) else None for value in values]
-        for values in (one.errors, one.totals, [one.cost])
+        [float(value) if np.isfinite(value) else None for value in values]
+        for values in (one.growths, one.errors, [one.stages.sum()])
     )
     return {"settings": dict(one.settings), "errors": errors, "totals": totals, "cpu_s_a_frame": cost}
 
@@ -134,6 +132,8 @@ def _over(values: list[float | None]) -> str:
     if None in values:
         return "out of range"
     found = interval(100 * np.asarray(values, np.float64), np.random.default_rng(0))
+    if not np.isfinite(found.low):  # too few, or all the same
+        return f"{found.mean:.1f}"
     return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
 
 

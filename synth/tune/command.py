@@ -10,39 +10,29 @@ import typer
 
 def tune(
     job: Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")],
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")
-    ] = None,
-    budget: Annotated[
-        str,
-        typer.Option(help="By how much the error of the force may grow over full fidelity's: 'force 3%'."),
-    ] = "force 3%",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="The job to write; JOB.tuned.yaml if not given.")
-    ] = None,
+    overrides: Annotated[list[str] | None, typer.Argument(help="Changes, as section.key=value.")] = None,
+    budget: Annotated[str, typer.Option(help="By how much the force error may grow.")] = "force 3%",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="To write; else JOB.tuned.yaml.")] = None,
     probes: Annotated[int, typer.Option(min=1, max=50, help="Sequences for every setting.")] = 3,
     checks: Annotated[int, typer.Option(min=0, max=50, help="Further sequences for whole jobs.")] = 3,
 ) -> None:
-    """Writes the cheapest job whose error of the force is within a budget of full fidelity's.
+    """Writes the cheapest job whose force error is within a budget of full fidelity's.
 
-    A few probe sequences are computed at full fidelity and with one parameter changed at a time (law, mesh,
-    time step, surface, size of picture, paths); the settings chosen are measured as a whole. A
-    run that was stopped goes on when it is given again.
+    On a few probe sequences one parameter at a time is changed (law, mesh, time step, surface, picture,
+    paths); the settings chosen are measured as a whole. The job gets no dearer unless it misses the
+    budget. A run that was stopped goes on when it is given again.
     """
     from synth.errors import UserError
     from synth.job import reader
-    from synth.tune import search, tuned_job
-    from synth.tune.measurements import Measurements
+    from synth.tune import search, table
 
     share = search.parse_budget(budget)
     loaded = reader.load_job(job, overrides or [])
-    target = out or Path(f"{Path(job).stem}.tuned.yaml")
-    if target.exists():
-        raise UserError(f"{target}: exists already")
-    if not target.resolve().parent.is_dir():
-        raise UserError(f"{target}: its folder does not exist")
-    journal = target.with_name(f"{target.name}.part")
-    tuned = search.tune(Measurements(loaded, journal), share, probes, checks)
-    tuned_job.write(tuned, job, overrides or [], target)
+    out = out or Path(f"{Path(job).stem}.tuned.yaml")
+    if out.exists() or not out.resolve().parent.is_dir():
+        raise UserError(f"{out}: {'exists already' if out.exists() else 'its folder does not exist'}")
+    journal = out.with_name(f"{out.name}.part")
+    tuned = search.tune(search.Measurements(loaded, journal), share, probes, checks)
+    table.write(tuned, job, overrides or [], out)
     journal.unlink(missing_ok=True)
-    print("\n".join([*tuned_job.table(tuned), "", f"wrote {target}"]))
+    print("\n".join([*table.table(tuned), "", f"wrote {out}"]))

@@ -1,122 +1,116 @@
-"""One sequence of a job: by how much the force is off with some settings, and what they cost."""
+"""One probe sequence of a job: the force error of settings against full fidelity, and their cost.
+
+The error is the dual-weighted residual of goal-oriented error control (Becker and Rannacher, Acta Numerica
+10, 2001) with the force as the goal. The sequence simulated with an instrument's force and with a little less
+of it shows how the displacement u changes with the force's size s; its place, footprint and direction are
+known. Least squares on du/ds turns other displacement of a frame into the force error that explains it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any, TypeVar
+from collections.abc import Iterable
+from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem.solver import Deformation
-from synth.flow import mask_detection
+from synth.fem.tool_gesture import trajectory
 from synth.flow.estimator import create
-from synth.flow.track import Tracker
 from synth.job.schema import Job
+from synth.render import truth
 from synth.render.camera import camera
-from synth.sequence import scenario
-from synth.sequence.scene import Frame, Scene, simulate
+from synth.sequence.scene import Frame, Scene, at_rest, simulate
 from synth.system.stopwatch import Stopwatch
-from synth.tune.force_reading import cells, fit_reading
 
 Floats = NDArray[np.float64]
-Found = TypeVar("Found")
 
-_LOADED = 3  # frames with load that are looked at in a sequence, on the way up to its peak
-_VIEW = {"field_mm", "working_distance_mm", "tilt_deg", "distortion", "calibration"}
-_PHYSICS: Any = {
-    **dict.fromkeys(("seed", "sequences", "frames", "fps", "anatomy", "fem"), True),
-    "render": _VIEW,
-}
-"""What it depends on; of the view, as contacts keep to what is in it, and not on the picture's size."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One sequence with some settings."""
-
-    label: Floats
-    """(K, I) error of the force that the true displacement stands for, as a part of the force, in K frames of
-    I instruments."""
-    read: Floats
-    """(K, I) the same of the recovered displacement; of the true one where none is recovered."""
-    cost: Floats
-    """(4,) CPU-s: physics and scene of the sequence, rendering and flow of a frame."""
+_PARTS = (0.7, 0.85, 1.0)  # of the way to the largest force, where frames are looked at
+_CELLS = (48, 36)  # across and down: displacement is averaged over them, for every size of picture
+_FLOOR_MM, _SHARE = 0.02, 0.2  # standard deviation of recovered flow: where nothing moves, and per mm
+_LESS = 0.05  # of a force: little enough to be linear, and never out of a law's range
+_FAINT = 0.1  # of the sequence's force: an instrument with less has no error in a frame
 
 
 class Probe:
-    """The first sequence of a job at full fidelity, which other settings are measured against."""
+    """The first sequence of a job at full fidelity, against which settings are measured."""
 
     def __init__(self, job: Job) -> None:
-        """UserError if the sequence cannot be carried out."""
-        scene, _ = _simulate(job.model_dump_json(include=_PHYSICS))
-        self._numbers = loaded_frames(scene.motion)
-        scene, frames, _ = _render(job.model_dump_json(exclude={"flow"}), self._numbers)
-        self._reading = fit_reading(scene, frames[1:])
+        """UserError if the sequence cannot be carried out, or shows no force."""
+        scene = simulate(job)  # which also compiles what all others need: it counts for no cost
+        frames = [scene.frame(round(part * scene.strongest)) for part in _PARTS]
+        self._numbers = [frame.index for frame in frames]
+        self._weights = linearise(scene, frames)
+        self._true_mm = np.stack([cells_mm(scene, frame.flow) for frame in frames])
 
-    def measure(self, job: Job) -> Measured:
-        """The sequence with the settings of `job`. UserError if they cannot carry it out."""
-        scene, frames, cost = _render(job.model_dump_json(exclude={"flow"}), self._numbers)
-        label = read = self._error(scene, [frame.flow for frame in frames[1:]])
-        flow_s = 0.0
+    def measure(self, job: Job) -> list[float]:
+        """The sequence with the settings of `job`. UserError if they cannot carry it out.
+
+        Returns:
+            Force error of the true displacement, and of the recovered one (the true one where none is), as
+            parts of the force; CPU-s a frame of physics, scene, rendering and flow, all above 0.
+        """
+        at_rest(job)  # grows the surface, which stays in memory for other settings: it counts for none
+        watch = Stopwatch()
+        with watch.stage("physics"):
+            scene = simulate(job)
+        with watch.stage("scene"):  # the first frame prepares it
+            rest = scene.frame(0)
+        with watch.stage("rendering"):
+            frames = [scene.frame(t) for t in self._numbers]
+        label = recovered = self._error(scene, [frame.flow for frame in frames])
         if job.flow.backend != "ideal":
-            flows, flow_s = _recover_flow(scene, frames, job)
-            read = self._error(scene, flows)
-        return Measured(label, read, np.array([*cost, flow_s]))
+            with watch.stage("flow"):  # the first step starts cold and costs as much as two of a video
+                track = scene.recover_flow([rest, *frames], create(job.flow.backend))
+            recovered = self._error(scene, track.flow[1:])
+        rendering_s, flow_s = watch.cpu_s("rendering") / len(frames), watch.cpu_s("flow") / (1 + len(frames))
+        sequence_s = watch.cpu_s("physics"), watch.cpu_s("scene") - rendering_s
+        stages = [*(spent / job.frames for spent in sequence_s), rendering_s, flow_s]
+        return [label, recovered, *(max(1e-6, spent) for spent in stages)]
 
-    def _error(self, scene: Scene, flows: list[NDArray[np.float32]]) -> Floats:
-        moved = np.stack([cells(flow, scene.tissue) for flow in flows])
-        return self._reading.error(scene.view.mm_per_px * moved)
-
-
-def loaded_frames(motion: Deformation) -> tuple[int, ...]:
-    """The rest frame and up to three others, evenly on the way to the largest load; UserError without any."""
-    load = np.linalg.norm(motion.traction, axis=2) @ motion.area
-    if not load.any():
-        raise UserError("a sequence of the job has no frame with a load; give it more frames")
-    first, peak = int(np.flatnonzero(load)[0]), int(load.argmax())
-    numbers = np.linspace(first - 1, peak, _LOADED + 1).round().astype(int)[1:]
-    return (0, *sorted({int(t) for t in numbers if t > 0}))
+    def _error(self, scene: Scene, flows: Iterable[NDArray[np.float32]]) -> float:
+        """Root mean square over frames, instruments together."""
+        residual = np.stack([cells_mm(scene, flow) for flow in flows]) - self._true_mm
+        errors = np.einsum("kip,kp->ki", self._weights, residual.reshape(len(residual), -1))
+        return float(np.sqrt(np.square(errors).sum(axis=1).mean()))
 
 
-@lru_cache(maxsize=2)
-def _simulate(job_json: str) -> tuple[Scene, float]:
-    """The moved scene of a job's first sequence, and its CPU-s."""
-    return _timed(lambda: simulate(Job.model_validate_json(job_json)))
+def linearise(scene: Scene, frames: list[Frame]) -> Floats:
+    """Weights (K, I, 2 P) of P cells, x and y in turn, in K frames of a sequence at full fidelity.
+
+    Their sum over errors of displacement, mm, is the error of I instruments' forces, as a part of the
+    sequence's force. UserError if nothing that an instrument moves is visible.
+    """
+    numbers, rest = [frame.index for frame in frames], scene.surface.vertices
+    force = np.linalg.norm(scene.motion.by_instrument[numbers], axis=2)  # (K, I) mN
+    force /= max(np.sqrt(np.square(force).sum(axis=1).mean()), 1e-9)
+    true_mm = np.stack([cells_mm(scene, frame.flow) for frame in frames])
+    responses = np.zeros((*force.shape, true_mm[0].size))
+    own = [trajectory(gesture, scene.job.frames) for gesture in scene.scenario.gestures]
+    for i, stronger in enumerate(own):
+        weaker = [*own[:i], replace(stronger, load=(1 - _LESS) * stronger.load), *own[i + 1 :]]
+        moved = simulate(scene.job, motions=weaker).motion.displacement
+        for k in np.flatnonzero(force[:, i] >= _FAINT):
+            states = (rest + state[numbers[k]] for state in (scene.motion.displacement, moved))
+            pixels = np.subtract(*(camera.project(scene.view, state) for state in states))
+            flow = truth.at_rest_pixels(scene.renderer.rest, scene.surface.faces, pixels)
+            responses[k, i] = cells_mm(scene, flow).ravel() / (_LESS * force[k, i])
+    variance = _FLOOR_MM**2 + _SHARE**2 * np.square(true_mm).sum(axis=2)
+    visible = np.stack([_cells(frame.visible[..., None]) for frame in frames])
+    root = np.sqrt(visible / variance[..., None]).repeat(2, axis=2).reshape(len(frames), 1, -1)
+    if not (responses * root).any(axis=(0, 2)).all():
+        raise UserError("a sequence of the job shows no force of an instrument; give it more frames")
+    return np.asarray(np.linalg.pinv(responses * root).swapaxes(1, 2) * root)
 
 
-@lru_cache(maxsize=1)  # for settings of flow alone
-def _render(job_json: str, numbers: tuple[int, ...]) -> tuple[Scene, list[Frame], tuple[float, float, float]]:
-    """Frames of a job's first sequence; CPU-s of its physics and scene, and of a frame."""
-    job = Job.model_validate_json(job_json)
-    moved, physics_s = _simulate(job.model_dump_json(include=_PHYSICS))
-    own = moved.scenario
-    case = replace(scenario.draw_scenario(job, 0), gesture=own.gesture, further=own.further)
-    scene = replace(moved, job=job, scenario=case, view=camera.place(case.view, job.render))
-    _, scene_s = _timed(lambda: scene.renderer)
-    rendered = [_timed(partial(scene.frame, t)) for t in numbers]
-    first_s, *others_s = (spent for _, spent in rendered)
-    frame_s = min(others_s)  # what else the machine does only adds
-    # The first frame also prepares what all of them need.
-    return scene, [frame for frame, _ in rendered], (physics_s, scene_s + first_s - frame_s, frame_s)
+def cells_mm(scene: Scene, flow: NDArray[np.float32]) -> Floats:
+    """Means (P, 2) mm of flow (H, W, 2) px over the tissue in each cell; 0 in cells without any."""
+    tissue = scene.tissue[..., None]
+    return np.asarray(scene.view.mm_per_px * _cells(flow * tissue) / np.maximum(_cells(tissue), 1e-6))
 
 
-def _recover_flow(scene: Scene, frames: list[Frame], job: Job) -> tuple[list[NDArray[np.float32]], float]:
-    """Flow (H, W, 2) px of all frames but the first, and the CPU-s of one."""
-    rgb = np.stack([frame.rgb for frame in frames])
-    blocked = mask_detection.hidden(rgb, np.stack([frame.tool for frame in frames]))
-    tracker = Tracker(create(job.flow.backend), rgb[0], blocked[0], scene.tissue)
-    steps = [_timed(partial(tracker.step, *one)) for one in zip(rgb[1:], blocked[1:], strict=True)]
-    first_s, *others_s = (spent for _, spent in steps)
-    return [flow for (flow, _), _ in steps], min(others_s or [first_s])  # in a video, most start warm
-
-
-def _timed(compute: Callable[[], Found]) -> tuple[Found, float]:
-    """What is computed, and the CPU-s that it took."""
-    watch = Stopwatch()
-    with watch.stage("all"):
-        found = compute()
-    return found, watch.cpu_s("all")
+def _cells(values: NDArray[np.generic]) -> Floats:
+    """Means (P, C) of (H, W, C)."""
+    means = cv2.resize(values.astype(np.float32), _CELLS, interpolation=cv2.INTER_AREA)
+    return np.asarray(means.reshape(-1, values.shape[2]), np.float64)

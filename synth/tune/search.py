@@ -1,73 +1,129 @@
-"""Goal-oriented fidelity: the cheapest job whose error of the force is within a budget of full fidelity's.
+"""Goal-oriented fidelity: the cheapest job whose force error is within a budget of full fidelity's.
 
-A few probe sequences are computed at full fidelity and with one parameter changed at a time. What each does
-to the force adds up to first order, with its sign, frame by frame; costs multiply stage by stage. That only
-orders the candidates: the cheapest that is predicted to keep the budget is measured as a whole, on further
-sequences too, and given up for the next if it does not keep it.
+On a few probe sequences, one parameter at a time is changed of the job as given, or of full fidelity if that
+job misses the budget. What changes do to the error adds up at most, their costs multiply stage by stage. That
+only orders the candidates: the cheapest that is predicted to keep the budget is measured as a whole, on
+further sequences too, and given up for a more careful one if it misses.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
 import re
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
+from synth.dataset import provenance
 from synth.errors import UserError
-from synth.tune.measurements import Measurements
-from synth.tune.parameters import Settings, show
+from synth.job.schema import Job
+from synth.tune.grid import Settings, changed, differences, list_settings, show
+from synth.tune.probe import Probe
 
 Floats = NDArray[np.float64]
 
-_TRIES = 6
-_STRICTER = (0.6, 0.95)  # after a broken prediction, the next may be between these parts of it
-_EQUAL = 0.02  # costs that differ by less than this part, to which they are known, count as equal
+_DRAWS = 5  # of a probe sequence, until full fidelity carries one out
+_TRIES, _CAREFUL = 6, 0.7  # of whole jobs; a miss is stepped back from to this part of the growth it adds
+_CHEAPER = 0.98  # costs that differ by less than 2%, to which they are known, count as equal
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Settings of all parameters on some sequences, against full fidelity; infinite where they don't work."""
+    """Settings for every key of the grid on N sequences; infinite where they cannot be carried out."""
 
-    name: str
     settings: Settings
-    errors: tuple[float, ...]
-    """By sequence, what they take of the budget (`excess`)."""
-    totals: tuple[float, ...]
-    """By sequence, by how much the force read from recovered displacement is off, as a part of the force."""
-    cost: float
-    """CPU-s a frame: physics, scene, rendering, flow; not the writing of the store."""
+    growths: Floats
+    """(N,) of the force error over full fidelity's, as a part of the force: what is taken of the budget."""
+    errors: Floats
+    """(N,) of the force by recovered displacement, as a part of the force."""
+    growth: float
+    """Mean over sequences."""
+    margin: float
+    """Half the 95% confidence interval of that mean; infinite for one sequence."""
+    stages: Floats
+    """(4,) CPU-s a frame of physics, scene, rendering and flow, mean over sequences."""
 
-    @property
-    def error(self) -> float:
-        """Mean over sequences."""
-        return float(np.mean(self.errors))
+
+class Measurements:
+    """Measurements of a job's settings on sequences like its own, none of which is one of them."""
+
+    def __init__(self, job: Job, journal: Path) -> None:
+        """Takes up what the file `journal` holds of this job and this code, and appends to it."""
+        self.job, self.grid, self._journal = job, list_settings(job), journal
+        explicit = changed(job, {"fem.law": job.fem.chosen_law[0]})
+        self.own: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
+        self.full: Settings = {key: settings[0] for key, settings in self.grid.items()}
+        self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()}"
+        self._probes: dict[int, tuple[Job, Probe]] = {}
+        self._known: dict[str, list[float]] = {}
+        for line in journal.read_text("utf-8", "replace").splitlines() if journal.exists() else []:
+            with suppress(ValueError, TypeError):  # cut off
+                self._known.update([json.loads(line)])
+
+    def evaluate(self, settings: Settings, sequences: Sequence[int]) -> Evaluation:
+        """Measures settings as a whole. UserError if not even full fidelity can carry a sequence out."""
+        full = np.array([self._measure(number, self.full) for number in sequences])
+        label, recovered, *stages = np.transpose([self._measure(number, settings) for number in sequences])
+        # Never below 0, so that no sequence pays for another.
+        growths, margin, n = np.maximum(label, recovered - full[:, 1]), float("inf"), len(label)
+        if n > 1 and np.isfinite(growths).all():
+            margin = float(stats.t.ppf(0.975, n - 1) * stats.sem(growths))
+        mean = float(growths.mean())
+        return Evaluation(settings, growths, recovered, mean, margin, np.mean(stages, axis=1))
+
+    def _measure(self, sequence: int, settings: Settings) -> list[float]:
+        """As `Probe.measure`."""
+        key = f"{self._made_by} {sequence} {sorted(settings.items())}"
+        if key not in self._known:
+            job, probe = self._probe(sequence)
+            self._known[key] = [np.inf] * 6
+            with suppress(*[UserError] * (settings != self.full)):
+                self._known[key] = probe.measure(changed(job, settings))
+            with self._journal.open("a", encoding="utf-8") as file:
+                # The newline comes first, so that a line that was cut off before spoils itself alone.
+                file.write("\n" + json.dumps([key, self._known[key]]))
+            print(f"sequence {sequence}: {show(settings, self.own)}", file=sys.stderr, flush=True)
+        return self._known[key]
+
+    def _probe(self, sequence: int) -> tuple[Job, Probe]:
+        """A sequence's job and probe; draws that full fidelity cannot carry out are passed over."""
+        kinds, families = self.job.fem.gestures, self.job.appearance.families
+        here: dict[str, Any] = {"sequences": 1, "fem.gestures": [kinds[sequence % len(kinds)]], **self.full}
+        here["appearance.families"] = [families[sequence % len(families)]]  # in turn
+        for attempt in range(_DRAWS):
+            if sequence not in self._probes:
+                here["seed"] = crc32(f"tune {self.job.seed} {sequence} {attempt}".encode())
+                job = changed(self.job, here)
+                with suppress(*[UserError] * (attempt < _DRAWS - 1)):
+                    self._probes[sequence] = job, Probe(job)
+        return self._probes[sequence]
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """The answer."""
+    """The answer, and what it rests on."""
 
     budget: float
-    alone: tuple[Evaluation, ...]
-    """Every setting of every parameter by itself."""
     full: Evaluation
     own: Evaluation
-    """The job as it was."""
-    tried: tuple[Evaluation, ...]
+    """The job as given."""
     best: Evaluation
-    """The cheapest that keeps the budget."""
-
-    @property
-    def changes(self) -> Settings:
-        """Keys of the job that change, and their values."""
-        return {key: value for key, value in self.best.settings.items() if value != self.own.settings[key]}
+    rows: tuple[Evaluation, ...]
+    """Each change by itself, on the probes, then whole jobs."""
 
 
 def parse_budget(text: str) -> float:
-    """0.03 of `force 3%`: by how much the error of the force may grow. UserError for anything else."""
+    """0.03 of `force 3%`: by how much the force error may grow. UserError for anything else."""
     found = re.fullmatch(r"\s*force\s+(\d+(?:\.\d+)?)\s*%\s*", text)
     if not found or not 0 < float(found[1]) < 100:
         raise UserError(f"--budget {text!r}: is written as 'force 3%', more than 0 and less than 100")
@@ -75,85 +131,35 @@ def parse_budget(text: str) -> float:
 
 
 def tune(measurements: Measurements, budget: float, probes: int, checks: int) -> Tuned:
-    """Finds the cheapest settings within the budget.
+    """Finds the cheapest settings that let the force error grow by at most a budget, a part of the force.
 
-    Args:
-        measurements: of the job.
-        budget: by how much the error of the force may grow over full fidelity's, as a part of the force.
-        probes: sequences that every setting is measured on.
-        checks: further ones that whole jobs are measured on.
-
-    Raises:
-        UserError: a probe sequence cannot be carried out at full fidelity.
+    Every setting is measured on `probes` sequences, whole jobs on `checks` more. The answer never costs more
+    than the job as given, unless that misses the budget by more than its margin. UserError if a sequence
+    cannot be carried out at full fidelity.
     """
-    parameters, every, some = measurements.parameters, range(probes + checks), range(probes)
-    measurements.expected = probes * sum(len(one.settings) for one in parameters) + 3 * len(every)
-    alone = []
-    for one in parameters:
-        for setting in one.settings[1:]:
-            name, changed = f"{one.key} {show(setting)}", {**measurements.full_fidelity, one.key: setting}
-            alone.append(evaluate(measurements, name, changed, some, predicted=True))
-    full = evaluate(measurements, "full fidelity", measurements.full_fidelity, every)
-    own = evaluate(measurements, "the job as it was", {one.key: one.own for one in parameters}, every)
-    # Full fidelity keeps the budget, which is counted from it.
-    best = own if own.error <= budget else full
-    least = evaluate(measurements, "", best.settings, some, predicted=True).cost
-    tried: list[Evaluation] = []
-    allowed = budget
-    for number in range(_TRIES):
-        picked = _pick(measurements, some, allowed, [one.settings for one in tried])
-        if picked is None or picked.cost > (1 - _EQUAL) * least:
-            break
-        found = evaluate(measurements, f"try {number + 1}", picked.settings, every)
-        tried.append(found)
-        if found.error <= budget:
-            best = min(best, found, key=lambda one: one.cost)
-            break
-        allowed *= float(np.clip(budget / found.error, *_STRICTER))
-    return Tuned(budget, tuple(alone), full, own, tuple(tried), best)
-
-
-def _pick(
-    measurements: Measurements, sequences: range, budget: float, excluded: Sequence[Settings]
-) -> Evaluation | None:
-    """The cheapest settings predicted to keep a budget; of some about as cheap, those that change least."""
-    own = {one.key: one.own for one in measurements.parameters}
-    combinations = itertools.product(*(one.settings for one in measurements.parameters))
-    every = [dict(zip(own, values, strict=True)) for values in combinations]
-    predicted = [evaluate(measurements, "", one, sequences, True) for one in every if one not in excluded]
-    kept = [one for one in predicted if one.error <= budget]
-    limit = (1 + _EQUAL) * min((one.cost for one in kept), default=0.0)
-    near = [one for one in kept if one.cost <= limit]
-    return min(near, key=lambda one: len(one.settings.items() - own.items()), default=None)
-
-
-def evaluate(
-    measurements: Measurements, name: str, settings: Settings, sequences: range, predicted: bool = False
-) -> Evaluation:
-    """Settings of all parameters, measured as a whole, or predicted from the parameters by themselves."""
-    per_frame = 1 / np.array([measurements.job.frames, measurements.job.frames, 1, 1])
-    errors, totals, costs = [], [], []
-    for sequence in sequences:
-        full = measurements.measure(sequence, {})
-        measure = measurements.predict if predicted else measurements.measure
-        found = measure(sequence, settings)
-        errors.append(excess(found.label, found.read, full.read))
-        totals.append(size(found.read))
-        costs.append(found.cost @ per_frame)
-    return Evaluation(name, settings, tuple(errors), tuple(totals), float(np.mean(costs)))
-
-
-def excess(label: Floats, read: Floats, full: Floats) -> float:
-    """What a sequence takes of the budget: never below 0, so that none pays for another.
-
-    Args:
-        label: (K, I) by how much the true displacement changes the force, as a part of the force.
-        read: (K, I) error of the force read from the recovered displacement.
-        full: (K, I) the same at full fidelity.
-    """
-    return max(size(label), size(read) - size(full), 0.0)
-
-
-def size(errors: Floats) -> float:
-    """Root mean square over frames of (K, I) errors, instruments together."""
-    return float(np.sqrt(np.square(errors).sum(axis=1).mean()))
+    grid, some, every = measurements.grid, range(probes), range(probes + checks)
+    full = measurements.evaluate(measurements.full, every)
+    own = measurements.evaluate(measurements.own, every)
+    start = own if np.isfinite(own.growth) and own.growth - own.margin <= budget else full
+    changes = [(key, one) for key in grid for one in grid[key] if one != start.settings[key]]
+    alone = {(key, one): measurements.evaluate({**start.settings, key: one}, some) for key, one in changes}
+    base, candidates = measurements.evaluate(start.settings, some), []
+    for values in itertools.product(*grid.values()):
+        settings = dict(zip(grid, values, strict=True))
+        parts = [alone[change] for change in settings.items() if change in alone]
+        growth = base.growth + sum(one.growth - base.growth for one in parts)
+        cost = np.prod([base.stages, *(one.stages / base.stages for one in parts)], axis=0).sum()
+        if growth <= budget and cost < _CHEAPER * base.stages.sum():
+            order = round(np.log(cost) / np.log(_CHEAPER)), -len(differences(settings, own.settings))
+            candidates.append((order, growth, settings))
+    best, tried, allowed = start, list[Evaluation](), budget
+    for _, growth, settings in sorted(candidates, key=lambda one: one[0], reverse=True):
+        if growth <= allowed and best is start and len(tried) < _TRIES:
+            found = measurements.evaluate(settings, every)
+            tried.append(found)
+            if found.growth > budget:
+                allowed = base.growth + _CAREFUL * (growth - base.growth)
+            elif found.stages.sum() < _CHEAPER * start.stages.sum():
+                best = found
+    single = [one for one in alone.values() if one.settings != own.settings]
+    return Tuned(budget, full, own, best, (*single, full, own, *tried))
