@@ -3,8 +3,8 @@
 #   docker build -t sulcus .
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD":/data sulcus synth render tiny --out out
 #
-# `--user`: what is written belongs to you, whatever your number is.
-# PIP_EXTRA_INDEX_URL may name an index with CPU builds of torch; the default one brings CUDA's libraries along.
+# `--user`: files that are written belong to you.
+# PIP_EXTRA_INDEX_URL may name an index with CPU builds of torch; builds of the default index include CUDA.
 
 FROM python:3.11-slim-trixie
 
@@ -24,7 +24,7 @@ RUN pip install --no-cache-dir -c constraints.txt '.[bench]' \
     && useradd --create-home sulcus \
     && install -d -o sulcus /data
 
-# Compiled kernels are kept below the home folder: mount one to keep them from run to run.
+# Compiled kernels are cached in the home folder: mount one to reuse them in later runs.
 USER sulcus
 WORKDIR /data
 CMD ["synth", "--help"]

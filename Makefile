@@ -1,12 +1,12 @@
-# `make demo` and `make test` are all the set-up there is: both make the virtual environment first.
+# No set-up is needed: `make demo` and `make test` make the virtual environment first.
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
 #   make test    lint, types, all tests but trials: six minutes on two cores
-#   make trials  kills, clusters, containers, the wheel, the site: what has to pass as well before anything lands
-#   make quick   lint, types, and the tests that take no more than seconds
+#   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
+#   make quick   lint, types, and the tests that take seconds
 #   make docs    the pages in site/; open site/index.html
-#   make evidence    kept results anew, into runs/evidence and docs/results; PHOTO=cortex.jpg for the look
-#   make clean   removes what these made
+#   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
+#   make clean   removes all of the above
 #
 # PYTHON=python3.12 chooses the interpreter (3.11 or newer).
 
@@ -15,18 +15,18 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 BIN := .venv/bin
 DEMO := runs/demo
 PYTEST := $(BIN)/python -m pytest -n 2
-# Python compiles what is imported; compiling all that is installed takes as long as installing it.
+# Python compiles a module when it is imported; compiling all packages would double the time of installing.
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
-UNREACHABLE := { echo "the packages could not be installed: is an index of Python packages within reach?" >&2; exit 2; }
+UNREACHABLE := { echo "the packages could not be installed: check the connection to an index of Python packages" >&2; exit 2; }
 
 .PHONY: demo test trials quick docs evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
 setup: .venv/developed .venv/llvm
 
-# `demo` takes what a user needs; everything else takes the tools of development as well, which are thrice as much.
+# `demo` installs what a user needs; the other targets add the developers' tools (3.6 instead of 2.3 GB).
 .venv/installed: pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it, or say make PYTHON=/path/to/python" >&2; exit 2; }
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: install it, or run make PYTHON=/path/to/python" >&2; exit 2; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	  { echo "$(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 2; }
 	@echo "installing into .venv (once; half a minute and the time of the download) ..."
@@ -38,21 +38,21 @@ setup: .venv/developed .venv/llvm
 	@$(INSTALL) -e '.[dev]' || $(UNREACHABLE)
 	@touch $@
 
-# The fast renderer needs an LLVM; without one the slow variant does the same work.
+# The fast renderer needs LLVM; without it the slow variant renders the same.
 .venv/llvm: .venv/installed
 	@$(BIN)/python -m synth.system.llvm_setup
 	@touch $@
 
 demo: .venv/installed .venv/llvm
 	@mkdir -p $(DEMO)
-	@echo && echo "1 of 4: films of brain surfaces that are pushed and pulled, with the force and motion behind every pixel"
+	@echo && echo "1 of 4: renders videos of brain surfaces that are pushed and pulled, with force and motion of every pixel"
 	$(BIN)/synth render demo -o $(DEMO)/data
-	@echo && echo "2 of 4: does the truth agree with the pictures?"
+	@echo && echo "2 of 4: checks that ground truth and pictures agree"
 	$(BIN)/synth verify $(DEMO)/data
-	@echo && echo "3 of 4: a small network learns the force from the motion, then reads films that it has not seen"
+	@echo && echo "3 of 4: trains a small network to estimate force from motion, and tests it on other videos"
 	$(BIN)/learn train $(DEMO)/data -o $(DEMO)/model --preset tiny --input mixed --epochs 30
 	$(BIN)/learn eval $(DEMO)/model $(DEMO)/data
-	@echo && echo "4 of 4: an unseen film as if a camera and a force sensor had recorded it, scored"
+	@echo && echo "4 of 4: scores it on a video that it was not trained on, as on a recording with a force sensor"
 	rm -rf $(DEMO)/recordings
 	recording=$$($(BIN)/bench from-dataset $(DEMO)/data --unseen-by mono --unseen-by $(DEMO)/model -o $(DEMO)/recordings) && \
 	  $(BIN)/bench score $$recording --model mono --also "trained here=$(DEMO)/model" --rate 0 -o $(DEMO) \
@@ -65,7 +65,7 @@ test: setup lint types
 trials: setup slurm
 	$(PYTEST) -m trial
 
-# One trial renders through a real SLURM. A CI's machine gets it where it may; a desk's owner decides.
+# One trial renders through a real SLURM. It is installed on CI machines only.
 slurm:
 	@if [ "$$CI" = true ] && ! command -v slurmctld >/dev/null && [ "$$(id -u)" = 0 ]; then \
 	  (apt-get -qq update && apt-get -qq install -y slurm-wlm) >/dev/null 2>&1 || echo "no SLURM: its test is skipped"; fi

@@ -23,30 +23,30 @@ import synth
 
 job = synth.load_job("tiny", ["seed=3"])  # or synth.Job(...)
 scene = synth.simulate(job, 0)  # built and moved
-frames = list(scene.frames())  # pictures and truth
-seen = scene.recover_flow(frames)
+frames = list(scene.frames())  # pictures and ground truth
+recovered = scene.recover_flow(frames)
 model = learn.load_model("model")
 about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa
-force = learn.predict_force(model, seen.flow, *about, seen.confidence)  # (T, 3) mN; true is scene.force
+force = learn.predict_force(model, recovered.flow, *about, recovered.confidence)  # (T, 3) mN
+print(abs(force - scene.force).max())  # against the true force
 """.strip()
 _SECTION = re.compile(r"^(Args|Returns|Raises):$")
 
 
 def write_page(written: str) -> str:
-    """The page; `written` says who writes it."""
+    """The page; `written` is its note that it is generated."""
     lines = [
         "# The Python packages",
         "",
-        f"{written} What is named here stays; what is imported from inside a",
-    ]
-    lines += [
-        "package may change. Importing a package loads nothing: each name is looked up when first used.",
+        f"{written} Names on this page are stable; modules inside the packages may",
+        "change. Importing a package loads nothing: each name is looked up when first used.",
         "",
+        "Whole programs are in `examples`, with a notebook from a job to a force curve. The shortest:",
+        "",
+        "```python",
+        _CHAIN,
+        "```",
     ]
-    lines += [
-        "Whole programs are in `examples`, among them a notebook from a job to a force curve. The shortest:"
-    ]
-    lines += ["", "```python", _CHAIN, "```"]
     for name, what in PACKAGES.items():
         lines += ["", f"## {name}", "", what]
         package = import_module(name)
@@ -59,9 +59,9 @@ def _described(name: str, value: Any) -> Iterator[str]:
     """A function or class as Markdown."""
     yield from ("", f"### {name}", "")
     if not inspect.isclass(value):
-        yield from (f"    {_signed(name, value)}", "", *_said(value.__doc__))
+        yield from (f"    {_signed(name, value)}", "", *_markdown(value.__doc__))
         return
-    yield from _said(value.__doc__)
+    yield from _markdown(value.__doc__)
     if issubclass(value, BaseModel):
         yield from ("", "Its keys are those of [the job file](job.md), as keywords and nested mappings.")
         return
@@ -69,34 +69,34 @@ def _described(name: str, value: Any) -> Iterator[str]:
         return
     members = list(_members(value))
     if members:
-        yield from ("", "| of it | what |", "| --- | --- |")
+        yield from ("", "| member | what |", "| --- | --- |")
         for member, what in members:
             text = " ".join(what.split("\n\n")[0].split()).replace("|", r"\|")
             yield f"| `{member}` | {text} |"
 
 
 def _members(value: type) -> Iterator[tuple[str, str]]:
-    """Public attributes, properties and methods that say what they are, in the order of the source."""
+    """Public attributes, properties and methods that have a docstring, in the order of the source."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(value))).body[0]
     assert isinstance(tree, ast.ClassDef)
     for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            text = after.value if isinstance(after, ast.Expr) else None
-            if not node.target.id.startswith("_") and isinstance(text, ast.Constant):
-                yield node.target.id, str(text.value)
+            below = after.value if isinstance(after, ast.Expr) else None
+            if not node.target.id.startswith("_") and isinstance(below, ast.Constant):
+                yield node.target.id, str(below.value)
         elif isinstance(node, ast.FunctionDef) and (not node.name.startswith("_") or node.name == "__call__"):
-            said = ast.get_docstring(node)
+            text = ast.get_docstring(node)
             plain = any(
                 isinstance(one, ast.Name) and one.id.endswith("property") for one in node.decorator_list
             )
             names = [one.arg for one in node.args.args[1:]]
             called = "" if node.name == "__call__" else node.name
-            if said:
-                yield (node.name if plain else f"{called}({', '.join(names)})"), said
+            if text:
+                yield (node.name if plain else f"{called}({', '.join(names)})"), text
 
 
 def _signed(name: str, function: Any) -> str:
-    """How it is called, without types."""
+    """Its signature without types."""
     shown = [
         one.replace(annotation=inspect.Parameter.empty)
         for one in inspect.signature(function).parameters.values()
@@ -104,7 +104,7 @@ def _signed(name: str, function: Any) -> str:
     return name + str(inspect.Signature(shown))
 
 
-def _said(text: str | None) -> Iterator[str]:
+def _markdown(text: str | None) -> Iterator[str]:
     """A docstring as Markdown: paragraphs, and its sections as lists."""
     inside = ""
     for line in inspect.cleandoc(text or "").splitlines():

@@ -1,8 +1,8 @@
-"""Writes the pages that say what the code says: `python docs/generate.py`, which `make docs` runs.
+"""Writes the generated pages: `python docs/generate.py`, which `make docs` runs.
 
-Job keys and meta.yaml come from their schemas, fields from the field table, commands from the command lines'
-own help, the Python packages from their docstrings, the map of rooms from the packages', the site's list of
-results from its folders. A test fails when a page says something else.
+Job keys and meta.yaml come from their schemas, fields from the field table, commands from their own help, the
+Python reference and the table of packages from docstrings, the site's list of results from its folders. A
+test fails when a page differs from what is generated.
 """
 
 from __future__ import annotations
@@ -30,41 +30,39 @@ ROOT = DOCS.parent
 PROGRAMS = ("synth", "learn", "bench")
 PACKAGES = (*PROGRAMS, "evidence")
 _WRITTEN = "Written by `make docs`; do not edit."
-# What stands between these in CONTRIBUTING.md, and after the last in mkdocs.yml, is written here.
-_ROOMS = ("<!-- rooms: written by `make docs` -->", "<!-- end of rooms -->")
+# The text between the two markers in CONTRIBUTING.md, and after the third in mkdocs.yml, is generated.
+_TABLE = ("<!-- packages: written by `make docs` -->", "<!-- end of packages -->")
 _LISTED = "  # From here on written by `make docs`"
 
 
 @dataclass(frozen=True)
-class Spoken:
-    """One command as a person types it."""
+class Command:
+    """One command of the command line."""
 
-    words: tuple[str, ...]
-    """("bench", "pareto", "flow")."""
-    command: Any
-    """The click command behind it; `Any`, as newer typer releases carry their own copy of click."""
+    words: tuple[str, ...]  # as typed: ("synth", "render")
+    click: Any  # the click command; `Any`, as newer typer releases bring their own copy of click
 
     @property
     def group(self) -> bool:
-        """Whether it does nothing itself."""
-        return hasattr(self.command, "list_commands")
+        """Whether it only holds other commands."""
+        return hasattr(self.click, "list_commands")
 
     @property
     def examples(self) -> list[str]:
-        """What its help says after each `Example:`."""
-        lines = (self.command.epilog or "").splitlines()
+        """The command lines of its help, each after `Example:`."""
+        lines = (self.click.epilog or "").splitlines()
         return [line.partition("Example:")[2].strip() for line in lines if "Example:" in line]
 
 
-def commands() -> Iterator[Spoken]:
-    """Every command of the three programs, each group before its own."""
+def commands() -> Iterator[Command]:
+    """Every command of the three programs, each group before its commands."""
     for name in PROGRAMS:
         yield from _below(typer.main.get_command(import_module(f"{name}.cli").app), (name,))
 
 
 def fields_page() -> str:
     """docs/fields.md."""
-    lines = ["| field | axes | type | unit | kept | in memory | on disk | meaning |"]
+    lines = ["| field | axes | type | unit | stored | in memory | on disk | meaning |"]
     lines.append("| --- | --- | --- | --- | --- | ---: | ---: | --- |")
     for field in FIELDS.values():
         per = "" if TIME in field.dims else " a sequence"
@@ -82,17 +80,18 @@ Written by `make docs`; do not edit. Sizes: a frame of 640 x 480 px; on disk by 
 sequences. `synth schema --fields` prints the same.
 
 `store.flow: float16` halves the flows. A value is then rounded to 11 bits: by 0.004 px at most below 16 px of
-motion, 0.008 px below 32. The largest error of a sequence is measured as it is written, in its attribute
-`summary.rounding_px`. Readers give float32 either way.
+motion, 0.008 px below 32. The largest error of a sequence is measured while it is written: attribute
+`summary.rounding_px`. Flows are read as float32 either way.
 
-`render.stereo_mm: B` adds a second lens B mm to the right of the first, axes parallel, with the same focal
-length f = `K[0,0]` and distortion, and its principal point moved so that both pictures show the same field:
+`render.stereo_mm: B` adds a right camera, B mm to the right of the left one. Their axes are parallel, focal
+length f = `K[0,0]` and distortion are the same. The right principal point is shifted so that both pictures
+show the same field:
 
     K_right[0,2] = K[0,2] + f B / z,    translation_right = translation - (B, 0, 0),
 
 z being the distance of the craniotomy's centre along the axis. The attribute `right` holds `K`, `distortion`,
-`rotation`, `translation` and `baseline_mm`. Without distortion both eyes see a point on the same row, and its
-depth is
+`rotation`, `translation` and `baseline_mm`. Without distortion a point is on the same row of both pictures,
+and its depth is
 
     Z = f B / (disparity + K_right[0,2] - K[0,2]).
 
@@ -100,7 +99,7 @@ depth is
 
 
 def pages() -> dict[Path, str]:
-    """The generated pages and what they must hold."""
+    """The generated pages: path and text."""
     return {
         DOCS / "fields.md": fields_page(),
         DOCS / "reference" / "job.md": _job(),
@@ -112,22 +111,23 @@ def pages() -> dict[Path, str]:
     }
 
 
-def _below(command: Any, words: tuple[str, ...]) -> Iterator[Spoken]:
-    spoken = Spoken(words, command)
-    yield spoken
-    if spoken.group:
-        context = command.make_context(words[-1], [], resilient_parsing=True)
-        for name in command.list_commands(context):
-            yield from _below(command.get_command(context, name), (*words, name))
+def _below(click: Any, words: tuple[str, ...]) -> Iterator[Command]:
+    command = Command(words, click)
+    yield command
+    if command.group:
+        context = click.make_context(words[-1], [], resilient_parsing=True)
+        for name in click.list_commands(context):
+            yield from _below(click.get_command(context, name), (*words, name))
 
 
 def _job() -> str:
     head = [
         "# The job file",
         "",
-        f"{_WRITTEN} `synth new job.yaml` writes the same as a file to edit; `synth schema` gives the",
-        "JSON schema for editors. Every key may be left out; on the command line it is `section.key=value`.",
-        "A range is `[low, high]`, drawn anew for each sequence; one number is a range that holds only it.",
+        f"{_WRITTEN} `synth new job.yaml` writes the same as a file to edit; `synth schema`",
+        "prints the JSON schema for editors. Every key may be left out; on the command line a key is",
+        "`section.key=value`.",
+        "A range is `[low, high]`, drawn anew for each sequence; a single number is a fixed value.",
     ]
     return "\n".join([*head, *_keys(Job(), "")]) + "\n"
 
@@ -136,13 +136,13 @@ def _recording() -> str:
     head = [
         "# A recording's meta.yaml",
         "",
-        f"{_WRITTEN} What else a recording folder holds: [Your own recording](../howto/recording.md).",
+        f"{_WRITTEN} The other files of a recording folder: [Your own recording](../howto/recording.md).",
     ]
     return "\n".join([*head, *_keys(Meta.model_construct(), "")]) + "\n"
 
 
 def _keys(section: BaseModel, at: str) -> list[str]:
-    """A table of a section's keys, then its sections' own."""
+    """A table of a section's keys, followed by the tables of its subsections."""
     rows: list[str] = []
     inner: list[str] = []
     for name, field in type(section).model_fields.items():
@@ -177,14 +177,14 @@ def _cell(text: str) -> str:
 
 def _commands() -> str:
     lines = ["# Commands", "", f"{_WRITTEN} Every command has `--help`."]
-    for spoken in commands():
-        name = " ".join(spoken.words)
-        lines += ["", f"{'##' if spoken.group else '###'} {name}", "", _sentence(spoken.command.help)]
-        if spoken.group:
+    for command in commands():
+        name = " ".join(command.words)
+        lines += ["", f"{'##' if command.group else '###'} {name}", "", _sentence(command.click.help)]
+        if command.group:
             continue
-        for line in spoken.examples:
+        for line in command.examples:
             lines += ["", f"    {line}"]
-        rows = [_parameter(one) for one in spoken.command.params if one.name != "help"]
+        rows = [_parameter(one) for one in command.click.params if one.name != "help"]
         if rows:
             lines += ["", "| parameter | default | meaning |", "| --- | --- | --- |", *rows]
     return "\n".join(lines) + "\n"
@@ -206,21 +206,24 @@ def _parameter(one: Any) -> str:
 
 
 def _contributing() -> str:
-    """CONTRIBUTING.md with the map of rooms as the code has it."""
+    """CONTRIBUTING.md with its table of packages."""
     path = ROOT / "CONTRIBUTING.md"
-    head, _, rest = path.read_text("utf-8").partition(_ROOMS[0])
-    rows = [f"| `{name.replace('.', '/')}` | {_cell(what)} | {met} |" for name, what, met in rooms()]
-    table = ["", "| room | what | imports from |", "| --- | --- | --- |", *rows, ""]
-    return f"{head}{_ROOMS[0]}\n" + "\n".join(table) + "\n" + _ROOMS[1] + rest.partition(_ROOMS[1])[2]
+    head, _, rest = path.read_text("utf-8").partition(_TABLE[0])
+    rows = [f"| `{name.replace('.', '/')}` | {_cell(what)} | {met} |" for name, what, met in _packages()]
+    table = ["", "| package | what | imports from |", "| --- | --- | --- |", *rows, ""]
+    return f"{head}{_TABLE[0]}\n" + "\n".join(table) + "\n" + _TABLE[1] + rest.partition(_TABLE[1])[2]
 
 
-def rooms() -> Iterator[tuple[str, str, str]]:
-    """Each package: dotted name, what it is for, rooms and packages that its files import from."""
+def _packages() -> Iterator[tuple[str, str, str]]:
+    """Each package: dotted name, purpose, packages that its files import from."""
     paths = [path.parent for name in PACKAGES for path in sorted((ROOT / name).rglob("__init__.py"))]
     folders = {".".join(path.relative_to(ROOT).parts): path for path in paths}
     for name, folder in folders.items():
         trees = {path.stem: ast.parse(path.read_text("utf-8")) for path in folder.glob("*.py")}
-        met = {_room(module, folders) for tree in trees.values() for module in _imported(tree)} - {"", name}
+        met = {_package(module, folders) for tree in trees.values() for module in _imported(tree)} - {
+            "",
+            name,
+        }
         home = name.partition(".")[0]
         inside = sorted(one.partition(".")[2] for one in met if one.startswith(f"{home}."))
         others = [
@@ -230,7 +233,7 @@ def rooms() -> Iterator[tuple[str, str, str]]:
         yield (
             name,
             ast.get_docstring(trees["__init__"]) or "",
-            "its rooms" if name in PROGRAMS else shown or "–",
+            "its own packages" if name in PROGRAMS else shown or "–",
         )
 
 
@@ -242,8 +245,8 @@ def _imported(tree: ast.Module) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def _room(module: str, folders: dict[str, Path]) -> str:
-    """The package that a module lies in; nothing if it isn't ours."""
+def _package(module: str, folders: dict[str, Path]) -> str:
+    """The package that a module belongs to; empty for a module of others."""
     return max((name for name in folders if f"{module}.".startswith(f"{name}.")), key=len, default="")
 
 
@@ -256,26 +259,25 @@ _TITLES = {
     "gap": "Sim-to-real gap",
     "inverse": "Force by physics alone",
     "learn": "Networks",
-    "pulse": "Heart beat and breath",
+    "pulse": "Heartbeat and breathing",
     "scoring": "Cost of scoring",
     "tune": "Choice of fidelity",
 }
 
 
-def _title(room: str) -> str:
-    """A room of docs/results as the site calls it."""
-    return _TITLES.get(room, room.replace("-", " ").capitalize())
-
-
 def _site() -> str:
-    """mkdocs.yml with the rooms of docs/results as they are found."""
+    """mkdocs.yml with a line for each folder of docs/results."""
     head = (ROOT / "mkdocs.yml").read_text("utf-8").partition(_LISTED)[0]
     pages = sorted((DOCS / "results").glob("*/README.md"))
+    titles = {page: page.parent.name.replace("-", " ").capitalize() for page in pages}
     lines = [
-        f"{_LISTED}: the rooms of docs/results as they are found.",
+        f"{_LISTED}: the folders of docs/results.",
         "  - Results:",
         "      - results/README.md",
-        *(f"      - {_title(page.parent.name)}: {page.relative_to(DOCS).as_posix()}" for page in pages),
+        *(
+            f"      - {_TITLES.get(page.parent.name, titles[page])}: {page.relative_to(DOCS).as_posix()}"
+            for page in pages
+        ),
         "",
         "exclude_docs: |",
         "  *.py",

@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered dataset of one short sequence, as the README's commands would leave it."""
+    """A rendered dataset of one short sequence, as the README's commands write it."""
     import synth
 
     small = ["sequences=1", "seed=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=2"]

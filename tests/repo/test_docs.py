@@ -1,4 +1,4 @@
-"""The pages say what the code says: tables are written by it, commands and keys exist, examples are whole."""
+"""Pages agree with the code: generated pages are current, commands and keys exist, code blocks run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PAGES = [
     if page.relative_to(ROOT).parts[:2] not in (("docs", "results"), ("docs", "reference"))
 ]
 GENERATED = generate.pages()
-SPOKEN = {spoken.words: spoken for spoken in generate.commands()}
+COMMANDS = {command.words: command for command in generate.commands()}
 PLUG_INS = ("flow", "law", "method")
 OURS = re.compile(r"(?<![\w./@-])(?:synth|learn|bench|evidence|tests|examples)/[\w/]+(?:\.[a-z0-9]+)*")
 
@@ -46,22 +46,22 @@ def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("page", GENERATED, ids=lambda page: page.stem)
-def test_generated_pages_are_those_of_this_code(page: Path) -> None:
+def test_generated_pages_are_current(page: Path) -> None:
     assert page.read_text("utf-8") == GENERATED[page], "out of date: run `make docs`"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_page_shows_can_be_used(page: Path) -> None:
+def test_commands_keys_and_files_that_a_page_names_exist(page: Path) -> None:
     text = page.read_text("utf-8")
     for line in re.sub(r" *\\\n +", " ", text).splitlines():
         if not re.match(r"(    )+(\.venv/bin/)?(synth|learn|bench) ", line):
             continue
         words = shlex.split(line.strip().removeprefix(".venv/bin/"), comments=True)
-        depth = next((k for k in (3, 2) if len(words) >= k and tuple(words[:k]) in SPOKEN), 0)
+        depth = next((k for k in (3, 2) if len(words) >= k and tuple(words[:k]) in COMMANDS), 0)
         assert depth, f"{line}: there is no such command"
-        spoken = SPOKEN[tuple(words[:depth])]
-        if "--help" not in words and not spoken.group:
-            spoken.command.make_context(words[depth - 1], words[depth:])
+        command = COMMANDS[tuple(words[:depth])]
+        if "--help" not in words and not command.group:
+            command.click.make_context(words[depth - 1], words[depth:])
     for title, block in blocks(page, "yaml"):
         if title in ("job.yaml", "meta.yaml"):
             {"job.yaml": Job, "meta.yaml": Meta}[title].model_validate(YAML(typ="safe").load(block))
@@ -72,7 +72,20 @@ def test_what_a_page_shows_can_be_used(page: Path) -> None:
     assert not lost, f"{page.name} names {lost}"
 
 
-KEPT = """
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=lambda command: "-".join(command.words))
+def test_every_command_has_help_and_examples_that_parse(command: generate.Command) -> None:
+    assert command.click.help
+    assert all(one.help for one in command.click.params), "a parameter has no help"
+    assert command.examples or command.group, 'has no example: epilog="Example: ..." of the command'
+    for line in command.examples:
+        typed = shlex.split(line)
+        assert tuple(typed[: len(command.words)]) == command.words
+        end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
+        if not command.group:
+            command.click.make_context(command.words[-1], typed[len(command.words) : end])
+
+
+FIGURES = """
 .1% learn/foreign/stereo/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% learn/foreign/monocular/pool.json methods/network and physics/scores/mae_of_peak/mean
 .1% exvivo/stereo/pool.json methods/network and physics/scores/mae_of_peak/mean
@@ -85,23 +98,23 @@ KEPT = """
 .2f flow/benchmark/results.json rows/0/measured
 .1% fem/relief/relief.json summary/0/peak_median
 """
-"""The figures of the README's table in turn: format, file of docs/results, place in it."""
+"""The figures of the README's table in order: format, file in docs/results, place in that file."""
 BY_HAND = "docs/scaling.md"
-"""The page of that table without such a file: its figures stand in its text."""
+"""The page of that table without such a file: its figures are in its text."""
 
 
-def test_figures_of_the_readme_are_those_of_kept_results() -> None:
+def test_figures_of_the_readme_are_those_of_stored_results() -> None:
     rows = re.findall(
         r"^\| .*? \| (.*\d.*) \| \[.*\]\((.*)\) \|$", (ROOT / "README.md").read_text("utf-8"), re.M
     )
     shown = [(figure, page) for text, page in rows for figure in re.findall(r"[\d.]*\d%?", text)]
-    kept = []
-    for form, file, place in (line.split(" ", 2) for line in KEPT.split("\n")[1:-1]):
+    stored = []
+    for form, file, place in (line.split(" ", 2) for line in FIGURES.split("\n")[1:-1]):
         value = json.loads((DOCS / "results" / file).read_text("utf-8"))
         for key in place.split("/"):
             value = value[int(key) if isinstance(value, list) else key]
-        kept.append(format(value, form))
-    assert [figure for figure, page in shown if page != BY_HAND] == kept
+        stored.append(format(value, form))
+    assert [figure for figure, page in shown if page != BY_HAND] == stored
     by_hand = re.findall(r"[\d.]*\d%?", (ROOT / BY_HAND).read_text("utf-8"))
     assert {figure for figure, page in shown if page == BY_HAND} <= set(by_hand)
 
@@ -126,13 +139,13 @@ import learn.inference.shipped as shipped
 shipped.MODELS = Path("packed")
 """,
 }
-"""What the blocks of a page take for granted: a person's own pictures; a place that is not the checkout's."""
+"""What the blocks of a page assume: the user's own pictures; a folder for models outside the checkout."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["README", "docs/tutorial", *(f"docs/howto/{one}" for one in HOWTO)])
-def test_what_a_page_shows_runs_in_a_folder_as_it_makes_it(name: str, out: Path, tmp_path: Path) -> None:
-    """Its files are written, its scripts run, its package is installed and offers what it says."""
+def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None:
+    """Its scripts run with the files that it shows; its package installs and its entry point loads."""
     page = ROOT / f"{name}.md"
     pip = "-m pip install -q --no-build-isolation --no-deps --no-index --target site ."
     (tmp_path / "out").symlink_to(out)
@@ -160,7 +173,7 @@ def test_what_a_page_shows_runs_in_a_folder_as_it_makes_it(name: str, out: Path,
 
 
 class Links(HTMLParser):
-    """What a page fetches, what it links to, and the places in it that can be linked to."""
+    """What a page loads, what it links to, and its anchors."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -179,7 +192,7 @@ class Links(HTMLParser):
 
 @pytest.mark.trial
 def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
-    """More than `--strict` asks, which passes over pictures, data files and the list of pages."""
+    """Beyond `--strict`, which ignores pictures, data files and the list of pages."""
     shutil.copytree(DOCS, tmp_path / "docs")
     shutil.copy(ROOT / "mkdocs.yml", tmp_path)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]

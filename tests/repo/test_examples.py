@@ -1,4 +1,4 @@
-"""Every example runs, and gives the number pinned here."""
+"""Every example runs and gives the numbers stated here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["median_flow_error_px"] < 0.2
 
 
-def test_a_dataset_of_own_motion_camera_and_look(tmp_path: Path) -> None:
+def test_a_dataset_with_custom_motion_camera_and_appearance(tmp_path: Path) -> None:
     dataset_recipe.main(tmp_path / "stirred", 1)
     assert verify_dataset(tmp_path / "stirred").good
     sequence = Dataset(tmp_path / "stirred")[0]
@@ -56,7 +56,7 @@ def test_rendering_a_frame() -> None:
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
 
 
-def test_a_law_of_ones_own_stiffens() -> None:
+def test_a_custom_law_stiffens() -> None:
     for name, b in (("example-stiff", 4.0), ("example-plain", 1e-4)):
         synth.add_law(name, own_law.Stiffening(b))
     soft, stiff = own_law.peak_mm("neo-hookean"), own_law.peak_mm("example-stiff")
@@ -65,11 +65,11 @@ def test_a_law_of_ones_own_stiffens() -> None:
     assert own_law.peak_mm("example-plain") == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
 
 
-def test_a_flow_back_end_of_ones_own(out: Path) -> None:
+def test_a_custom_flow_back_end(out: Path) -> None:
     assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.566, rel=0.1)
 
 
-def test_a_method_of_ones_own(out: Path, tmp_path: Path) -> None:
+def test_a_custom_method(out: Path, tmp_path: Path) -> None:
     from bench.recording.from_sequence import export_recording
 
     found = own_method.score_springs(export_recording(Dataset(out)[0], tmp_path / "recording")).methods

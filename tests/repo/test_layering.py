@@ -1,4 +1,4 @@
-"""Rooms know only those below them; checked on the source itself."""
+"""Packages import only from those below them; checked on the source itself."""
 
 from __future__ import annotations
 
@@ -8,69 +8,24 @@ from pathlib import Path
 
 from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
-# From the ground up: a room, or a file that stands by itself, may import what comes before it.
-ORDER = (
-    "synth",
-    "synth.errors",
-    "synth.fields",
-    "synth.formats",
-    "synth.plugins",
-    "synth.system",
-    "synth.job",
-    "synth.flow",
-    "synth.flow.stereo",
-    "synth.video",
-    "synth.recording_flow",
-    "synth.geometry",
-    "synth.fem.mesh",
-    "synth.fem",
-    "synth.render.camera",
-    "synth.render.mitsuba",
-    "synth.render.appearance",
-    "synth.render.anatomy",
-    "synth.render",
-    "synth.dataset",
-    "synth.sequence",
-    "synth.checks",
-    "synth.publish",
-    "synth.publish.export",
-    "synth.engine",
-    "synth.tune",
-    "synth.fit",
-    "synth.cli",
-    "synth.__main__",
-    "learn",
-    "learn.data",
-    "learn.uncertainty",
-    "learn.network",
-    "learn.loss",
-    "learn.settings",
-    "learn.checkpoint",
-    "learn.split",
-    "learn.inference",
-    "learn.evaluation",
-    "learn.training",
-    "learn.cli",
-    "learn.__main__",
-    "bench",
-    "bench.bootstrap",
-    "bench.recording",
-    "bench.importers",
-    "bench.sensor",
-    "bench.methods",
-    "bench.tracking",
-    "bench.scoring",
-    "bench.cli",
-    "bench.__main__",
-    "evidence",
-)
+INSIDE = {
+    "synth": "errors fields formats plugins system job flow flow.stereo video recording_flow "
+    "geometry fem.mesh fem render.camera render.mitsuba render.appearance render.anatomy render "
+    "dataset sequence checks publish publish.export engine tune fit cli __main__",
+    "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "
+    "cli __main__",
+    "bench": "bootstrap recording importers sensor methods tracking scoring cli __main__",
+    "evidence": "",
+}
+ORDER = [name for top, names in INSIDE.items() for name in (top, *(f"{top}.{one}" for one in names.split()))]
+"""Packages, and files outside of any, from the ground up: each may import from those before it."""
 
-# Meeting only in `synth.sequence`: physics, pictures and flow know nothing of each other.
 APART = ("synth.fem", "synth.render", "synth.flow")
+"""Physics, rendering and flow: combined in `synth.sequence` only."""
 
 
-def room(name: str) -> str:
-    """The entry of `ORDER` that a module belongs to: the longest that it lies in."""
+def package(name: str) -> str:
+    """The entry of `ORDER` that a module belongs to: the longest match."""
     return max((one for one in ORDER if name == one or name.startswith(f"{one}.")), key=len)
 
 
@@ -89,54 +44,51 @@ def test_imports_go_down_only() -> None:
     place = {name: k for k, name in enumerate(ORDER)}
     up = []
     for path in sources(*PACKAGES):
-        mine = room(module(path))
+        mine = package(module(path))
         for name in ours(path):
-            other = room(name)
+            other = package(name)
             if place[other] > place[mine] and not name.startswith(f"{module(path)}."):
                 up.append(f"{path.relative_to(ROOT)} imports {name}")
     assert not up, "\n".join(up)
 
 
-def test_every_room_is_in_the_order() -> None:
-    rooms = {module(path.parent / "__init__.py") for path in sources("synth", "learn", "bench")}
-    assert rooms <= set(ORDER), sorted(rooms - set(ORDER))
-    files = {
-        module(path) for package in ("synth", "learn", "bench") for path in (ROOT / package).glob("*.py")
-    }
-    assert files <= set(ORDER), sorted(files - set(ORDER))
+def test_every_package_is_in_the_order() -> None:
+    product = ("synth", "learn", "bench")
+    found = {module(path.parent / "__init__.py") for path in sources(*product)}
+    found |= {module(path) for name in product for path in (ROOT / name).glob("*.py")}
+    assert found <= set(ORDER), sorted(found - set(ORDER))
 
 
-def test_physics_pictures_and_flow_do_not_know_each_other() -> None:
+def test_physics_rendering_and_flow_do_not_import_each_other() -> None:
     for one in APART:
         for path in sources(one.replace(".", "/")):
             met = [name for name in ours(path) for other in APART if other != one and name.startswith(other)]
             assert not met, f"{path} imports {met}"
 
 
-def test_the_product_knows_nothing_of_the_evidence() -> None:
+def test_the_product_does_not_import_evidence() -> None:
     for path in sources("synth", "learn", "bench", "examples"):
         assert not [name for name in imports(path) if name.split(".")[0] == "evidence"], path
     assert [name for path in sources("evidence") for name in imports(path) if name.startswith("bench.")]
 
 
-def test_a_room_is_neither_a_drawer_nor_a_hall() -> None:
+def test_a_package_has_at_most_16_files_and_a_line_that_describes_it() -> None:
     for folder in {path.parent for path in sources(*PACKAGES)}:
         files = [path for path in folder.glob("*.py") if path.name not in ("__init__.py", "__main__.py")]
-        assert len(files) <= 16, f"{folder} has {len(files)} files: look for the second room"
-        said = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8")))
-        assert said, f"{folder} doesn't say what it is for"
-        assert "\n" not in said, f"{folder} needs more than a line to say what it is for"
+        assert len(files) <= 16, f"{folder} has {len(files)} files: split it"
+        described = ast.get_docstring(parsed(folder / "__init__.py"))
+        assert described, f"{folder} has no docstring"
+        assert "\n" not in described, f"{folder}: its docstring has more than one line"
 
 
-def reached(*rooms: str) -> set[str]:
-    """Names of all modules that importing a room's modules imports, one through another."""
+def reached(*packages: str) -> set[str]:
+    """Names of all modules that importing these packages' modules imports, directly or through others."""
     loaded = {}
     for path in sources(*PACKAGES):
-        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
-        loaded[name] = set(imported(ast.Module(top, [])))
+        loaded[module(path)] = set(imported(ast.Module(top, [])))
     found: set[str] = set()
-    todo = [name for name in loaded if name.split(".")[0] in rooms]
+    todo = [name for name in loaded if name.split(".")[0] in packages]
     while todo:
         for name in loaded.get(todo.pop(), set()) - found:
             found.add(name)
@@ -144,15 +96,15 @@ def reached(*rooms: str) -> set[str]:
     return found
 
 
-def test_learn_loads_no_renderer_by_way_of_another_module() -> None:
+def test_learn_loads_no_renderer_through_another_module() -> None:
     found = reached("learn")
     assert {"torch", "synth.dataset.store", "synth.job.schema"} <= found
     assert not [name for name in found if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
-    assert "synth.sequence.pipeline" in reached("bench") | reached("synth"), "the walk sees nothing"
+    assert "synth.sequence.pipeline" in reached("bench") | reached("synth"), "the walk finds no modules"
 
 
 def test_only_the_adapter_imports_mitsuba_at_the_top() -> None:
-    """Mitsuba is loaded after its variant and LLVM are chosen, never on the way of another import."""
+    """Mitsuba must be loaded after its variant and LLVM are chosen, never by an import of another module."""
     for path in sources(*PACKAGES):
         for node in parsed(path).body:
             if isinstance(node, ast.Import) and any(alias.name == "mitsuba" for alias in node.names):

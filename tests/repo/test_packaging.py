@@ -1,0 +1,108 @@
+"""The wheel, the container recipes and the pinned requirements hold what the package needs, and agree."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+from sources import ROOT
+
+DOCKER = (ROOT / "Dockerfile").read_text("utf-8")
+APPTAINER = (ROOT / "apptainer.def").read_text("utf-8")
+TOML = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PROJECT = TOML["project"]
+PRODUCT = ("synth", "learn", "bench")
+DEBIAN = {
+    **dict.fromkeys((f"lib{name}.so.6" for name in ("c", "m", "stdc++")), "the image"),
+    **dict.fromkeys((f"lib{name}" for name in ("pthread.so.0", "dl.so.2", "rt.so.1")), "the image"),
+    **dict.fromkeys(("libgcc_s.so.1", "libz.so.1"), "the image"),
+    "libatomic.so.1": "libatomic1",
+}
+"""The Debian package that provides a library."""
+
+
+def names(requirements: list[str]) -> set[str]:
+    """Names of packages in requirements, as an index spells them."""
+    lines = (line for line in requirements if not line.startswith("#"))
+    return {re.split(r"[^\w.-]", line)[0].lower().replace("_", "-") for line in lines}
+
+
+def test_every_dependency_is_pinned() -> None:
+    required = names(PROJECT["dependencies"]).union(*map(names, PROJECT["optional-dependencies"].values()))
+    assert not required - names((ROOT / "constraints.txt").read_text("utf-8").splitlines())
+    assert {"mitsuba", "scikit-learn", "zensical"} <= required
+
+
+def test_files_agree_on_version_and_licence() -> None:
+    citation = YAML(typ="safe").load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+    assert f"`{PROJECT['version']}`" in (ROOT / "CHANGELOG.md").read_text("utf-8")
+
+
+def test_containers_copy_what_a_build_of_the_wheel_reads() -> None:
+    packages = {name.rstrip("*") for name in TOML["tool"]["setuptools"]["packages"]["find"]["include"]}
+    needed = {"pyproject.toml", "constraints.txt", PROJECT["readme"], *PROJECT["license-files"], *packages}
+    joined = re.sub(r"\\\n\s*", "", DOCKER)
+    copied = {name for rest in re.findall(r"^COPY (.*)$", joined, re.MULTILINE) for name in rest.split()[:-1]}
+    ignored = (ROOT / ".dockerignore").read_text("utf-8")
+    assert copied == needed == {line[1:] for line in ignored.splitlines() if line[:1] == "!"}
+    files = APPTAINER.partition("%files")[2].partition("%")[0]
+    assert {line.split()[0] for line in files.splitlines() if line.strip()} == needed
+
+
+def test_containers_install_what_the_renderer_is_linked_against() -> None:
+    """According to `ldd`: the wheels of Mitsuba and drjit lack some of their libraries."""
+    specs = [find_spec(name) for name in ("drjit", "mitsuba")]
+    homes = [Path(spec.origin).parent for spec in specs if spec is not None and spec.origin is not None]
+    files = [path for home in homes for path in home.glob("*.so*")]
+    linked = subprocess.run(["ldd", *map(str, files)], capture_output=True, text=True).stdout
+    needed = {line.split()[0] for line in linked.splitlines() if "=>" in line} - {path.name for path in files}
+    assert "libatomic.so.1" in needed
+    for recipe in (DOCKER, APPTAINER):
+        installed = re.search(r"apt-get install -y --no-install-recommends ([\w ]+)", recipe)
+        assert installed
+        assert {DEBIAN[name] for name in needed} <= {"the image", *installed[1].split()}
+
+
+@pytest.mark.trial
+def test_the_wheel_holds_the_product_and_its_commands_run(tmp_path: Path) -> None:
+    source, made, content = (tmp_path / name for name in ("source", "made", "content"))
+    for name in PRODUCT:  # a copy, as a build leaves folders behind
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    pip = [sys.executable, "-m", "pip", "wheel", "--disable-pip-version-check", "--no-deps"]
+    build = [*pip, "--no-build-isolation", "-q", "-w", str(made), "."]
+    subprocess.run(build, cwd=source, check=True)
+    (wheel,) = made.glob("*.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(content)
+
+    held = {path.relative_to(content).as_posix() for path in content.rglob("*") if path.is_file()}
+    ours = {
+        path.relative_to(ROOT).as_posix()
+        for name in PRODUCT
+        for path in (ROOT / name).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts and path.suffix not in (".nbi", ".nbc")
+    }
+    assert {name for name in held if ".dist-info/" not in name} == ours
+
+    environment = {**os.environ, "PYTHONPATH": str(content)}
+    where = "import synth.job.reader as r; r.load_job('demo', []); print(r.__file__)"
+    helps = (["-m", program, "--help"] for program in PRODUCT)
+    for words in (*helps, ["-m", "synth", "new", "job.yaml"], ["-c", where]):
+        done = subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(content)), "the checkout was imported, not the wheel"
+    assert (tmp_path / "job.yaml").is_file()
