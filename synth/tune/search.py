@@ -42,16 +42,11 @@ class Evaluation:
     """Settings for every key of the grid on N sequences; infinite where they cannot be carried out."""
 
     settings: Settings
-    growths: Floats
-    """(N,) of the force error over full fidelity's, as a part of the force: what is taken of the budget."""
-    errors: Floats
-    """(N,) of the force by recovered displacement, as a part of the force."""
-    growth: float
-    """Mean over sequences."""
-    margin: float
-    """Half the 95% confidence interval of that mean; infinite for one sequence."""
-    stages: Floats
-    """(4,) CPU-s a frame of physics, scene, rendering and flow, mean over sequences."""
+    growths: Floats  # (N,) of the force error over full fidelity's, as a share of the force
+    errors: Floats  # (N,) of the force from recovered displacement, as a share of the force
+    growth: float  # mean over sequences
+    margin: float  # half the 95% confidence interval of that mean; infinite for one sequence
+    stages: Floats  # (4,) CPU-s a frame of physics, scene, rendering and flow, mean over sequences
 
 
 class Measurements:
@@ -111,15 +106,13 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Tuned:
-    """The answer, and what it rests on."""
+    """The tuned job and all that was measured."""
 
     budget: float
     full: Evaluation
-    own: Evaluation
-    """The job as given."""
+    own: Evaluation  # the job as given
     best: Evaluation
-    rows: tuple[Evaluation, ...]
-    """Each change by itself, on the probes, then whole jobs."""
+    rows: tuple[Evaluation, ...]  # each change by itself, on the probes, then whole jobs
 
 
 def parse_budget(text: str) -> float:

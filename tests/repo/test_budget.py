@@ -1,42 +1,62 @@
-"""Lines of Python that each package may have: one in, one out.
+"""Size of the project: one in, one out.
 
-Who raises a number says why in the same commit.
+Each row states what there is now and what is aimed at. A commit may raise the first up to the second, never
+above it; where it is above already, it only falls.
 """
 
 from __future__ import annotations
 
+import re
+import subprocess
+from importlib import import_module
+from pathlib import Path
+
 import pytest
 from sources import ROOT, sources
 
-LINES = {
-    "synth": 24_751,
-    "learn": 5_611,
-    "bench": 7_744,
-    "evidence": 9_316,
-    "tests": 14_744,
+from learn.settings import TrainingSettings
+from synth.job.schema import Job
+from synth.system.config_file import places
+
+BUDGET = {
+    "synth, learn and bench": (37_000, 35_000),
+    "evidence": (9_312, 7_900),
+    "tests": (14_480, 13_500),
+    "job keys": (88, 88),
+    "training keys": (24, 24),
+    "commands": (26, 26),
 }
-COMMANDS = 28
-JOB_KEYS, TRAINING_KEYS = 100, 26  # a matrix and curves for the one contrast that went
 
 
-@pytest.mark.parametrize("package", LINES)
-def test_a_package_keeps_to_its_budget(package: str) -> None:
-    assert (ROOT / package).is_dir()
-    lines = sum(len(path.read_text("utf-8").splitlines()) for path in sources(package))
-    assert lines <= LINES[package]
+def lines(*packages: str) -> int:
+    return sum(len(path.read_text("utf-8").splitlines()) for path in sources(*packages))
 
 
-def test_keys_keep_to_their_budget() -> None:
-    from learn.settings import TrainingSettings
-    from synth.job.schema import Job
-    from synth.system.config_file import places
-
-    assert len(places(Job)) <= JOB_KEYS
-    assert len(places(TrainingSettings)) <= TRAINING_KEYS
-
-
-def test_commands_keep_to_their_budget() -> None:
-    from importlib import import_module
-
+def commands() -> int:
     apps = [import_module(f"{package}.cli").app for package in ("synth", "learn", "bench")]
-    assert sum(len(app.registered_commands) for app in apps) <= COMMANDS
+    return sum(len(app.registered_commands) for app in apps)
+
+
+MEASURES = {
+    "synth, learn and bench": lambda: lines("synth", "learn", "bench"),
+    "evidence": lambda: lines("evidence"),
+    "tests": lambda: lines("tests"),
+    "job keys": lambda: len(places(Job)),
+    "training keys": lambda: len(places(TrainingSettings)),
+    "commands": commands,
+}
+
+
+@pytest.mark.parametrize("what", BUDGET)
+def test_there_is_no_more_than_stated(what: str) -> None:
+    assert MEASURES[what]() <= BUDGET[what][0]
+
+
+def test_no_commit_raises_what_is_above_what_is_aimed_at() -> None:
+    """Compared with the last commit's table; in a checkout without git there is nothing to compare with."""
+    here = Path(__file__).relative_to(ROOT).as_posix()
+    shown = subprocess.run(["git", "show", f"HEAD:{here}"], cwd=ROOT, capture_output=True, text=True)
+    before = re.findall(r'"([a-z ,]+)": \(([\d_]+), ([\d_]+)\)', shown.stdout)
+    for what, is_, aim in before:
+        assert BUDGET[what][0] <= max(int(is_), BUDGET[what][1]), what
+        assert BUDGET[what][1] <= int(aim), f"{what}: the aim itself was raised"
