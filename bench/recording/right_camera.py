@@ -18,7 +18,7 @@ from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.stereo import calibration
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
-from synth.flow.stereo.rig import Eye, Floats, StereoRig
+from synth.flow.stereo.rig import Floats, Intrinsics, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker
 from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.frame_motion import FrameMotion
@@ -161,7 +161,9 @@ class RightCamera:
         assert about is not None
         path = self._recording.folder / about.calibration
         rig = calibration.read_rig(path, (width, height), about.mm_per_unit)
-        left, right = (Eye(_smaller(eye.K, video.shrink), eye.distortion) for eye in (rig.left, rig.right))
+        left, right = (
+            Intrinsics(_smaller(eye.K, video.shrink), eye.distortion) for eye in (rig.left, rig.right)
+        )
         size = (width // video.shrink, height // video.shrink)
         return StereoRig(left, right, rig.rotation, rig.translation, size)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from synth.flow.confidence import DOUBTFUL
+from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Flags
 from synth.publish.picture import Rgb, arrow_gain, arrows, framed, legible, overlay, tile
 from synth.recording_flow.frame_motion import FrameMotion
@@ -25,7 +25,7 @@ def draw_tracking(frames: Sequence[FrameMotion], tissue: Flags, shrink: int) -> 
         tissue: (h, w) of the rest frame.
         shrink: how many times smaller than the film's these pictures are; lengths are said in the film's.
     """
-    trusted = [tissue & (one.confidence > DOUBTFUL) for one in frames]
+    trusted = [tissue & (one.confidence > LOW_CONFIDENCE) for one in frames]
     lengths = [np.linalg.norm(one.flow, axis=-1) * where for one, where in zip(frames, trusted, strict=True)]
     most = [float(np.percentile(length[tissue], 99)) for length in lengths]
     strongest = int(np.argmax(most))

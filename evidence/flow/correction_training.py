@@ -32,7 +32,7 @@ from synth.errors import UserError
 from synth.flow import correction, image, mask_detection
 from synth.flow.stereo import depth_correction
 from synth.flow.stereo.depth_motion import Change
-from synth.flow.stereo.rig import Eye, StereoRig
+from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
@@ -307,7 +307,7 @@ def depth_example(film: Film) -> Film:
     tissue = film["tissue"]
     hidden = [mask_detection.hidden(film[rgb], film[tool]) for rgb, tool in zip(_EYES, _TOOLS, strict=True)]
     found = track(Tvl1(), film["rgb"], hidden[0], tissue)
-    eyes = Eye(film["K"], film["dist"]), Eye(film["Kr"], film["distr"])
+    eyes = Intrinsics(film["K"], film["dist"]), Intrinsics(film["Kr"], film["distr"])
     pair = StereoRig(*eyes, np.eye(3), np.array([-float(film["baseline"]), 0, 0]), tissue.shape[::-1])
     still = still_frames(found.flow, tissue)
     left, right = (film[rgb] for rgb in _EYES)

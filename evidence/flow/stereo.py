@@ -20,7 +20,7 @@ from evidence import report, status
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.flow import mask_detection
-from synth.flow.stereo.rig import Eye, StereoRig
+from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.track import StereoTracker, still_frames
 from synth.flow.track import track
 
@@ -111,7 +111,7 @@ def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
 def _rig(sequence: Sequence) -> StereoRig:
     """The pair of lenses that took a stereo sequence."""
     left, right = optics.camera_of(sequence), stereo.right_of(sequence)
-    eyes = Eye(left.K, left.distortion), Eye(right.K, right.distortion)
+    eyes = Intrinsics(left.K, left.distortion), Intrinsics(right.K, right.distortion)
     return StereoRig(*eyes, np.eye(3), right.translation - left.translation, left.size)
 
 

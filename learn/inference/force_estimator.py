@@ -17,7 +17,7 @@ from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_out_of_distribution
 from synth.errors import UserError
-from synth.flow.confidence import DOUBTFUL
+from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
@@ -120,7 +120,7 @@ class ForceEstimator:
             still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
             self._at_rest[place] = self._predict(still, place)
         # Of a frame that is lost nothing has the confidence of what is found again.
-        if found.motion is not None and frame.confidence.max() >= DOUBTFUL:
+        if found.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
             self._seen.append(found.motion)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]

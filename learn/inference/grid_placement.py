@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learn.data.grid import Grid, centre, check_scale
-from synth.flow.confidence import DOUBTFUL
+from synth.flow.confidence import LOW_CONFIDENCE
 
 Point = tuple[float, float]
 """(x, y) px."""
@@ -45,7 +45,7 @@ class GridPlacement:
         """
         if self.fits:
             return self.centre_px
-        sure = self._tissue if confidence is None else self._tissue & (confidence >= DOUBTFUL)
+        sure = self._tissue if confidence is None else self._tissue & (confidence >= LOW_CONFIDENCE)
         power = np.square(flow.astype(np.float32)).sum(-1) * sure
         if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
             return self.centre_px

@@ -1,14 +1,15 @@
-"""What a flow misses, and how far off it may be: a small network that rendered scenes have taught.
+"""Correction of a flow and its standard deviation by a small network trained on rendered scenes.
 
-The data term of a flow errs the same way wherever an instrument hides or shades tissue, and where a dimple
-turns away from the lamps; no estimator's own terms say so, but rendered truth does. The network (a U-Net,
-Ronneberger et al., MICCAI 2015) sees no pictures. It sees, on cells of 4 x 4 px, what is masked, the flow and
-its agreement, how light and colour changed, and the steps that Lucas and Kanade's equations (IJCAI 1981)
-would still take over two windows, in brightness and in colour, each freed of the window's mean change. All of
-it is in pixels or ratios, so that little of a renderer's look can be learnt. It answers with what is to be
-added and the logarithm of its variance (Kendall and Gal, NeurIPS 2017, eq. 5; Student's distribution).
+A flow has systematic errors where an instrument hides or shades tissue, and where a dimple turns away from
+the lamps. The energy of an estimator cannot reveal them; ground truth of renders does. The network (a U-Net,
+Ronneberger et al., MICCAI 2015) works on cells of 4 x 4 px and does not see pictures. Its features are the
+masks, the flow and its agreement, changes of light and colour, and the remaining steps of Lucas and Kanade's
+equations (IJCAI 1981) over two windows, in brightness and in colour, each without the mean change of the
+window. All are in pixels or ratios, so that little of the renderer's appearance can be learnt. The outputs
+are the correction and the logarithm of its variance (Kendall and Gal, NeurIPS 2017, eq. 5, with Student's
+distribution).
 
-`evidence.flow.correction_training` makes the weights; they lie beside this file with a card.
+`evidence.flow.correction_training` trains the weights. They are stored next to this file with a card.
 """
 
 from __future__ import annotations
@@ -31,33 +32,32 @@ from synth.flow.image import GREY
 from synth.system.jit import vectorised
 
 WEIGHTS = Path(__file__).with_name("correction.pt")
-CELL = 4
-"""Pixels a side that are one cell."""
-_WINDOWS = 3, 7  # cells a side
+CELL = 4  # px, side of a cell
+_WINDOWS = 3, 7  # cells, sides of the windows of Lucas and Kanade's steps
 _STEPS = [f"{of} {n} {part}" for of in ("grey", "colour") for n in _WINDOWS for part in ("x", "y", "known")]
 FEATURES = (
     *("visible in both", "visible now", "usable at rest", "residual", *_STEPS, "red", "green", "blue"),
     *("light at rest", "light now", "agreement", "flow x", "flow y"),
 )
-"""Channels that the network takes, in the order that its weights are bound to."""
+"""Input channels of the network, in the order of its weights."""
 CHANNELS = len(FEATURES)
 VECTORS = tuple((k, k + 1) for k, name in enumerate(FEATURES) if name.endswith(" x"))
-"""Channels that are x and y of a vector: a picture that is mirrored or turned changes them."""
+"""Pairs of channels that are x and y of a vector and change when a picture is mirrored or rotated."""
 PRODUCTS = ("1", "gx", "gy", "r", "gx gx", "gx gy", "gx r", "gy gy", "gy r", "r r")
-"""Planes of `sum_cells` of greys, then of colours: g the gradient of both pictures' mean, r their change."""
+"""Planes of `sum_cells` for greys, then for colours: g is the mean gradient of both, r their change."""
 LIGHTS = ("red", "green", "blue", "luminance")
-"""Planes of `sum_cells` of the rest frame after those, then of the frame now."""
+"""Further planes of `sum_cells`, for the rest frame and then for the frame now."""
 _PRODUCTS, _LIGHTS, _LUMINANCE = len(PRODUCTS), len(LIGHTS), LIGHTS.index("luminance")
-_MULTIPLE = 8  # cells a side that the network's levels need
+_MULTIPLE = 8  # cells: the levels of the network need multiples of it on both sides
 _WIDTHS = 20, 32, 48
-_LEAST = 0.02  # squared gradients a pixel: windows of less contrast say nothing
-_FARTHEST_PX = 2.0  # no step of a linear equation is believed beyond
-_OFFSET = np.float32(8)  # grey levels added before ratios: sensors' black is none
+_LEAST = 0.02  # added to squared gradients per pixel, so that steps of windows without contrast vanish
+_FARTHEST_PX = 2.0  # limit of a linearised step
+_OFFSET = np.float32(8)  # grey levels added before ratios are taken: the black of a sensor is not zero
 _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
 
 
 class CorrectionNet(nn.Module):
-    """Features in, what is to be added and its log-variance out: (B, channels, h, w) → (B, 2 parts, h, w)."""
+    """U-Net from features (B, channels, h, w) to corrections and their log-variances (B, 2 parts, h, w)."""
 
     mean: Tensor
     deviation: Tensor
@@ -91,72 +91,72 @@ class CorrectionNet(nn.Module):
 
 @cache
 def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
-    """A network with its weights. Raises UserError if they aren't there."""
+    """A network with its weights. Raises UserError if the file is missing."""
     if not path.is_file():
-        raise UserError(f"{path.name}: the correction of motion is missing from this installation")
+        raise UserError(f"{path.name}: this installation lacks the weights of the flow correction")
     net = CorrectionNet(channels, parts)
     state = torch.load(path, map_location="cpu", weights_only=True)
     net.load_state_dict({name: value.float() for name, value in state.items()})
-    # As the processor's convolutions like it: two thirds of the time.
+    # This layout takes two thirds of the time on a CPU.
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
 def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tuple[Flow, Map]:
-    """A flow (H, W, 2) px with what is missing added, and its standard deviation, (H, W) px a component.
+    """Corrects a flow; returns it (H, W, 2) px and the standard deviation of a component (H, W) px.
 
     Args:
         net: the network.
         features: (CHANNELS, h, w), see `describe`.
-        flow: (H, W, 2) px, the one described.
+        flow: (H, W, 2) px, the flow that the features describe.
     """
     height, width = flow.shape[:2]
     small = answer(net, features).transpose(1, 2, 0)
     size = CELL * small.shape[1], CELL * small.shape[0]
     missing, spread = (cv2.resize(part, size)[:height, :width] for part in (small[..., :2], small[..., 2:]))
-    # The geometric mean of both components', within what was trained.
+    # Log-variances are limited to the trained range; the deviation is the geometric mean of both components.
     spread = np.clip(spread, -8, 5, out=spread)
     return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
 
 
 def answer(net: CorrectionNet, features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(2 parts, h', w') what it says of features (channels, h, w), with the cells that its levels add."""
+    """Output (2 parts, h', w') of the network for features (channels, h, w), with its padding."""
     with torch.inference_mode():
         cells = torch.from_numpy(padded(features))[None]
         return np.asarray(net(cells.to(memory_format=torch.channels_last))[0])
 
 
 def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(..., h, w) with zeros to the right and below, as many cells as the network's levels need."""
+    """Pads (..., h, w) with zeros to the right and below to multiples of 8 cells."""
     spare = [(0, 0)] * (cells.ndim - 2) + [(0, -n % _MULTIPLE) for n in cells.shape[-2:]]
     return np.pad(cells, spare)
 
 
 def describe(
-    rest: Rgb, now: Rgb, rest_usable: Flags, greys: tuple[Map, Map], seen: Map, flow: Flow, agreed: Map
+    rest: Rgb, now: Rgb, rest_usable: Flags, greys: tuple[Map, Map], visible: Map, flow: Flow, agreed: Map
 ) -> NDArray[np.float32]:
-    """The `FEATURES` of a frame and its flow: (CHANNELS, h, w) float32 on cells of 4 x 4 px.
+    """`FEATURES` (CHANNELS, h, w) float32 of a frame and its flow on cells of 4 x 4 px.
 
     Args:
         rest: (H, W, 3) uint8.
         now: (H, W, 3) uint8.
-        rest_usable: (H, W), tissue that nothing hides in the rest frame.
-        greys: (H, W) both contrast-normalised, that of the frame warped back along the flow.
-        seen: (H, W) 1 where what it was warped from is hidden by nothing, else 0; see `image.warp`.
+        rest_usable: (H, W), unmasked tissue in the rest frame.
+        greys: (H, W) each, the contrast-normalised rest frame and frame now, the latter warped by the flow.
+        visible: (H, W) 1 where the sampled pixels of the frame now are usable, else 0; see `image.warp`.
         flow: (H, W, 2) px.
-        agreed: (H, W) how well both agree along it, in 0..1.
+        agreed: (H, W) in 0..1, agreement of the two greys.
     """
     height, width = agreed.shape
     u, v = cv2.split(flow)
     x = u + np.arange(width, dtype=np.float32)
     y = v + np.arange(height, dtype=np.float32)[:, None]
     there = cv2.remap(now, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    mask = seen * rest_usable
+    mask = visible * rest_usable
     sums = np.empty((2 * (_PRODUCTS + _LIGHTS), -(-height // CELL), -(-width // CELL)), np.float32)
     colours = np.stack([cv2.split(picture) for picture in (rest, there)])
     sum_cells(colours, np.stack(greys), mask, sums)
     products, lights = np.split(sums, [2 * _PRODUCTS])
     lights = lights.reshape(2, _LIGHTS, *sums.shape[1:]) / (CELL * CELL)
-    m, seen, usable, agreed, u, v = means(mask, seen, rest_usable, agreed, u, v)
+    m, visible, usable, agreed, u, v = means(mask, visible, rest_usable, agreed, u, v)
     area = np.maximum(m, 0.05)
     before, after = lights[:, :_LUMINANCE] / area + _OFFSET
     change = (m > 0) * np.log(after / before)
@@ -165,12 +165,12 @@ def describe(
     light = 0.5 * np.log1p(lights[:, _LUMINANCE]) - 2
     steps = np.stack([_steps(products, side) for side in _WINDOWS], 1).reshape(-1, *m.shape)
     left = np.minimum(products[PRODUCTS.index("r r")] / (CELL * CELL * area), 4)
-    rows = [m, seen, usable, left, *steps, *change, *light, agreed, 0.25 * u, 0.25 * v]
+    rows = [m, visible, usable, left, *steps, *change, *light, agreed, 0.25 * u, 0.25 * v]
     return np.stack(rows).astype(np.float32)
 
 
 def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
-    """(C, h, w) means over cells of planes (H, W); over fewer pixels at the border."""
+    """Means (C, h, w) over cells of planes (H, W); at the border the last row or column is repeated."""
     height, width = planes[0].shape
     spare, size = (0, -height % CELL, 0, -width % CELL), (-(-width // CELL), -(-height // CELL))
     small = []
@@ -181,15 +181,15 @@ def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Lucas and Kanade's steps x, y [px] over windows of `side` cells, and how well they are known.
+    """Lucas and Kanade's steps over windows of `side` cells, from `PRODUCTS` (20, h, w) of `sum_cells`.
 
-    Of two `PRODUCTS` (20, h, w) of `sum_cells`; (2, 3, h, w), by greys and by colours.
+    Returns (2, 3, h, w), from greys and from colours: x and y [px], and a measure of their certainty.
     """
     around = np.empty_like(products)
     kernels.box_into(products, (0,) * side, around)
     around = around.reshape(2, _PRODUCTS, *products.shape[1:]).swapaxes(0, 1)
     inside = cv2.boxFilter(np.ones_like(products[0]), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
-    # Windows that see less than a pixel a cell say less.
+    # Windows with less than one usable pixel per cell have less weight.
     gx, gy, r, xx, xy, xr, yy, yr = around[1:9] * (inside / np.maximum(around[0] * inside, 1))
     xx, xy, yy = xx - gx * gx + _LEAST, xy - gx * gy, yy - gy * gy + _LEAST
     xr, yr = xr - gx * r, yr - gy * r
@@ -202,10 +202,11 @@ def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 
 @vectorised
 def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[np.float32]) -> None:
-    """Sums over cells of two aligned pictures (2, 3, H, W) and their greys (2, H, W) into `sums` (28, h, w).
+    """Sums products of two aligned pictures (2, 3, H, W) and their greys (2, H, W) over cells.
 
-    `PRODUCTS` of the greys, then of green against red, which shading leaves alone, where the mask (H, W) is;
-    `LIGHTS` of rest, then of now, colours where the mask is. A cell repeats the border.
+    Writes to `sums` (28, h, w): `PRODUCTS` of the greys and of the ratio of green to red, which is free of
+    shading, inside the mask (H, W); then `LIGHTS` of the rest frame and of the frame now, the colours inside
+    the mask. Cells at the border repeat its pixels.
     """
     height, width = mask.shape
     total, left = np.empty((2, height, width + 2), np.float32), np.empty((2, height, width), np.float32)
@@ -216,7 +217,7 @@ def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[n
             for k in range(2):
                 for x in range(width):
                     red, green = np.float32(colours[k, 0, y, x]), np.float32(colours[k, 1, y, x])
-                    # About as large as a contrast-normalised grey.
+                    # Scaled to the range of a contrast-normalised grey.
                     colour = _TWELVE * (green - red) / (green + red + _OFFSET + _OFFSET)
                     line[k, x] = colour if tone else greys[k, y, x]
             for x in range(width):
@@ -256,7 +257,7 @@ def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[n
 
 
 def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:
-    # A kernel of 4 halves about the cells' corners, as upsampling doubles; one of 3 would shift the field.
+    # A stride of 2 needs an even kernel: a kernel of 3 would shift the field by half a cell.
     return nn.Sequential(
         nn.Conv2d(inside, outside, 2 + stride, stride, 1),
         nn.ReLU(inplace=True),

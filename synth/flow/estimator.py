@@ -1,4 +1,4 @@
-"""What an estimator of displacement is, and the ones there are by name."""
+"""The interface of flow estimators, and their creation by name."""
 
 from __future__ import annotations
 
@@ -10,14 +10,10 @@ from numpy.typing import NDArray
 from synth.errors import as_user_error
 from synth.plugins import ESTIMATORS, check_answer
 
-Rgb = NDArray[np.uint8]
-"""(H, W, 3) uint8, sRGB."""
-Flags = NDArray[np.bool_]
-"""(H, W)."""
-Flow = NDArray[np.float32]
-"""(H, W, 2) float32, px: x right, y down."""
-Map = NDArray[np.float32]
-"""(H, W) float32."""
+Rgb = NDArray[np.uint8]  # (H, W, 3), sRGB
+Flags = NDArray[np.bool_]  # (H, W)
+Flow = NDArray[np.float32]  # (H, W, 2) px: x right, y down
+Map = NDArray[np.float32]  # (H, W)
 
 
 class Estimator(Protocol):
@@ -31,9 +27,9 @@ class Estimator(Protocol):
         Args:
             rest: (H, W, 3) uint8, sRGB.
             now: (H, W, 3) uint8, sRGB.
-            rest_usable: (H, W), False where `rest` shows no tissue (tool, glare, outside).
+            rest_usable: (H, W), False where `rest` shows no tissue (tool, glare, outside the tissue).
             now_usable: (H, W), the same on the pixels of `now`.
-            initial: (H, W, 2) px, a guess to start from.
+            initial: (H, W, 2) px, the flow to start from; None: zero.
 
         Returns:
             Flow (H, W, 2) float32 px, finite everywhere, and confidence (H, W) float32 in 0..1.
@@ -42,7 +38,7 @@ class Estimator(Protocol):
 
 
 class CheckedEstimator:
-    """An estimator of somebody else's: what goes wrong in it, or in its answer, is one line that names it."""
+    """A third-party estimator whose exceptions and invalid results become a `UserError` that names it."""
 
     def __init__(self, estimator: Estimator, label: str) -> None:
         self._estimator, self._label = estimator, label
@@ -59,10 +55,10 @@ class CheckedEstimator:
 
 
 def create(backend: str | Estimator) -> Estimator:
-    """The estimator of that name, ours or from the entry-point group `sulcus.flow`, or the one given.
+    """Returns an estimator: built in, from the entry-point group `sulcus.flow`, or the object passed.
 
     Raises:
-        UserError: no such estimator, or a plug-in's package that does not load.
+        UserError: no estimator has that name, or the package of a plug-in does not load.
     """
     if not isinstance(backend, str):
         kind = type(backend)

@@ -1,4 +1,4 @@
-"""Pictures as the solver reads them: batched torch tensors, every operation aware of what is masked.
+"""Image operations of the flow solver on batched torch tensors; masked pixels are excluded throughout.
 
 Tensors are (B, C, H, W) float32 on the CPU; `usable` is (B, 1, H, W) float32 in 0..1.
 """
@@ -16,17 +16,17 @@ from torch import Tensor
 
 from synth.flow import kernels
 
+# Luminance from red, green and blue: vessels have most contrast in green, averaging reduces noise.
 GREY = np.array([0.2, 0.6, 0.2], np.float32)
-"""Luminance from red, green, blue: vessels stand out in green, noise falls by averaging."""
-GREY_PER_DEVIATION = 32.0
-"""Normalised contrast of +-4 deviations spans 8 bits."""
-_FLOOR = 3.0  # grey levels: contrast below this is noise and isn't stretched to full contrast
+GREY_PER_DEVIATION = 32.0  # normalised contrast of +-4 local deviations spans 8 bits
+_WINDOW = 6.5  # px, standard deviation of the window of `normalise`
+_FLOOR = 3.0  # grey levels added to the local deviation, so that noise is not amplified to full contrast
 
 
 def local_contrast(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.uint8]:
-    """(H, W) of a picture (H, W) in grey levels, about 128: gain and offset of the light are taken out."""
+    """Local contrast (H, W), centred at 128, of a picture (H, W) in grey levels: no gain, no offset."""
     detail = grey - cv2.blur(grey, window)
-    # A blur's running sums may end below 0 where a picture is blank.
+    # Rounding in the running sums of a blur can make the variance of a blank picture negative.
     spread = np.sqrt(np.maximum(cv2.blur(detail * detail, window), 0)) + _FLOOR
     return np.asarray(np.clip(128 + GREY_PER_DEVIATION * detail / spread, 0, 255), np.uint8)
 
@@ -55,7 +55,7 @@ def flags(mask: NDArray[np.bool_]) -> Tensor:
 
 
 def box(field: Tensor, radius: int) -> Tensor:
-    """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels, smaller at the border. Separable."""
+    """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels; over fewer at the border."""
     planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
     out = np.empty_like(planes)
     kernels.box_into(planes, (0,) * (2 * radius + 1), out)
@@ -63,7 +63,7 @@ def box(field: Tensor, radius: int) -> Tensor:
 
 
 def halved(field: Tensor) -> Tensor:
-    """Mean of (B, C, H, W) over 2 x 2 pixels, fewer at an odd border: (B, C, ceil(H/2), ceil(W/2))."""
+    """Mean of (B, C, H, W) over 2 x 2 pixels: (B, C, ceil(H/2), ceil(W/2)); over fewer at an odd border."""
     *batch, height, width = field.shape
     planes = field.contiguous().numpy().reshape(-1, height, width)
     out = np.empty((len(planes), (height + 1) // 2, (width + 1) // 2), np.float32)
@@ -72,37 +72,35 @@ def halved(field: Tensor) -> Tensor:
 
 
 def window(field: Tensor, sigma: float) -> Tensor:
-    """About a Gaussian blur at half the size, (B, C, H/2, W/2): for windows, whose shape matters little."""
+    """Approximate Gaussian blur at half the size, (B, C, H/2, W/2): two box filters."""
     small = halved(field)
-    radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # two boxes of variance ((2r+1)^2 - 1)/12 each
+    radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # each box has the variance ((2r+1)^2 - 1)/12
     return box(box(small, radius), radius)
 
 
 def doubled(field: Tensor, like: Tensor) -> Tensor:
-    """`field` (B, C, h, w) at twice its size, cut to the height and width of `like`. Bilinear."""
+    """`field` (B, C, h, w) at twice its size (bilinear), cropped to the height and width of `like`."""
     planes, (height, width) = field.numpy().reshape(-1, *field.shape[-2:]), like.shape[-2:]
     size = 2 * planes.shape[2], 2 * planes.shape[1]
     found = np.stack([cv2.resize(plane, size)[:height, :width] for plane in planes])
     return torch.from_numpy(found).view(*field.shape[:2], height, width)
 
 
-def normalise(grey: Tensor, usable: Tensor, sigma: float = 6.5) -> Tensor:
-    """Local contrast normalisation: (I - mean) / (deviation + floor) over the usable neighbours only.
+def normalise(grey: Tensor, usable: Tensor) -> Tensor:
+    """Local contrast normalisation: (I - mean) / (deviation + floor) over usable neighbours only.
 
-    Takes out every gain and offset that varies slower than the window, hence illumination drift. Masked
-    pixels get 0, the local mean.
+    It removes gains and offsets that vary more slowly than the window, such as drifting illumination.
 
     Args:
         grey: (B, 1, H, W), grey levels.
         usable: (B, 1, H, W) in 0..1.
-        sigma: standard deviation of the window [px].
 
     Returns:
-        (B, 1, H, W), in local standard deviations.
+        (B, 1, H, W), in local standard deviations; 0 at masked pixels.
     """
-    # Statistics of I - 128: the difference of two squares loses fewer digits.
+    # Centring at 128 avoids cancellation in the difference of squares.
     centred = (grey - 128.0) * usable
-    sums = window(torch.cat([usable, centred, centred * centred], dim=1), sigma)
+    sums = window(torch.cat([usable, centred, centred * centred], dim=1), _WINDOW)
     mean = sums[:, 1:] / sums[:, :1].clamp_min(1e-4)
     deviation = (mean[:, 1:] - mean[:, :1] ** 2).clamp_min(0).sqrt() + _FLOOR
     smooth = doubled(torch.cat([mean[:, :1] + 128.0, 1 / deviation], 1), grey)
@@ -110,14 +108,14 @@ def normalise(grey: Tensor, usable: Tensor, sigma: float = 6.5) -> Tensor:
 
 
 def fill(field: Tensor, usable: Tensor) -> Tensor:
-    """Masked pixels from around: push-pull over a pyramid (Gortler et al., The Lumigraph, 1996, sec. 3.5).
+    """Fills masked pixels from around by push-pull (Gortler et al., The Lumigraph, 1996, sec. 3.5).
 
     Args:
         field: (B, C, H, W).
-        usable: (B, 1, H, W) in 0..1; where 1 the field is kept as it is.
+        usable: (B, 1, H, W) in 0..1; where it is 1 the field stays as it is.
 
     Returns:
-        (B, C, H, W); zeros where nothing at all is usable.
+        (B, C, H, W); zeros if no pixel is usable.
     """
     known = field * usable
     if min(field.shape[-2:]) <= 2:
@@ -131,7 +129,7 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
 
 
 def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """`now` at x + w by bicubic sampling, and 1 where all it is read from is usable and inside, else 0.
+    """Samples `now` at x + w (bicubic). Also returns 1 where all pixels read are usable and inside, else 0.
 
     Args:
         now: (1, 1, H, W).

@@ -1,23 +1,21 @@
-"""Compiled loops over pixels: warping, derivatives and means, each in one pass. Everything is float32."""
+"""Compiled loops over pixels for warping, derivatives and means; all arrays are float32."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.flow.estimator import Map
 from synth.system.jit import vectorised
-
-Map = NDArray[np.float32]
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _EIGHT, _TWELFTH = np.float32(8), np.float32(1 / 12)
-_SEEN = np.float32(0.9)  # of what a sample is read from must be usable
-_CUBIC = np.float32(-0.75)  # the free parameter of bicubic interpolation that PyTorch and OpenCV have
+_VISIBLE = np.float32(0.9)  # share of the sampled pixels that must be usable
+_CUBIC = np.float32(-0.75)  # free parameter of bicubic interpolation, as in PyTorch and OpenCV
 
 
 @vectorised
-def warp_into(now: Map, usable: Map, flow: Map, warped: Map, seen: Map) -> None:
-    """See `image.warp`: now, usable (H, W), flow (2, H, W) px; writes warped and seen (H, W)."""
+def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> None:
+    """See `image.warp`: now, usable (H, W), flow (2, H, W) px; writes warped and visible (H, W)."""
     height, width = now.shape
     a, border = _CUBIC, 4
     picture, known = _padded(now, border), np.zeros((height + 2 * border, width + 2 * border), np.float32)
@@ -25,10 +23,10 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, seen: Map) -> None:
     weights, share = np.empty((2, 4, width), np.float32), np.empty((2, width), np.float32)
     whole, last = np.empty((2, width), np.uint32), (width + 1, height + 1)
     for y in range(height):
-        # Weights first, for they are computed many at a time, as samples can't be.
+        # Weights are computed in a loop of their own, because it vectorises and the sampling does not.
         for c in range(2):
             for x in range(width):
-                # Beyond the border all is as at it. Whole numbers are limited once more: nan passes.
+                # Positions are clamped to the border; the integer part is clamped again because NaN passes.
                 at = min(max(np.float32(y if c else x) + flow[c, y, x], -_TWO), np.float32(last[c]))
                 t = at - np.floor(at)
                 r = _ONE - t
@@ -47,12 +45,12 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, seen: Map) -> None:
             warped[y, x] = total
             some = (_ONE - fy) * ((_ONE - fx) * known[j, i] + fx * known[j, i + 1])
             some += fy * ((_ONE - fx) * known[j + 1, i] + fx * known[j + 1, i + 1])
-            seen[y, x] = _ONE if some > _SEEN else _ZERO
+            visible[y, x] = _ONE if some > _VISIBLE else _ZERO
 
 
 @vectorised
 def differentiate(field: Map, dx: Map, dy: Map) -> None:
-    """Derivatives of field (H, W) by x and by y, fourth-order central, into dx and dy (H, W)."""
+    """Fourth-order central differences of field (H, W) by x and y into dx and dy (H, W)."""
     padded = _padded(field, 2)
     height, width = dx.shape
     for y in range(height):
@@ -65,7 +63,7 @@ def differentiate(field: Map, dx: Map, dy: Map) -> None:
 
 @vectorised
 def _padded(field: Map, border: int) -> Map:
-    """`field` (H, W) with `border` pixels of its border repeated around it."""
+    """`field` (H, W) padded by `border` repeated pixels on every side."""
     height, width = field.shape
     padded = np.empty((height + 2 * border, width + 2 * border), np.float32)
     for y in range(height + 2 * border):
@@ -79,7 +77,7 @@ def _padded(field: Map, border: int) -> Map:
 def box_into(field: Map, across: tuple[int, ...], out: Map) -> None:
     """See `image.box`: means of field (N, H, W) over squares of `len(across)` pixels, into `out`.
 
-    A tuple's length is known when this is compiled: sums over it are unrolled, six times as fast.
+    The length of a tuple is a compile-time constant, so sums over it are unrolled: six times as fast.
     """
     count, height, width = field.shape
     radius = len(across) // 2

@@ -1,4 +1,4 @@
-"""Which pixels of a frame show no tissue, glare and tool, or cortex: found in the picture itself."""
+"""Detection of specular highlights, instruments and exposed cortex in single frames."""
 
 from __future__ import annotations
 
@@ -8,29 +8,23 @@ from numpy.typing import NDArray
 
 from synth.flow import toolnet
 
-# By hand, on renders and photographs of cortex; `mask_selection` doesn't rely on what they find.
-_CLIPPED = 240.0  # grey levels: at least two channels this high have no texture left
-_ABOVE = 45.0  # grey levels above the local median
-_SOME = 0.1  # mean probability of a grey body that counts as an instrument
-_OUTLINE_PX = 240  # larger side of the small picture that the cortex is found in
-_MIDDLE = 0.6  # squared radius of the ellipse that is taken for cortex at first, half sides are 1
-_BLACK, _BLOODY = 60, 0.42  # grey levels; green over red (sRGB)
-_VESSEL_MM = 3.0  # no vessel is wider: what is bloody over more is something else
-_INSET_PX = 5  # of it by which the outline is drawn in
-_SHRINK = 4  # the median is taken on a picture this much smaller: it is smooth
+# Chosen by hand on renders and photographs of cortex; `mask_selection` rejects false positives.
+_CLIPPED = 240.0  # grey levels: two channels above it have no texture left
+_ABOVE = 45.0  # grey levels of a highlight above the local median
+_SOME = 0.1  # mean probability above which a grey body counts as an instrument
+_OUTLINE_PX = 240  # longer side of the downsampled picture in which the cortex is segmented
+_MIDDLE = 0.6  # squared radius of the initial ellipse of cortex, in half sides of the picture
+_BLACK, _BLOODY = 60, 0.42  # grey levels; ratio of green to red (sRGB)
+_VESSEL_MM = 3.0  # widest vessel: larger red areas are pooled blood
+_INSET_PX = 5  # px of the downsampled picture, kernel by which the outline is eroded
+_SHRINK = 4  # factor of downsampling for the local median
 
 
 def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
-    """Specular highlights: clearly brighter than the local median, grown by their soft rim.
+    """Mask (H, W) of the specular highlights of `rgb` (H, W, 3) uint8, grown by `dilate_px`.
 
-    Brightness is the smallest channel: a highlight has the colour of the lamp, tissue lacks blue.
-
-    Args:
-        rgb: (H, W, 3) uint8, sRGB.
-        dilate_px: growth [px].
-
-    Returns:
-        (H, W) bool, True in glare.
+    A highlight is much brighter than the local median. Brightness is that of the darkest channel, because a
+    highlight has the colour of the lamp and tissue lacks blue.
     """
     red, green, blue = (np.ascontiguousarray(rgb[..., k]) for k in range(3))
     least, most = np.minimum(red, green), np.maximum(red, green)
@@ -46,25 +40,18 @@ def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
     return _grow(bright, dilate_px)
 
 
-def tool(rgb: NDArray[np.uint8], dilate_px: int = 2) -> NDArray[np.bool_]:
-    """The instrument: what the U-Net of `toolnet` finds, and grey bodies that it doesn't rule out.
+def tool(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Instrument mask (H, W) of `rgb` (H, W, 3) uint8, grown by 2 px.
 
-    The net knows the renderer's instruments; the rule knows only that steel is grey, on any picture.
-    Without weights the rule stands alone.
-
-    Args:
-        rgb: (H, W, 3) uint8, sRGB.
-        dilate_px: growth [px].
-
-    Returns:
-        (H, W) bool, True on the instrument.
+    It joins the output of the U-Net of `toolnet`, trained on rendered instruments, with grey bodies (steel)
+    that the network does not reject. Without weights it consists of the grey bodies alone.
     """
     net = toolnet.load()
-    return _grow(grey_bodies(rgb) if net is None else both(rgb, net), dilate_px)
+    return _grow(grey_bodies(rgb) if net is None else both(rgb, net), 2)
 
 
 def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
-    """(H, W): where the net is sure, and whole grey bodies in which it sees some instrument."""
+    """Instrument mask (H, W): pixels of high probability, and whole grey bodies of some probability."""
     probable = toolnet.probability(net, rgb)
     count, label = cv2.connectedComponents(grey_bodies(rgb).astype(np.uint8))
     size = np.bincount(label.ravel(), minlength=count)
@@ -75,15 +62,15 @@ def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
 
 
 def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Everything that is no tissue to follow: glare and tool, both found in the picture. (H, W) bool."""
+    """Mask (H, W) of the specular highlights and instruments found in `rgb` (H, W, 3) uint8."""
     return np.asarray(glare(rgb) | tool(rgb), bool)
 
 
 def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
-    """(H, W): the exposed cortex of a picture (H, W, 3) sRGB of a scale, without instruments and dark border.
+    """Mask (H, W) of the exposed cortex in a picture (H, W, 3) sRGB.
 
-    What is like the middle of the picture and not like its edge (C. Rother et al., "GrabCut", 2004), less
-    what is black, blue, soaked with blood or found to be an instrument.
+    Pixels that resemble the middle of the picture more than its edge (C. Rother et al., "GrabCut", 2004),
+    without those that are black, blue, covered by blood or part of an instrument.
     """
     scale = min(1.0, _OUTLINE_PX / max(rgb.shape))
     small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
@@ -96,7 +83,7 @@ def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
     label[(small.max(axis=2) < _BLACK) | (blue > 1.1 * red) | bloody | steel] = cv2.GC_BGD
     if not (label == cv2.GC_PR_FGD).any():
         return np.zeros(rgb.shape[:2], bool)
-    cv2.setRNGSeed(1)  # of the colour clusters' first guess
+    cv2.setRNGSeed(1)  # for the initial colour clusters
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), label, None, *models, 6, cv2.GC_INIT_WITH_MASK)
     inside = (label == cv2.GC_PR_FGD).astype(np.uint8)
@@ -104,13 +91,13 @@ def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.resize(found, rgb.shape[1::-1]) > 0)
 
 
-def hidden(film: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The same of a film (T, H, W, 3) whose instrument's outline is known, (T, H, W): glare is found."""
-    return np.asarray(tools | np.stack([glare(picture) for picture in film]), bool)
+def hidden(video: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Masks (T, H, W) of a video (T, H, W, 3): given instrument masks joined with the detected glare."""
+    return np.asarray(tools | np.stack([glare(picture) for picture in video]), bool)
 
 
 def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W): connected pixels of little colour that touch the border and are more than specks."""
+    """Mask (H, W) of connected pixels of little colour that touch the border and cover 0.3% of it."""
     red, green, blue = cv2.split(rgb)
     top = np.maximum(np.maximum(red, green), blue)
     colour = top - np.minimum(np.minimum(red, green), blue)

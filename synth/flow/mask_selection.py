@@ -1,10 +1,10 @@
-"""Which of the tools and highlights found in pictures are masked: those that the video itself rules out.
+"""Selection of masks among the detected instruments and highlights, by their effect on the flow.
 
-A mask that is wrong hides tissue, and a detector trained elsewhere can be wrong about a whole recording. So
-what `mask_detection` finds is a proposal. Two flows are computed, without masks and with every proposal
-masked. A block of a proposal is masked if the flow without masks leaves more of the picture unexplained in
-it than elsewhere (something came between), or if masking lowers what is left around it (it pulls at its
-neighbours). All is taken back if away from proposals the flow without masks is the surer one.
+A wrong mask hides tissue, and a detector trained on other pictures can be wrong about a whole recording.
+Detections of `mask_detection` are therefore proposals. Two flows are computed, without masks and with every
+proposal masked. A block of a proposal is masked if the residual of the unmasked flow is larger in it than
+elsewhere (something occludes the tissue), or if masking it lowers the residual around it (it biases the flow
+of its neighbours). No proposal is masked if the unmasked flow has the higher confidence away from proposals.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from synth.flow.track import Solution, Tracker
 
 @dataclass(frozen=True)
 class SelectionConstants:
-    """When a proposal is masked: chosen on the foreign videos of docs/results/flow/recordings, where always
-    used masks cost 0.55 px and chosen ones 0.17; a local deviation is a picture's unit of contrast."""
+    """Thresholds of the selection, chosen on the foreign videos of docs/results/flow/recordings: masking all
+    proposals costs 0.55 px there, masking selected ones 0.17. The unit of residuals is a local deviation."""
 
-    largest: float = 0.4  # share of the tissue: more is no instrument and no highlight
-    unexplained: float = 0.12  # local deviations by which the residual exceeds that elsewhere
-    gain: float = 0.01  # local deviations by which masking lowers the residual around a block
-    sure: float = 3.0  # standard errors by which a block shows either: few pixels show either by chance
-    ring_px: int = 6  # what is "around" a block
-    new_px: int = 20  # so much that was not judged is something new
-    cells: int = 6  # blocks on the longer side
-    grown_px: float = 0.5  # masks are selected anew as motion grows by so much, or at something new ...
-    first: int = 4  # ... so often at first, for time
-    every: int = 60  # ... and once in so many frames
+    largest: float = 0.4  # share of the tissue above which a kind of proposal is dropped as implausible
+    unexplained: float = 0.12  # excess of a block's residual over that elsewhere [local deviations]
+    gain: float = 0.01  # fall of the residual around a block when it is masked [local deviations]
+    sure: float = 3.0  # standard errors that are added to both thresholds
+    ring_px: int = 6  # width of the ring around a block
+    new_px: int = 20  # pixels of unjudged proposals that start a selection
+    cells: int = 6  # blocks along the longer side
+    grown_px: float = 0.5  # growth of the motion that starts a selection
+    first: int = 4  # selections that are always allowed; they take time
+    every: int = 60  # frames for each further selection
 
 
 SELECTION = SelectionConstants()
@@ -43,14 +43,14 @@ SELECTION = SelectionConstants()
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """What was found in a picture that may be no tissue, and what is known to be none, (H, W) each."""
+    """Masks (H, W) of what may not be tissue in a picture, and of what is certainly not."""
 
     glare: Flags
     tool: Flags
-    known: Flags  # masked in any case
+    known: Flags  # always masked
 
     def within(self, tissue: Flags) -> Proposal:
-        """Without the kind that takes more of the tissue than anything real does."""
+        """The same without a kind that covers an implausible share of the tissue."""
         most = SELECTION.largest * np.count_nonzero(tissue)
         glare, tool = (
             kind if np.count_nonzero(kind & tissue) <= most else np.zeros_like(kind)
@@ -60,11 +60,11 @@ class Proposal:
 
     @property
     def either(self) -> Flags:
-        """(H, W) both kinds."""
+        """(H, W) glare or tool."""
         return self.glare | self.tool
 
     def blocks(self) -> NDArray[np.int16]:
-        """(2, H, W) numbers from 1 on of the squares of glare and of those of tool; 0: neither."""
+        """Block numbers (2, H, W) of glare and of tool, from 1; 0 where there is no proposal."""
         height, width = self.glare.shape
         side = max(1, max(height, width) // SELECTION.cells)
         row, column = np.arange(height, dtype=np.int16) // side, np.arange(width, dtype=np.int16) // side
@@ -73,51 +73,39 @@ class Proposal:
 
 
 class SelectingTracker:
-    """A `Tracker` that is given proposals and selects its masks.
+    """A `Tracker` that selects its masks among proposals.
 
-    It does so at first motion, as motion grows, when something new turns up, and when trust falls.
+    Masks are selected at the first motion, when motion grows, at new proposals, and when a frame is lost.
     """
 
     def __init__(self, backend: str | Estimator, rest: Rgb, found: Proposal, tissue: Flags) -> None:
-        """Starts at rest, where nothing proposed has to be masked yet. Arguments and errors as `Tracker`.
-
-        Args:
-            found: of the rest frame.
-        """
+        """Starts at the rest frame with proposals `found`, none of them masked; otherwise as `Tracker`."""
         self.tracker = Tracker(backend, rest, found.known, tissue)
         self.rest_found = found.within(tissue)
-        self.rest_blocked = found.known
-        """(H, W) what is masked in the rest frame, by the last selection."""
-        self.blocked = found.known
-        """(H, W) what is masked in the last frame."""
-        self.reinitialised = False
-        """Whether the last frame can be trusted only for other masks, or for a start from nothing."""
+        self.rest_blocked = found.known  # (H, W) mask of the rest frame
+        self.blocked = found.known  # (H, W) mask of the last frame
+        self.reinitialised = False  # whether other masks or a start from zero made the last frame trusted
         self._rest_picture = _normalised(rest)
         last = Proposal(tissue, np.ones_like(tissue), tissue).blocks().max()
-        self._verdict = np.zeros(1 + last, np.int8)  # of blocks: 1 masked, -1 not, 0 not known
-        self._some = np.flatnonzero(tissue)[::7]  # pixels by which motion is judged
-        self._tested_px = 0.0  # largest motion at which masks were selected
+        self._verdict = np.zeros(1 + last, np.int8)  # of blocks: 1 masked, -1 not masked, 0 not judged
+        self._some = np.flatnonzero(tissue)[::7]  # pixels over which motion is measured
+        self._tested_px = 0.0  # largest motion at which masks have been selected
         self._frames = self._selections = 0
 
     @property
     def trusted(self) -> bool:
-        """Whether the last frame could be followed."""
+        """Whether the last frame could be tracked."""
         return self.tracker.trusted
 
-    @property
-    def lost(self) -> str:
-        """Why the last frame could not be followed; empty if it could."""
-        return self.tracker.lost
-
     def step(self, frame: Rgb, found: Proposal) -> tuple[Flow, Map]:
-        """As `Tracker.step`; found: what may be no tissue in the frame."""
+        """As `Tracker.step`, with the proposals `found` in the frame."""
         tracker = self.tracker
         found = found.within(tracker.tissue)
         verdict = self._verdict[found.blocks()]
         self.blocked = found.known | (verdict > 0).any(0)
         new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= SELECTION.new_px
-        # Near a proposal the confidence speaks of the proposal, too.
-        tracker.unsure = _grown(found.either | self.rest_found.either)
+        # Near a proposal the confidence depends on the proposal too.
+        tracker.unsure = _widened((found.either | self.rest_found.either).astype(np.int16)) > 0
         resets = tracker.resets
         flow, confidence = tracker.step(frame, self.blocked)
         first, low_confidence = tracker.last, not tracker.trusted
@@ -132,12 +120,12 @@ class SelectingTracker:
                 flow, confidence = tracker.accept(better)
         self.reinitialised = tracker.trusted and (low_confidence or tracker.resets > resets)
         assert tracker.last is not None
-        # Over faint tissue nothing but highlights, which stay with the light, says that nothing moves.
+        # Highlights stay in place with the lamp: over faint tissue they would support zero motion.
         stay = self.rest_found.glare & found.glare
         return flow, np.where(stay, np.minimum(confidence, np.float32(tracker.last.level)), confidence)
 
     def _select(self, frame: Rgb, found: Proposal, first: Solution) -> Solution:
-        """The answer; its masks are remembered if it is one."""
+        """Selects masks and returns the solution; the masks are stored unless the frame is lost."""
         tracker, at_rest = self.tracker, self.rest_found
         initial = first.flow if tracker.trusted and self._tested_px > 0 else None
         solved = [(self.rest_blocked, self.blocked, first)]
@@ -156,41 +144,39 @@ class SelectingTracker:
         blocks, (selected, masked) = found.blocks(), self._judge(frame, found, bare.flow, full.flow)
         tried = rest | selected[at_rest.blocks()].any(0)
         if tracker.trusted and motion < self._tested_px:
-            # What was found out at more motion stands: a highlight pulls at nothing while nothing moves.
+            # Verdicts at larger motion are final: a highlight causes no residual while nothing moves.
             tried, masked = self.rest_blocked, np.where(self._verdict == 0, masked, self._verdict > 0)
         chosen = solve(tried, now | masked[blocks].any(0))
         if bare.level > chosen.level:
             tried, masked, chosen = rest, np.zeros_like(masked), bare
-        if tracker.is_doubtful(chosen) and not chosen.is_matched:
+        if tracker.needs_retry(chosen) and not chosen.is_matched:
             tracker.usable = tracker.tissue & ~self.rest_blocked
-            return first  # nothing is learned from a frame that can't be followed
-        seen = np.unique(blocks)[1:]
-        self._verdict[seen] = np.where(masked[seen], 1, -1)
+            return first  # a lost frame gives no verdict
+        judged = np.unique(blocks)[1:]
+        self._verdict[judged] = np.where(masked[judged], 1, -1)
         self._tested_px = max(motion, self._tested_px)
         self.rest_blocked, self.blocked = tried, now | masked[blocks].any(0)
         tracker.usable = tracker.tissue & ~self.rest_blocked
         return chosen
 
     def _motion(self, flow: Flow) -> float:
-        """What a tenth of the tissue exceeds [px]."""
+        """90th percentile of the motion over the tissue [px]."""
         return float(np.quantile(np.hypot(*flow.reshape(-1, 2)[self._some].T), 0.9))
 
     def _judge(self, frame: Rgb, found: Proposal, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
-        """Whether each block has to be masked at rest and in the frame, (number of blocks + 1,) each.
-
-        By what the flow without masks, and that with all of them, leave unexplained.
-        """
+        """Whether to mask each block at rest and in the frame, (number of blocks + 1,) each, by the residuals
+        of the flow without masks (`bare`) and with all of them (`full`)."""
         picture = _normalised(frame)
         residual, left = (_residual(self._rest_picture, picture, flow) for flow in (bare, full))
         blocks, moved, others = self.rest_found.blocks(), *(_at_rest(found.blocks(), f) for f in (bare, full))
-        # What is known to be no tissue is counted nowhere.
+        # Pixels that are certainly not tissue do not count.
         inside = self.tracker.tissue & ~self.rest_found.known & (moved >= 0).all(0) & (others >= 0).all(0)
         common = inside & (np.concatenate([blocks, moved, others]) <= 0).all(0)
         usual = float(residual[common].mean() if common.any() else np.median(residual))
         count = self._verdict.size
 
         def mean(field: Map, number: NDArray[np.int16], where: Flags) -> NDArray[np.float64]:
-            """(2, count): each block's mean and its standard error, infinite below two pixels."""
+            """(2, count): mean of each block and its standard error, which is infinite below two pixels."""
             many = np.bincount(number[where], minlength=count)
             first, second = (np.bincount(number[where], field[where] ** k, count) for k in (1, 2))
             average = first / np.maximum(many, 1)
@@ -211,19 +197,19 @@ class SelectingTracker:
             chosen[0] = False
             return chosen
 
-        # What something covers now is no worse at rest: there the neighbours are as little explained.
+        # At rest a block is compared with its neighbours, which an occluder in the frame affects as much.
         return selected(blocks, local=True), selected(moved, local=False)
 
 
 def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Flow) -> Map:
-    """(H, W) difference of the aligned pictures [local deviations]."""
+    """(H, W) absolute difference of the aligned pictures [local deviations]."""
     planes = torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))[None]
     warped, _ = image.warp(now, torch.ones_like(now), planes)
     return np.asarray((warped - rest).abs()[0, 0].numpy(), np.float32)
 
 
 def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
-    """The now frame's numbers (2, H, W) on the rest frame's pixels; -1 for what left the picture."""
+    """Block numbers (2, H, W) of the frame now on the pixels of the rest frame; -1 outside the picture."""
     height, width = flow.shape[:2]
     x = np.arange(width, dtype=np.float32) + flow[..., 0]
     y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
@@ -232,14 +218,9 @@ def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
 
 
 def _widened(number: NDArray[np.int16]) -> NDArray[np.int16]:
-    """(H, W) numbers with a ring around each, the larger number first."""
+    """Block numbers (H, W) grown by a ring; where rings overlap, the larger number."""
     wide = 2 * SELECTION.ring_px + 1
     return np.asarray(cv2.dilate(number, np.ones((wide, wide), np.uint8)), np.int16)
-
-
-def _grown(piece: Flags) -> Flags:
-    """(H, W) with a ring around it."""
-    return _widened(piece.astype(np.int16)) > 0
 
 
 def _normalised(picture: Rgb) -> torch.Tensor:

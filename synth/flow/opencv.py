@@ -1,4 +1,4 @@
-"""OpenCV's estimators behind our protocol: contrast-normalised pictures, masked pixels filled from around."""
+"""OpenCV's flow estimators as `Estimator`s, on contrast-normalised pictures with masked pixels filled."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from synth.flow import image
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 
-_RESIDUAL = 0.6  # in local deviations: where two aligned pictures differ by more they don't match
-_SMALLEST = 16  # OpenCV's estimators want some pixels to build a pyramid from
-_cv2: Any = cv2  # its type stubs leave out the contributed modules
+_RESIDUAL = 0.6  # local deviations between aligned pictures at which the confidence is 1/e
+_SMALLEST = 16  # px a side that the pyramids of OpenCV's estimators need
+_cv2: Any = cv2  # the type stubs of OpenCV lack the contributed modules
 
 
 class OpenCvTvl1:
-    """TV-L1 of Zach, Pock and Bischof (2007) as OpenCV ships it, with the settings that suit cortex.
+    """TV-L1 of Zach, Pock and Bischof (2007) in OpenCV, with settings chosen for cortex.
 
-    OpenCV's default pyramid (step 0.8, 5 levels) is too shallow for a 10 px pull, and it silently ignores an
-    initial flow unless `useInitialFlow` is set.
+    OpenCV's default pyramid (step 0.8, 5 levels) is too shallow for motion of 10 px, and an initial flow is
+    ignored unless `useInitialFlow` is set.
     """
 
-    def __init__(self, weight: float = 0.1, warps: int = 3, levels: int = 5) -> None:
-        self.weight, self.warps, self.levels = weight, warps, levels
+    def __init__(self, weight: float = 0.1, warps: int = 3) -> None:
+        self.weight, self.warps = weight, warps
 
     def flow(
         self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
@@ -33,7 +33,7 @@ class OpenCvTvl1:
             tau=0.25,
             lambda_=self.weight,
             theta=0.3,
-            nscales=self.levels,
+            nscales=5,
             warps=self.warps,
             epsilon=0.01,
             innnerIterations=10,
@@ -64,7 +64,7 @@ def _solve(
     before, after = _prepare(rest, rest_usable), _prepare(now, now_usable)
     start = np.zeros((height, width, 2), np.float32) if initial is None else initial.astype(np.float32)
     if min(height, width) < _SMALLEST:
-        # Mirrored up to a size that has a pyramid; the answer is cut out again.
+        # Mirrored to the smallest size that has a pyramid; the result is cropped.
         spare = ((0, max(0, _SMALLEST - height)), (0, max(0, _SMALLEST - width)))
         before, after = np.pad(before, spare, "symmetric"), np.pad(after, spare, "symmetric")
         start = np.pad(start, (*spare, (0, 0)), "edge")
@@ -74,7 +74,7 @@ def _solve(
 
 
 def _prepare(picture: Rgb, usable: Flags) -> Rgb:
-    """Contrast-normalised, filled, (H, W) uint8 about 128."""
+    """Contrast-normalised picture (H, W) uint8 centred at 128, with masked pixels filled."""
     known = image.flags(usable)
     contrast = image.normalise(image.tensor(picture), known)
     filled = image.fill(contrast, known)[0, 0].numpy()
@@ -82,13 +82,13 @@ def _prepare(picture: Rgb, usable: Flags) -> Rgb:
 
 
 def _confidence(flow: Flow, before: Rgb, after: Rgb, rest_usable: Flags, now_usable: Flags) -> Map:
-    """Whether the point is seen in both pictures, times how well they agree once aligned; (H, W) in 0..1."""
+    """(H, W) in 0..1: agreement of the aligned pictures; 0 where a point is masked in either."""
     height, width = rest_usable.shape
     x = np.arange(width, dtype=np.float32) + flow[..., 0]
     y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
-    seen = cv2.remap(now_usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) * rest_usable
+    visible = cv2.remap(now_usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) * rest_usable
     aligned = cv2.remap(after.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    difference = cv2.GaussianBlur(((aligned - before) * seen / image.GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
-    share = cv2.GaussianBlur(seen, (0, 0), 2.0)
+    difference = cv2.GaussianBlur(((aligned - before) * visible / image.GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
+    share = cv2.GaussianBlur(visible, (0, 0), 2.0)
     residual = difference / np.maximum(share, 1e-3)
-    return np.asarray(seen * np.exp(-residual / _RESIDUAL**2), np.float32)
+    return np.asarray(visible * np.exp(-residual / _RESIDUAL**2), np.float32)

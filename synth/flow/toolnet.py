@@ -1,7 +1,7 @@
-"""Where the instrument is: a small U-Net (Ronneberger et al., MICCAI 2015) on a shrunken frame.
+"""Instrument segmentation: a small U-Net (Ronneberger et al., MICCAI 2015) on a downsampled frame.
 
-`evidence.flow.toolnet_training` makes its weights from scenes rendered for it; they lie beside this
-file, with a card that says by what command and how well they do on scenes held out.
+`evidence.flow.toolnet_training` trains its weights on rendered scenes. They are stored next to this file,
+with a card that lists the command and the scores on held-out scenes.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 WEIGHTS = Path(__file__).with_name("toolnet.pt")
-SIDE = 160  # px of the longer side that the net looks at
-_STEP = 16  # both sides are padded to multiples of it
+SIDE = 160  # px, longer side of the input
+_STEP = 16  # px: both sides of the input are padded to multiples of it
 _WIDTHS = (12, 24, 48, 64)
 
 
 class ToolNet(nn.Module):
-    """Three colours in, one logit a pixel out at half the size: (B, 3, H, W) → (B, 1, H/2, W/2)."""
+    """U-Net from RGB to one logit per pixel at half the size: (B, 3, H, W) → (B, 1, H/2, W/2)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class ToolNet(nn.Module):
 
 
 def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H, W, 3) uint8 as the net sees it: longer side 160 px, mean 0, deviation 1; (3, h, w) float32."""
+    """Network input (3, h, w) float32 of (H, W, 3) uint8: longer side 160 px, mean 0, deviation 1."""
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)
     size = (max(1, round(width * share)), max(1, round(height * share)))
@@ -59,7 +59,7 @@ def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @cache
 def load(path: Path = WEIGHTS) -> ToolNet | None:
-    """The net with its weights; None if they aren't there."""
+    """The network with its weights; None if the file is missing."""
     if not path.is_file():
         return None
     net = ToolNet()
@@ -68,7 +68,7 @@ def load(path: Path = WEIGHTS) -> ToolNet | None:
 
 
 def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Of being tool, (H, W) float32. rgb: (H, W, 3) uint8."""
+    """Probability (H, W) float32 that a pixel of `rgb` (H, W, 3) uint8 shows an instrument."""
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)
     with torch.inference_mode():
@@ -79,7 +79,7 @@ def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:
-    # A kernel of 4 halves about the pixels' corners, as upsampling doubles; one of 3 would shift the picture.
+    # A stride of 2 needs an even kernel: a kernel of 3 would shift the picture by half a pixel.
     return nn.Sequential(
         nn.Conv2d(inside, outside, 2 + stride, stride, 1, bias=False),
         nn.BatchNorm2d(outside),

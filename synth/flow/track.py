@@ -1,4 +1,4 @@
-"""Displacement through a video: always from the rest frame, each frame starting from the one before."""
+"""Displacement through a video: from the rest frame to each frame, initialised with the previous frame."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.flow import mask_detection
-from synth.flow.confidence import DOUBTFUL
+from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
 
 
 @dataclass(frozen=True)
 class TrackingConstants:
-    """When a frame is solved again or lost; by hand where no source is given."""
+    """When a frame is solved again or counts as lost; chosen by hand where no source is given."""
 
-    low: float = 0.5  # mean confidence of what is visible; frames below it are solved again from nothing
-    drop: float = 0.85  # and so are those below this share of the last trusted frame's
-    matched: float = 0.1  # share of what is visible that is no lost pixel; below it motion is a guess
-    free: float = 0.02  # share of the tissue that must be free of masks for anything to be concluded
-    wider: float = 0.2  # confidence that surroundings must add: else they cost a tenth of error (design.md)
-    tries: int = 3  # frames in which they may: time
+    low: float = 0.5  # mean confidence over visible tissue below which a frame is solved again from zero
+    drop: float = 0.85  # the same relative to the last trusted frame
+    matched: float = 0.1  # share of the visible tissue above `LOW_CONFIDENCE`; a frame with less is lost
+    free: float = 0.02  # unmasked share of the tissue; a frame with less is lost
+    wider: float = 0.2  # gain in confidence for which surroundings are used; they cost 10% error (design.md)
+    tries: int = 3  # frames in which surroundings are tried, to limit the time
 
 
 TRACKING = TrackingConstants()
@@ -37,44 +37,39 @@ class Track:
     confidence: NDArray[np.float32]
     """(T, H, W) in 0..1; 0 outside the tissue, under the tool and in glare."""
     trusted: NDArray[np.bool_]
-    """(T,), False where the frame could not be followed."""
+    """(T,), False where a frame could not be tracked."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """One answer for a frame."""
+    """One flow of a frame."""
 
     flow: Flow  # (H, W, 2) px
     confidence: Map  # (H, W) in 0..1; 0 outside the tissue and where it is masked
-    level: float  # mean confidence over what is not masked
-    matched: float  # share of that whose confidence says that it is not lost
-    visible: float  # share of the tissue that is not masked
-
-    @property
-    def is_matched(self) -> bool:
-        """Whether enough of what is visible is found again."""
-        return self.matched >= TRACKING.matched
+    level: float  # mean confidence over the unmasked tissue
+    is_matched: bool  # whether enough of the unmasked tissue is above `LOW_CONFIDENCE`
+    is_visible: bool  # whether enough of the tissue is unmasked
 
 
 class Tracker:
-    """Frames in, displacement from the rest frame out, one at a time, for streams as for recordings.
+    """Tracks frames one at a time, in streams and recordings, and returns displacement from the rest frame.
 
-    Rest to now, never frame to frame: errors of small steps add up (0.8 px after 60 frames), those of one
-    long step don't. Each frame starts from the last one that could be trusted; when confidence falls, the
-    frame is solved again from nothing and the better answer kept: one lost frame doesn't lose the rest.
+    Flow is computed from rest to now, because errors of frame-to-frame flow add up (0.8 px after 60 frames).
+    Each frame starts from the last trusted flow. When confidence drops, the frame is solved again from zero
+    and the better flow is used, so that tracking recovers after a lost frame.
     """
 
     def __init__(self, backend: str | Estimator, rest: Rgb, rest_blocked: Flags, tissue: Flags) -> None:
-        """Starts at rest.
+        """Starts at the rest frame.
 
         Args:
             backend: an estimator or its name.
             rest: the rest frame, (H, W, 3) uint8.
-            rest_blocked: (H, W), tool and glare in it.
-            tissue: (H, W), where there is tissue to follow.
+            rest_blocked: (H, W), its instrument and glare masks.
+            tissue: (H, W), where tissue is tracked.
 
         Raises:
-            UserError: no such estimator, or shapes that don't fit.
+            UserError: no such estimator, or shapes that differ.
         """
         if rest.shape[:2] != tissue.shape or rest_blocked.shape != tissue.shape:
             raise UserError(
@@ -83,34 +78,29 @@ class Tracker:
         self.estimator = create(backend)
         self.rest, self.tissue = rest, tissue
         self.usable = tissue & ~rest_blocked
-        self.trusted = True
-        """Whether the last frame could be followed."""
-        self.lost = ""
-        """Why the last frame could not be followed; empty if it could."""
-        self.resets = 0
-        """How often a frame was solved again from nothing, and better."""
-        self.last: Solution | None = None
-        """The last frame's answer as it was found."""
-        self.initial: Flow | None = None
-        """(H, W, 2) px, what the next frame starts from; None: from nothing."""
-        self.unsure: Flags = np.zeros_like(tissue)
-        """(H, W) where confidence says nothing about the frame."""
-        self._level = 1.0
+        self.trusted = True  # whether the last frame could be tracked
+        self.resets = 0  # frames whose flow from zero was the better one
+        self.last: Solution | None = None  # of the last frame
+        self.initial: Flow | None = None  # (H, W, 2) px from which the next frame starts; None: zero
+        self.unsure: Flags = np.zeros_like(tissue)  # (H, W) left out of the mean confidence
+        self._level = 1.0  # mean confidence of the last trusted frame
         self._around, self._tries = ~tissue & ~rest_blocked, 0
-        self.widened = False
-        """Whether the surroundings are followed with the tissue."""
+        self.widened = False  # whether the surroundings are tracked together with the tissue
 
     def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
-        """Flow (H, W, 2) px and confidence (H, W) of the next frame; `trusted` says whether it was followed.
+        """Returns flow (H, W, 2) px and confidence (H, W) of the next frame; sets `trusted`.
 
         Args:
             frame: (H, W, 3) uint8.
-            blocked: (H, W), tool and glare in it.
+            blocked: (H, W), its instrument and glare masks.
+
+        Raises:
+            UserError: the shapes differ from those of the rest frame.
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
         found = self.solve(frame, blocked, self.initial)
-        if self.is_doubtful(found):
+        if self.needs_retry(found):
             if self.initial is not None:
                 again = self.solve(frame, blocked, None)
                 if again.level > found.level:
@@ -119,9 +109,9 @@ class Tracker:
         return self.accept(found)
 
     def _wider(self, frame: Rgb, blocked: Flags, found: Solution) -> Solution:
-        """The answer with the surroundings, if it is so much surer in the tissue; then in all later frames.
+        """Includes the surroundings, here and in all later frames, if confidence in the tissue rises enough.
 
-        Where tissue is faint, what lies still around it holds the flow; elsewhere it pulls at the rim.
+        Still surroundings stabilise the flow of tissue with little texture; otherwise they bias its rim.
         """
         if self.widened or self._tries >= TRACKING.tries:
             return found
@@ -131,40 +121,33 @@ class Tracker:
         return wider if self.widened else found
 
     def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solution:
-        """One answer for a frame; nothing is remembered of it. Arguments as `step` and `initial`."""
+        """Solves a frame from a flow `initial` (None: zero) without changing the state; see `step`."""
         domain = self.usable | self._around if self.widened else self.usable
         flow, confidence = self.estimator.flow(self.rest, frame, domain, ~blocked, initial)
         confidence = confidence * self.tissue
-        seen = self.usable & ~blocked
-        where, tissue = seen & ~self.unsure, int(np.count_nonzero(self.tissue))
+        visible = self.usable & ~blocked
+        where, tissue = visible & ~self.unsure, int(np.count_nonzero(self.tissue))
         if np.count_nonzero(where) < TRACKING.free * tissue:
-            where = seen
+            where = visible
         inside = confidence[where] if where.any() else np.zeros(1, np.float32)
-        level = float(inside.mean(dtype=np.float64))
         return Solution(
             flow,
             confidence,
-            level,
-            matched=float(np.mean(inside >= DOUBTFUL)),
-            visible=int(np.count_nonzero(seen)) / max(1, tissue),
+            level=float(inside.mean(dtype=np.float64)),
+            is_matched=float(np.mean(inside >= LOW_CONFIDENCE)) >= TRACKING.matched,
+            is_visible=int(np.count_nonzero(visible)) / max(1, tissue) >= TRACKING.free,
         )
 
-    def is_doubtful(self, found: Solution) -> bool:
-        """Whether an answer is so much worse than the last good one's that others are tried."""
+    def needs_retry(self, found: Solution) -> bool:
+        """Whether the confidence of a flow is low, alone or relative to the last trusted frame."""
         return found.level < max(TRACKING.low, TRACKING.drop * self._level)
 
     def accept(self, found: Solution) -> tuple[Flow, Map]:
-        """Makes it the frame's answer; the next one starts from it if it can be trusted."""
-        self.last = found
-        self.lost = ""
-        if found.visible < TRACKING.free:
-            self.lost = f"masks leave {100 * found.visible:.2g}% of the tissue"
-        elif not found.is_matched:
-            self.lost = f"only {100 * found.matched:.0f}% of what is visible matches the rest frame"
-        self.trusted = not self.lost
+        """Makes a solution that of the frame; the next frame starts from it if it is trusted."""
+        self.last, self.trusted = found, found.is_visible and found.is_matched
         if self.trusted:
             self.initial, self._level = found.flow, found.level
-        sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * DOUBTFUL)
+        sure = found.confidence if self.trusted else np.minimum(found.confidence, 0.5 * LOW_CONFIDENCE)
         return found.flow * self.tissue[..., None], sure
 
 
@@ -174,24 +157,20 @@ def recover_flow(
     tissue: Flags,
     backend: str | Estimator = "tvl1",
 ) -> Track:
-    """Displacement through a video whose instruments' outlines are known; glare is found in the pictures.
+    """Displacement through a video with known instrument masks; specular highlights are detected.
 
     Args:
         frames: (T, H, W, 3) uint8, sRGB; frame 0 is the rest frame.
-        tool: (T, H, W), pixels of instruments.
-        tissue: (H, W), where there is tissue to follow in the rest frame.
-        backend: an estimator, or the name of one: tvl1, opencv-tvl1, dis or a plug-in's.
+        tool: (T, H, W), instrument masks.
+        tissue: (H, W), where tissue is tracked, in the rest frame.
+        backend: an estimator, or a name: tvl1, opencv-tvl1, dis or that of a plug-in.
 
     Raises:
-        UserError: no such estimator, no frames, or shapes that don't fit.
+        UserError: no such estimator, no frames, or shapes that differ.
     """
-    if not (
-        isinstance(frames, np.ndarray)
-        and frames.size
-        and frames.dtype == np.uint8
-        and np.shape(frames)[3:] == (3,)
-    ):
-        raise UserError("frames: expected a filled array (T, H, W, 3) of uint8")
+    is_video = isinstance(frames, np.ndarray) and frames.dtype == np.uint8 and frames.shape[3:] == (3,)
+    if not is_video or not frames.size:
+        raise UserError("frames: expected a non-empty array (T, H, W, 3) of uint8")
     for what, given, shape in (("tool", tool, frames.shape[:3]), ("tissue", tissue, frames.shape[1:3])):
         if np.shape(given) != shape or np.asarray(given).dtype != bool:
             raise UserError(f"{what}: expected an array {shape} of bool, got {np.shape(given)}")
@@ -201,7 +180,7 @@ def recover_flow(
 def track(
     backend: str | Estimator, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags
 ) -> Track:
-    """As `recover_flow`, with all that is masked, (T, H, W), given."""
+    """As `recover_flow`, with masks (T, H, W) of everything that is not tissue."""
     if len(frames) == 0 or len(frames) != len(blocked):
         raise UserError(f"flow: {len(frames)} frames with {len(blocked)} masks")
     tracker = Tracker(backend, frames[0], blocked[0], tissue)

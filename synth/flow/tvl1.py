@@ -1,18 +1,18 @@
-"""Masked TV-L1 optical flow, each step of its solver one compiled pass over the pixels.
+"""Masked TV-L1 optical flow with a compiled solver.
 
 Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame now, both contrast-normalised,
 
     E(w) = sum_x  lambda m(x) psi(|r(x, w)|^2)  +  |grad u|_h + |grad v|_h ,
     r(x, w) = (W, gamma d_x W, gamma d_y W) - (I_0, gamma d_x I_0, gamma d_y I_0),   W(x) = I_1(x + w(x)),
 
-psi(s^2) = sqrt(s^2 + epsilon^2) being the robust data term on brightness and gradient (Brox et al., High
+psi(s^2) = sqrt(s^2 + epsilon^2) is the robust data term on brightness and gradient (Brox et al., High
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
-rest frame, and visible now at x + w. Where m is 0 the regulariser alone carries the flow on, there as a
-membrane (a larger h). lambda is that of a picture of little noise: it falls with the square of the residual's
-median, as a measurement's weight does with its noise, and rises where the first guess is steep. Coarse to
-fine, re-warped (Brox), each warp solved by the primal-dual steps of Chambolle and Pock (J. Math. Imaging Vis.
-40, 2011, algorithm 1) on lagged weights.
+rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h
+as in a membrane. lambda holds for little noise: it falls with the square of the median residual, like the
+weight of a measurement with its noise, and rises where the initial flow is steep. The solver works coarse to
+fine with repeated warping (Brox); each warp is solved by the primal-dual algorithm 1 of Chambolle and Pock
+(J. Math. Imaging Vis. 40, 2011) with lagged weights.
 """
 
 from __future__ import annotations
@@ -32,84 +32,61 @@ from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import Level
 from synth.system.jit import vectorised
 
-_BETTER = 1.025  # the guess for large motion must fit this much better than the one for small motion
-_AGREED = 0.6  # agreement below which the network is believed less, and noise not at all
-_WEIGHT_LIMITS = 0.45, 1.5  # pictures of much noise, or none, would be smoothed to nothing or not at all
-_LANES = 16  # floats of the widest vectors
+_BETTER = 1.025  # factor in agreement by which the guess for large motion must exceed that for small motion
+_AGREED = 0.6  # agreement below which the confidence of the network is lowered
+_WEIGHT_LIMITS = 0.45, 1.5  # of the noise weight: avoids too much or too little smoothing
+_LANES = 16  # floats of the widest vector registers
 _ZERO, _HALF, _ONE, _TWO, _EIGHT = (np.float32(number) for number in (0, 0.5, 1, 2, 8))
 
 
 @dataclass(frozen=True)
 class TVL1Settings:
-    """The energy, and how far it is minimised."""
+    """Parameters of the energy and of the solver. A cold start has two stages: a guess on the coarse levels
+    with two values of lambda, then the solution on the fine levels. A warm start solves on all levels."""
 
-    weight: float = 0.36
-    """lambda: data against smoothness."""
-    noise: float = 0.115
-    """Median residual [local deviations] that lambda is for. It falls with the square of what is found: that
-    is the weight of a measurement with so much noise. 0: lambda stays."""
-    gradient: float = 1.0
-    """gamma: weight of gradient constancy."""
-    huber: float = 0.15
-    """h: flow gradients below it [px/px] are smoothed quadratically, above it linearly."""
-    hidden_huber: float = 0.3
-    """Added to h where nothing is seen: flow carries on there as a membrane would, without steps."""
-    epsilon: float = 0.01
-    """Residuals below it [local deviations] count quadratically."""
-    coarsest_px: int = 12
-    """The pyramid goes down to about this many pixels on the short side."""
-    warps: int = 6
-    """Linearisations a level."""
-    steps: int = 16
-    """Primal-dual steps a warp."""
-    tau: float = 3.5
-    """Primal step; the dual step is 1/(8 tau)."""
-    median: bool = True
-    """3x3 median of the flow after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)."""
-    steady_px: float = 0.1
-    """The last flow is averaged over its neighbours where that changes it by less than about this: what goes
-    there is noise, and a step in the flow stays."""
-    steep: float = 0.1
-    """Where the first guess's gradient [px/px] is this large, lambda doubles: smoothness costs most there."""
-    fine_levels: int = 2
-    """Levels that the second stage of a cold start works on; a warm start works on all."""
-    large_motion_weight: float = 2.5
-    """lambda of the first stage of a cold start: far pulls are steep, and smoothness would hold them back."""
-    small_motion_weight: float = 1.0
-    """lambda of its other try, which is taken unless the first fits clearly better."""
-    coarse_tau: float = 1.0
-    """Primal step of that stage: small, for the coarsest levels have few pixels and must not run away."""
-    coarse_warps: int = 6
-    """Linearisations a level of that stage, which leaves out the finest level."""
+    weight: float = 0.36  # lambda: data against smoothness
+    noise: float = 0.115  # median residual for which lambda holds [local deviations]; 0: lambda is constant
+    gradient: float = 1.0  # gamma: weight of gradient constancy
+    huber: float = 0.15  # h [px/px]: smaller flow gradients are smoothed quadratically, larger ones linearly
+    hidden_huber: float = 0.3  # added to h where nothing is visible: the flow has no steps there
+    epsilon: float = 0.01  # residuals below it count quadratically [local deviations]
+    coarsest_px: int = 12  # shorter side of the coarsest level, about
+    warps: int = 6  # linearisations per level
+    steps: int = 16  # primal-dual steps per warp
+    tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
+    median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
+    steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
+    steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
+    fine_levels: int = 2  # levels of the second stage
+    large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
+    small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
+    coarse_tau: float = 1.0  # primal step of the first stage: small, because coarse levels may diverge
+    coarse_warps: int = 6  # linearisations per level of the first stage, which omits the finest level
 
-    def small_motion(self) -> TVL1Settings:
-        """A first stage of a cold start, for what moves little."""
-        weight, tau, warps = self.small_motion_weight, self.coarse_tau, self.coarse_warps
+    def first_stage(self, weight: float) -> TVL1Settings:
+        """Settings of the first stage of a cold start."""
+        tau, warps = self.coarse_tau, self.coarse_warps
         return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, tau=tau, warps=warps)
-
-    def large_motion(self) -> TVL1Settings:
-        """A first stage of a cold start, for what moves far."""
-        return replace(self.small_motion(), weight=self.large_motion_weight)
 
 
 class Tvl1:
-    """The estimator `tvl1`: masked TV-L1, cold in two stages, warm in one.
+    """The estimator `tvl1`: masked TV-L1 with two stages for a cold start and one for a warm start.
 
-    Both with as many warps: half of them smooth less, and the error of warm frames was 1.12 times as large.
+    Both use the same number of warps: half as many smooth less and give 1.12 times the error in warm frames.
     """
 
     def __init__(self, settings: TVL1Settings | None = None, *, corrected: bool = True) -> None:
-        """Sets up.
+        """Loads the network.
 
         Args:
-            settings: the energy and the effort; None: the default, a measured point.
-            corrected: add what a network says is missing, and take its deviation for the confidence, which is
-                the pictures' agreement otherwise; see `synth.flow.correction`.
+            settings: energy and solver; None: the defaults.
+            corrected: whether a network corrects the flow and gives its confidence, which otherwise is the
+                agreement of the pictures; see `synth.flow.correction`.
         """
         self.settings = settings or TVL1Settings()
         self.correction = correction.load() if corrected else None
+        # The last rest frame, its mask and its pyramid, which are the same for all frames of a video.
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
-        """The last rest frame, where it was usable, and its pyramid: a video has one."""
 
     def flow(
         self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
@@ -118,23 +95,21 @@ class Tvl1:
         with torch.inference_mode(), one_thread():
             start = None
             if initial is not None:
-                # Planes, not interleaved: sums over neighbours took five times as long on the latter.
+                # Planes: sums over neighbours take five times as long on interleaved components.
                 planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
                 start = torch.from_numpy(planes)[None]
             found, agreed, aligned = self.tensors(
-                image.tensor(rest),
-                image.tensor(now),
-                image.flags(rest_usable),
-                image.flags(now_usable),
+                *(image.tensor(rest), image.tensor(now)),
+                *(image.flags(rest_usable), image.flags(now_usable)),
                 start,
             )
             flow, sure = found[0].movedim(0, -1).numpy(), agreed[0, 0].numpy()
             if self.correction is None:
                 return flow, sure
-            *greys, seen = (plane[0, 0].numpy() for plane in aligned)
-            described = correction.describe(rest, now, rest_usable, (greys[0], greys[1]), seen, flow, sure)
+            *greys, visible = (plane[0, 0].numpy() for plane in aligned)
+            described = correction.describe(rest, now, rest_usable, (greys[0], greys[1]), visible, flow, sure)
             flow, deviation = correction.correct(self.correction, described, flow)
-            # Where pictures hardly agree, as under a tool that no mask knows, the network has learnt nothing.
+            # The network was not trained where pictures disagree, as under an unmasked instrument.
             return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
     def tensors(
@@ -145,27 +120,27 @@ class Tvl1:
         now_usable: Tensor,
         initial: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """As `flow`, uncorrected, on tensors: greys, masks, agreement (1, 1, H, W), flow (1, 2, H, W).
+        """Uncorrected flow on tensors: greys and masks (1, 1, H, W), initial flow (1, 2, H, W).
 
-        The last are the rest frame, the one warped back, both contrast-normalised, and what is seen of it.
+        Returns the flow, its agreement, and the normalised rest frame, the warped frame and its mask.
         """
         s = self.settings
         last = self._rest
         if last is None or not (torch.equal(rest, last[0]) and torch.equal(rest_usable, last[1])):
             self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
-        levels = [Level(before, after, seen, still) for (before, seen), (after, still) in both]
+        levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
         fine = levels
         if initial is None and len(levels) > 1:
             initial, fine = finer(guess(levels[1:], s), levels[0]), levels[: s.fine_levels]
         found = steadied(solve(fine, initial, s), s.steady_px)
-        warped, seen = image.warp(levels[0].now, levels[0].now_usable, found)
-        return found, confidence.agreement(levels[0], warped, seen), (levels[0].rest, warped, seen)
+        warped, visible = image.warp(levels[0].now, levels[0].now_usable, found)
+        return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread for the block: these tensors are so small that threads only wait for one another."""
+    """Limits PyTorch to one thread: more are slower on tensors of this size."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -175,7 +150,7 @@ def one_thread() -> Iterator[None]:
 
 
 def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor, Tensor]]:
-    """Half of every `Level`, fine to coarse, of one picture; pixel x of one is (x - 1/2)/2 of the next."""
+    """Normalised picture and mask of each level, fine to coarse; pixel x is (x - 1/2)/2 on the next level."""
     levels = []
     while True:
         levels.append((image.normalise(grey, usable), (usable > 0.5).to(grey.dtype)))
@@ -187,18 +162,19 @@ def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor,
 
 
 def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
-    """The first stage of a cold start, twice: the picture's better answer, (B, 2, H, W) px.
+    """The first stage of a cold start with two values of lambda; returns the better flow (B, 2, H, W) px.
 
-    Little smoothness follows far pulls but loses islands between the tines, much smoothness the reverse.
+    Little smoothness follows large motion but loses small areas between the tines; much does the reverse.
     """
-    small, large = solve(levels, None, s.small_motion()), solve(levels, None, s.large_motion())
+    weights = s.small_motion_weight, s.large_motion_weight
+    small, large = (solve(levels, None, s.first_stage(weight)) for weight in weights)
     warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
     trust = [confidence.agreement(levels[0], *one).mean((1, 2, 3), keepdim=True) for one in warped]
     return torch.where(trust[1] > _BETTER * trust[0], large, small)
 
 
 def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tensor:
-    """Flow (B, 2, H, W) px of the finest level.
+    """Solves for the flow (B, 2, H, W) px of the finest level.
 
     Args:
         levels: fine to coarse.
@@ -225,7 +201,7 @@ def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tenso
 
 
 def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
-    """All warps of a level: linearise r about the flow, weigh it, minimise."""
+    """All warps of a level: each linearises r about the flow, weights it and minimises the energy."""
     rest, now, rest_usable, now_usable = (
         np.ascontiguousarray(field[0, 0].numpy())
         for field in (level.rest, level.now, level.rest_usable, level.now_usable)
@@ -238,7 +214,7 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
     state = new_state(*rest.shape)
 
     def differentiate(planes: Map) -> None:
-        """d_x, d_y, d_xx, d_xy, d_yy of the first plane into the others."""
+        """Writes d_x, d_y, d_xx, d_xy, d_yy of the first plane to the others."""
         kernels.differentiate(planes[0], planes[1], planes[2])
         kernels.differentiate(planes[1], planes[3], planes[4])
         kernels.differentiate(planes[2], spare, planes[5])
@@ -260,7 +236,7 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
 
 
 def steadied(flow: Tensor, within_px: float) -> Tensor:
-    """Flow (B, 2, H, W) px, averaged about as by a Gaussian of 1.4 px where that changes it little."""
+    """Smooths a flow (B, 2, H, W) px by about a Gaussian of 1.4 px where that changes it by little."""
     smooth = flow
     for _ in range(3):
         smooth = image.box(smooth, 1)
@@ -269,12 +245,12 @@ def steadied(flow: Tensor, within_px: float) -> Tensor:
 
 
 def finer(flow: Tensor, level: Level) -> Tensor:
-    """The next coarser level's flow (B, 2, h, w) on the grid of `level`, (B, 2, H, W) in its pixels."""
+    """Upsamples the flow (B, 2, h, w) of the next coarser level to `level`: (B, 2, H, W) in its pixels."""
     return 2 * image.doubled(flow, level.now)
 
 
 def steepness(flow: Tensor) -> Tensor:
-    """|grad w|^2 of w averaged over 16 x 16 px, (B, 1, H, W): what of the slope isn't noise."""
+    """|grad w|^2 (B, 1, H, W) of w averaged over 16 x 16 px, which removes the noise."""
     coarse = F.avg_pool2d(flow, 16, ceil_mode=True, count_include_pad=False)
     wide = F.pad(coarse, (1, 1, 1, 1), "replicate")
     dx, dy = wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2], wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]
@@ -284,13 +260,13 @@ def steepness(flow: Tensor) -> Tensor:
 
 @vectorised
 def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, numbers: Map, state: Map) -> None:
-    """The data term's prox as an affine map of (v_x, v_y), and the dual's factor 1 / (1 + sigma h).
+    """Computes the proximal map of the data term, affine in (v_x, v_y), and the factor 1 / (1 + sigma h).
 
     Args:
-        before, after: (6, H, W), the rest frame and the warped one: I, d_x, d_y, d_xx, d_xy, d_yy of it.
+        before, after: (6, H, W), I, d_x, d_y, d_xx, d_xy, d_yy of the rest frame and of the warped frame.
         mask, weight: (H, W).
-        flow: (2, H, W) px, what is linearised about.
-        numbers: tau, gamma, epsilon, h where something is seen, and what is added to it where nothing is.
+        flow: (2, H, W) px, the point of linearisation.
+        numbers: tau, gamma, epsilon, h, and its increase where nothing is visible.
         state: see `new_state`; its last six planes are written.
     """
     height, width = mask.shape
@@ -298,7 +274,7 @@ def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, number
     for y in range(height):
         for x in range(width):
             u, v = flow[0, y, x], flow[1, y, x]
-            # Residual r; slopes a by x and b by y of the mean of both pictures, b1 being a2.
+            # Residual r; slopes a by x and b by y of the mean of both pictures; a2 equals b1.
             r0 = after[0, y, x] - before[0, y, x]
             r1 = gamma * (after[1, y, x] - before[1, y, x])
             r2 = gamma * (after[2, y, x] - before[2, y, x])
@@ -321,11 +297,11 @@ def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, number
 
 
 def new_state(height: int, width: int) -> Map:
-    """Planes of `primal_dual`: w (2), its extrapolation (2), the dual of grad w by x (2) and by y (2), at 0,
-    the prox: straight (2), cross (1), shift (2), and 1 / (1 + sigma h).
+    """Planes of `primal_dual`: w (2), its extrapolation (2), the dual of grad w by x (2) and y (2), both 0,
+    the proximal map: straight (2), cross (1), shift (2), and 1 / (1 + sigma h).
 
-    Wider than the picture and aligned, so that loops of whole vectors have no rest: without, they took 1.6
-    times as long. The dual stands a row lower, that by x `_LANES` further right: 0 comes before it.
+    Rows are aligned and padded to whole vectors: without, loops take 1.6 times as long. The dual is shifted
+    down by one row, its x part right by `_LANES`, so that zeros precede it.
     """
     shape = 14, height + 1, -(-width // _LANES) * _LANES + _LANES
     flat = np.empty(int(np.prod(shape)) + _LANES, np.float32)
@@ -338,19 +314,19 @@ def new_state(height: int, width: int) -> Map:
 def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
     """`steps` of Chambolle and Pock's algorithm 1, in place.
 
-    A row of step k needs this row and the next of step k - 1, no more: all steps go down the picture
-    together, each one row behind the one before it, so that what they share stays in the cache.
+    A row of step k depends only on this row and the next of step k - 1. All steps therefore go down the
+    picture together, each one row behind the previous one, so that shared rows stay in the cache.
 
     Args:
         flow: (2, H, W) px.
         state: see `new_state`.
         tau: primal step; the dual step sigma is 1 / (8 tau).
-        steps: how many.
+        steps: number of steps.
     """
     height, width = flow.shape[1:]
     wide = state.shape[2] - _LANES
     sigma = _ONE / (_EIGHT * tau)
-    sigma_x = np.full(wide, sigma)  # no gradient leaves the picture: the last column's dual stays 0
+    sigma_x = np.full(wide, sigma)  # the dual of the last column stays 0: no gradient crosses the border
     sigma_x[width - 1 :] = _ZERO
     now, ahead, px, py, prox, shrink = state[:2], state[2:4], state[4:6], state[6:8], state[8:13], state[13]
     now[:, :height, :width] = flow
@@ -380,7 +356,7 @@ def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
 
 
 def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float) -> float:
-    """(noise / median of |r| where `mask` is)^2, 1 if nothing is seen; before, after as in `linearise`."""
+    """(noise / median of |r| inside `mask`)^2; 1 if the mask is empty. Arguments as in `linearise`."""
     square = _squares(before, after, mask, np.float32(gamma))
     middle = (len(square) - 1) // 2
     return noise**2 / max(float(np.partition(square, middle)[middle]), 1e-12) if len(square) else 1.0
@@ -388,7 +364,7 @@ def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float)
 
 @vectorised
 def _squares(before: Map, after: Map, mask: Map, gamma: np.float32) -> Map:
-    """|r|^2 of every other pixel of every other row, where the mask is."""
+    """|r|^2 at every other pixel of every other row, inside the mask."""
     height, width = mask.shape
     square, count = np.empty(mask.size, np.float32), 0
     for y in range(0, height, 2):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.flow.confidence import DOUBTFUL
+from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Flags, Flow, Map
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion
@@ -60,15 +60,14 @@ class ForegroundSearch:
             self._note("stands in front of the tissue", high & free, frame, LIMITS.front)
         if frame.is_rest or not frame.trusted:
             return
-        lost = free & (frame.confidence > 0) & (frame.confidence < DOUBTFUL)
+        lost = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
         self._note("hides what was there at rest", lost, frame, LIMITS.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > LIMITS.least_px:
             inner = cv2.erode(free.astype(np.uint8), _square(2 * LIMITS.across_px), borderValue=0) > 0
             jump = flow_jump(frame.flow) > max(LIMITS.step_px, LIMITS.step * motion)
-            self._note(
-                "moves unlike tissue", jump & inner & (frame.confidence > DOUBTFUL), frame, 0.0, LIMITS.long
-            )
+            edge = jump & inner & (frame.confidence > LOW_CONFIDENCE)
+            self._note("moves unlike tissue", edge, frame, 0.0, LIMITS.long)
 
     @property
     def findings(self) -> list[Finding]:

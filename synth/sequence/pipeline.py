@@ -180,8 +180,8 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
-            left=rig.Eye(scene.view.K, scene.view.distortion),
-            right=rig.Eye(lens.K, lens.distortion),
+            left=rig.Intrinsics(scene.view.K, scene.view.distortion),
+            right=rig.Intrinsics(lens.K, lens.distortion),
             rotation=np.eye(3),
             translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
             size=job.render.size,

@@ -1,1 +1,1 @@
-"""Two eyes: rest disparity, and motion in three dimensions with its standard deviation."""
+"""Stereo and depth cameras: rest disparity, and motion in three dimensions with its standard deviation."""

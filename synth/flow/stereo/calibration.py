@@ -1,4 +1,4 @@
-"""Reading a stereo calibration that OpenCV wrote, as `stereoCalibrate` gives it: YAML, XML or JSON."""
+"""Reader of stereo calibrations from OpenCV's `stereoCalibrate`: YAML, XML or JSON."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from synth.errors import UserError
-from synth.flow.stereo.rig import Eye, Floats, StereoRig
+from synth.flow.stereo.rig import Floats, Intrinsics, StereoRig
 from synth.system import checked_file
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")
@@ -19,37 +19,37 @@ _ORTHOGONAL = 1e-3
 
 
 def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> StereoRig:
-    """The pair of cameras in a file: K1, D1, K2, D2, R and T, or OpenCV's samples' names for them.
+    """Reads a pair of cameras: K1, D1, K2, D2, R and T, or the names of these in OpenCV's samples.
 
     Args:
         path: of the file.
-        size: width, height of the pictures that it was made from [px].
-        mm_per_unit: of T: the chessboard's squares say it.
+        size: width, height of the pictures used for calibration [px].
+        mm_per_unit: unit of T, given by the squares of the chessboard.
 
     Raises:
-        UserError: it cannot be read, or what it holds are no two cameras.
+        UserError: the file cannot be read, or does not contain two valid cameras.
     """
     held = checked_file.read_storage(path)
 
     def matrix(names: Sequence[str], what: str) -> Floats:
         first = next((held[name] for name in names if isinstance(held.get(name), np.ndarray)), None)
         if first is None or not np.isfinite(first).all():
-            raise UserError(f"{path}: holds no {what} ({', '.join(names)})")
+            raise UserError(f"{path}: the {what} is missing ({', '.join(names)})")
         return np.asarray(first, np.float64)
 
-    eyes = []
-    for (matrices, lenses), eye in ((_LEFT, "left"), (_RIGHT, "right")):
-        K = matrix(matrices, f"{eye} camera matrix")
+    cameras = []
+    for (matrices, lenses), side in ((_LEFT, "left"), (_RIGHT, "right")):
+        K = matrix(matrices, f"{side} camera matrix")
         if K.shape != (3, 3) or min(K[0, 0], K[1, 1]) <= 0:
-            raise UserError(f"{path}: the {eye} camera matrix is none")
-        lens = matrix(lenses, f"{eye} distortion").ravel()
+            raise UserError(f"{path}: the {side} camera matrix is not 3 x 3 with positive focal lengths")
+        lens = matrix(lenses, f"{side} distortion").ravel()
         if lens.size not in _TERMS:
-            raise UserError(f"{path}: the {eye} distortion has {lens.size} terms, OpenCV's has {_TERMS}")
-        eyes.append(Eye(K, lens))
+            raise UserError(f"{path}: the {side} distortion has {lens.size} terms, OpenCV has {_TERMS}")
+        cameras.append(Intrinsics(K, lens))
     rotation, translation = matrix(("R",), "rotation"), matrix(("T",), "translation").ravel()
     if rotation.size == 3:
         rotation = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
     straight = rotation.shape == (3, 3) and np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHOGONAL
     if not straight or np.linalg.det(rotation) < 0 or translation.shape != (3,) or not translation.any():
-        raise UserError(f"{path}: R is no rotation or T no translation")
-    return StereoRig(eyes[0], eyes[1], rotation, mm_per_unit * translation, size)
+        raise UserError(f"{path}: R is not a rotation, or T is not a translation")
+    return StereoRig(cameras[0], cameras[1], rotation, mm_per_unit * translation, size)

@@ -1,11 +1,11 @@
-"""What the depth solver misses, and how far off it may be: the flow's correction, for the second eye.
+"""Correction of the depth motion of stereo and its standard deviation, as in `synth.flow.correction`.
 
-A thin plate that is soft enough for a dimple follows noise; one that is stiff enough for noise flattens the
-dimple, by an eighth where a tool touches. Which of both it did can be read from the motion across the view,
-from what the pictures would still have, and from how sharply they know it; rendered truth teaches it. On the
-solver's cells, in mm, so that neither size of picture nor baseline is learnt.
+A thin plate that is soft enough for a dimple follows noise; a stiffer one flattens the dimple, by an eighth
+at a contact. A network trained on rendered ground truth estimates the error from the lateral motion, the
+remaining residual and its precision. It works on the cells of the solver, in mm, so that neither the size of
+pictures nor the baseline is learnt.
 
-`evidence.flow.correction_training` makes the weights; they lie beside this file with a card.
+`evidence.flow.correction_training` trains the weights. They are stored next to this file with a card.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.flow import correction
-from synth.flow.stereo.depth_motion import Change, Map, Solver
+from synth.flow.estimator import Map
+from synth.flow.stereo.depth_motion import Change, Solver
 
 WEIGHTS = Path(__file__).with_name("depth_correction.pt")
 _WINDOWS = 1, 3  # cells a side
@@ -26,32 +27,30 @@ FEATURES = (
     *("visible in both", "tissue", "motion x", "motion y", "motion away", *_STEPS),
     *("plate's deviation", "misfit", "flow's deviation", "strain"),
 )
-"""Channels that the network takes, in the order that its weights are bound to."""
+"""Input channels of the network, in the order of its weights."""
 CHANNELS = len(FEATURES)
-VECTORS = ((FEATURES.index("motion x"), FEATURES.index("motion y")),)
-"""Channels that are x and y of a vector, as in `synth.flow.correction`."""
-UNIT_MM = 0.1
-"""Of what the network says."""
-_FARTHEST_MM = 0.5  # no step of a linear equation is believed beyond
+VECTORS = ((FEATURES.index("motion x"), FEATURES.index("motion y")),)  # as in `synth.flow.correction`
+UNIT_MM = 0.1  # unit of the network's outputs
+_FARTHEST_MM = 0.5  # limit of a linearised step
 
 
 def describe(
-    change: Change, solver: Solver, flow: Map, seen: Map, spread: Map, px_per_mm: float, mm_per_px: float
+    change: Change, solver: Solver, flow: Map, visible: Map, spread: Map, px_per_mm: float, mm_per_px: float
 ) -> NDArray[np.float32]:
-    """The `FEATURES` of a frame: (CHANNELS, h, w) float32 on the solver's cells.
+    """`FEATURES` (CHANNELS, h, w) float32 of a frame on the cells of the solver.
 
     Args:
-        change: of the solver.
-        solver: that found it.
-        flow: (2, H, W) px, the left eye's, rectified.
-        seen: (h, w) share of a cell that is unmasked tissue in the left eye.
-        spread: (h, w) px, deviation of the flow's components.
-        px_per_mm: change of disparity of a point that moves 1 mm away (its size).
-        mm_per_px: across the view.
+        change: solution of the solver.
+        solver: of the change.
+        flow: (2, H, W) px, rectified flow of the left camera.
+        visible: (h, w) share of a cell that is unmasked tissue in the left picture.
+        spread: (h, w) px, standard deviation of a flow component.
+        px_per_mm: magnitude of the change of disparity of a point that moves 1 mm along the optical axis.
+        mm_per_px: size of a pixel at the tissue.
     """
     coarse, across = solver.coarse, [mm_per_px * solver.coarse(part) for part in flow]
     here = coarse(change.px)
-    rows = [coarse(change.visible), seen, *across, -here / px_per_mm]
+    rows = [coarse(change.visible), visible, *across, -here / px_per_mm]
     left = change.pull - change.precision * here
     for side in _WINDOWS:
         precision, pull = (
@@ -66,10 +65,10 @@ def describe(
 
 
 def correct(features: NDArray[np.float32]) -> tuple[Map, Map]:
-    """Depth motion to be added and its standard deviation, both (h, w) mm. features: see `describe`.
+    """Correction of the depth motion and its standard deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w).
 
     Raises:
-        UserError: the weights aren't there.
+        UserError: the weights are missing.
     """
     height, width = features.shape[1:]
     found = correction.answer(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]

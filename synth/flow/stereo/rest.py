@@ -1,7 +1,7 @@
-"""Rest disparity of a stereo pair: OpenCV's semi-global matching, then our flow to a part of a pixel.
+"""Rest disparity of a stereo pair: OpenCV's semi-global matching, refined to subpixels by TV-L1 flow.
 
 H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30, 2008, in
-OpenCV's blockwise form. TV-L1 refines it: masked, on local contrast, with edges kept.
+OpenCV's blockwise form. The refinement uses masks and local contrast, and preserves edges.
 """
 
 from __future__ import annotations
@@ -15,40 +15,37 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from synth.errors import UserError
+from synth.flow.estimator import Flags, Map
 from synth.flow.tvl1 import Tvl1, one_thread
 
-Map = NDArray[np.float32]
-Flags = NDArray[np.bool_]
-
-_STEP = 16  # OpenCV takes ranges in multiples of it, and gives sixteenths of a pixel
-_BLOCK = 5  # px of a match; the penalties are OpenCV's for it
-_ALIKE = 0.5  # local correlation of a match; by hand
-_ENOUGH = 0.05  # share of the tissue that must match; by hand
-_TRUSTED_PX = 1.5  # a refinement by more found something else; by hand
+_STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
+_BLOCK = 5  # px, side of the matched blocks; the penalties are those that OpenCV suggests for it
+_ALIKE = 0.5  # least local correlation of a match; chosen by hand
+_ENOUGH = 0.05  # share of the tissue that must match; chosen by hand
+_TRUSTED_PX = 1.5  # largest plausible change by the refinement; chosen by hand
 
 
 @dataclass(frozen=True)
 class Rest:
-    """The pair at rest, on rectified left pixels."""
+    """Rest disparity on rectified left pixels."""
 
-    disparity: Map  # (H, W) px: the left eye's column less the right eye's; finite everywhere
-    found: Flags  # (H, W), False where it was filled in from around
-    epipolar_px: float
-    """Median distance of what matches from its row: how far off the calibration is. NaN: not refined."""
+    disparity: Map  # (H, W) px: left column minus right column; finite everywhere
+    found: Flags  # (H, W), False where it was filled from the surroundings
+    epipolar_px: float  # median distance of matches from their row: calibration error; NaN: not refined
 
 
 def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, refine: bool = True) -> Rest:
-    """Rest disparity of a rectified pair.
+    """Matches a rectified pair.
 
     Args:
-        left: (n, H, W) grey levels of n rest frames, or (H, W) of one: their mean has less noise.
-        right: the same of the right eye.
-        left_usable: (H, W), tissue that is neither under the tool nor in glare.
-        right_usable: (H, W), the same of the right eye.
-        refine: to a part of a pixel; else as semi-global matching finds it.
+        left: (n, H, W) grey levels of n rest frames, which are averaged, or (H, W) of one.
+        right: the same of the right camera.
+        left_usable: (H, W), unmasked tissue.
+        right_usable: (H, W), unmasked pixels of the right picture.
+        refine: to subpixels.
 
     Raises:
-        UserError: nothing matches within an eighth of the width to both sides.
+        UserError: too little matches within an eighth of the width to both sides.
     """
     left, right = (np.atleast_3d(one.T).T.mean(axis=0, dtype=np.float32) for one in (left, right))
     width = left.shape[1]
@@ -65,15 +62,16 @@ def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, ref
         speckleWindowSize=100,
         speckleRange=2,
     )
-    # What lies left of the picture's reach matches too, once the right picture has room for it.
-    room = count + abs(low)
-    padded = [
-        cv2.copyMakeBorder(_bytes(one), 0, 0, room, room, cv2.BORDER_REPLICATE) for one in (left, right)
-    ]
-    raw = matcher.compute(*padded)[:, room:-room].astype(np.float32) / 16
+    # Padding lets pixels near the left and right borders match too.
+    pad = count + abs(low)
+    padded = [cv2.copyMakeBorder(_bytes(one), 0, 0, pad, pad, cv2.BORDER_REPLICATE) for one in (left, right)]
+    raw = matcher.compute(*padded)[:, pad:-pad].astype(np.float32) / 16
     found = (raw >= low) & left_usable
+    unmatched = UserError(
+        f"stereo: the left and right rest pictures do not match at disparities from {low} to {high} px"
+    )
     if not found.any():
-        raise UserError(f"stereo: the two eyes' rest pictures don't match between {low} and {high} px")
+        raise unmatched
     filled = _filled(raw, found)
     if not refine:
         return Rest(filled, found, float("nan"))
@@ -81,13 +79,13 @@ def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, ref
     better = (np.abs(-flow[0] - filled) < _TRUSTED_PX) & (trust > 0)
     sure = better & found & (trust > _ALIKE)
     if sure.sum() < _ENOUGH * left_usable.sum():
-        raise UserError(f"stereo: the two eyes' rest pictures don't match between {low} and {high} px")
+        raise unmatched
     off = float(np.median(np.abs(flow[1][sure])))
     return Rest(np.where(better, -flow[0], filled).astype(np.float32), found, off)
 
 
 def _refined(left: Map, right: Map, left_usable: Flags, right_usable: Flags, start: Map) -> tuple[Map, Map]:
-    """Flow (2, H, W) px from the left rest picture to the right one, and its confidence (H, W)."""
+    """Flow (2, H, W) px from the left to the right rest picture, and its agreement (H, W)."""
 
     def wide(field: NDArray[np.generic]) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(field, np.float32))[None, None]
@@ -101,7 +99,7 @@ def _refined(left: Map, right: Map, left_usable: Flags, right_usable: Flags, sta
 
 
 def _filled(raw: Map, found: Flags) -> Map:
-    """What was not found, from the nearest that was."""
+    """Fills pixels without a match from the nearest match."""
     rows, columns = distance_transform_edt(~found, return_distances=False, return_indices=True)
     return np.ascontiguousarray(raw[rows, columns])
 

@@ -1,4 +1,4 @@
-"""The correction of flow: what it sees against closed forms, its gain on pictures that no renderer drew."""
+"""The correction of flow: its features against closed forms, its gain on pictures that are not rendered."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from synth.flow.tvl1 import Tvl1
 
 
 def _described(mirrored: bool) -> np.ndarray:
-    """Features of cloth that went by (0.4, -0.25) px while the flow says (0, 0)."""
+    """Features of a texture that moved by (0.4, -0.25) px, with a flow of (0, 0)."""
     rng = np.random.default_rng(3)
     coloured = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
     shift = np.float32([[1, 0, 0.4], [0, 1, -0.25]])
@@ -25,22 +25,18 @@ def _described(mirrored: bool) -> np.ndarray:
     return correction.describe(rest, now, every, greys, np.float32(every), flow, np.float32(every))
 
 
-def test_what_is_left_to_go_is_seen_in_grey_and_in_colour() -> None:
-    seen = _described(mirrored=False)
-    assert seen.shape == (correction.CHANNELS, 26, 22)
+def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -> None:
+    features, mirrored = _described(mirrored=False), _described(mirrored=True)
+    assert features.shape == (correction.CHANNELS, 26, 22)
     for x, y in correction.VECTORS[:4]:
-        np.testing.assert_allclose(np.median(seen[x, 3:-3, 3:-3]), 0.4, atol=0.05)
-        np.testing.assert_allclose(np.median(seen[y, 3:-3, 3:-3]), -0.25, atol=0.05)
-
-
-def test_a_mirrored_picture_mirrors_vectors_alone() -> None:
+        np.testing.assert_allclose(np.median(features[x, 3:-3, 3:-3]), 0.4, atol=0.05)
+        np.testing.assert_allclose(np.median(features[y, 3:-3, 3:-3]), -0.25, atol=0.05)
     signs = np.ones((correction.CHANNELS, 1, 1))
     signs[[x for x, _ in correction.VECTORS]] = -1
-    seen, mirrored = _described(mirrored=False), _described(mirrored=True)
-    np.testing.assert_allclose(signs * mirrored[..., ::-1], seen, atol=0.02)
+    np.testing.assert_allclose(signs * mirrored[..., ::-1], features, atol=0.02)
 
 
-def test_it_helps_on_pulls_that_no_renderer_drew() -> None:
+def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None:
     errors = []
     for pair in pairs(Recipe(), 3, 23):
         pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable

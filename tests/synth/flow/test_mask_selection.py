@@ -1,4 +1,4 @@
-"""Masks that have to earn their place."""
+"""Selection of masks among true and false detections of instruments and highlights."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _tracker(rest: NDArray[np.uint8], found: Proposal) -> SelectingTracker:
     return SelectingTracker("tvl1", rest, found, ~_NOTHING)
 
 
-def test_tissue_that_is_taken_for_a_tool_is_not_masked() -> None:
+def test_tissue_that_is_detected_as_a_tool_is_not_masked() -> None:
     wrong = Proposal(_NOTHING, _MIDDLE, _NOTHING)
     tracker = _tracker(_picture(_texture()), wrong)
     for by_px in (1.0, 2.0):
@@ -43,7 +43,7 @@ def test_tissue_that_is_taken_for_a_tool_is_not_masked() -> None:
     assert np.abs(flow[30:66, 30:66] - [2.0, 0.0]).mean() < 0.05
 
 
-def test_tool_that_comes_between_is_masked() -> None:
+def test_a_tool_that_occludes_the_tissue_is_masked() -> None:
     tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
     for by_px in (1.0, 2.0):
         now = _picture(np.where(_MIDDLE, 60.0, _moved(by_px)))
@@ -51,7 +51,7 @@ def test_tool_that_comes_between_is_masked() -> None:
     assert tracker.blocked[36:60, 36:60].mean() > 0.9
 
 
-def test_highlights_that_stay_while_the_tissue_moves_are_masked_and_help() -> None:
+def test_still_highlights_on_moving_tissue_are_masked_and_masking_helps() -> None:
     spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 3)
     wet = spots > np.quantile(spots, 0.85)
     shine = Proposal(wet, _NOTHING, _NOTHING)
@@ -67,13 +67,13 @@ def test_highlights_that_stay_while_the_tissue_moves_are_masked_and_help() -> No
 
 
 def _faint(by_px: float, noise: int, contrast: float = 0.3) -> NDArray[np.float64]:
-    """Texture so faint that still highlights, and the camera's own noise, speak louder."""
+    """Moved texture of low contrast with sensor noise."""
     grain = np.random.default_rng(noise).normal(0, 3, (_SIZE, _SIZE))
     return 120 + contrast * (_moved(by_px) - 120) + grain
 
 
 @pytest.mark.parametrize(("contrast", "held"), [(0.06, True), (1.0, False)])
-def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast: float, held: bool) -> None:
+def test_confidence_is_low_where_only_highlights_support_zero_motion(contrast: float, held: bool) -> None:
     spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 6)
     wet = spots > np.quantile(spots, 0.95)
     found = Proposal(wet, _NOTHING, _NOTHING)
@@ -81,5 +81,5 @@ def test_highlights_that_alone_say_that_nothing_moves_are_not_believed(contrast:
     for k, by_px in enumerate((1.5, 3.0, 3.0)):
         flow, confidence = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k, contrast))), found)
         off = float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean())
-        assert (off > 1) == held, "what proves nothing if it is followed after all"
+        assert (off > 1) == held, "the case is only meaningful if the motion is missed"
         assert (confidence[wet].max() < 0.4) == held

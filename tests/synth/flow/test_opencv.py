@@ -1,4 +1,4 @@
-"""OpenCV's estimators behind the protocol, against warps known in closed form."""
+"""OpenCV's estimators against translations, detection of masks, and estimators of plug-ins."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ from synth.job.schema import Job
 from synth.plugins import ESTIMATORS
 
 
-def _error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(flow - truth, axis=-1)
-
-
 @pytest.mark.parametrize(("name", "bound_px"), [("opencv-tvl1", 0.05), ("dis", 0.08)])
 def test_translation(name: str, bound_px: float) -> None:
     fine = np.round(255 * cortex(320, np.random.default_rng(3))).astype(np.uint8)
@@ -28,7 +24,7 @@ def test_translation(name: str, bound_px: float) -> None:
     every = np.ones((160, 160), bool)
     flow, confidence = estimator.create(name).flow(rest, now, every, every)
     inner = (slice(20, -20), slice(20, -20))
-    assert _error(flow, np.array([5.0, 3.0]))[inner].mean() < bound_px
+    assert np.linalg.norm(flow - [5.0, 3.0], axis=-1)[inner].mean() < bound_px
     assert confidence[inner].min() > 0.9
     assert flow.dtype == np.float32
 
@@ -57,7 +53,7 @@ def test_tool_is_found_without_weights() -> None:
     assert blocked.mean() < 0.2
 
 
-def test_shipped_weights_are_small_say_what_made_them_and_beat_the_rule() -> None:
+def test_bundled_weights_are_small_and_documented_and_better_than_the_rule() -> None:
     card = json.loads(toolnet.WEIGHTS.with_suffix(".json").read_text())
     assert toolnet.WEIGHTS.stat().st_size <= 2_000_000
     assert "--seed" in card["command"]
@@ -77,7 +73,7 @@ class Learned:
 """
 
 
-def test_another_packages_estimator_is_found_by_its_entry_point(
+def test_the_estimator_of_a_plug_in_is_found_by_its_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UserError):
@@ -93,7 +89,7 @@ def test_another_packages_estimator_is_found_by_its_entry_point(
 
 
 @pytest.mark.parametrize("wrong", ["f, 1.5 * c", "f, c - 1.5", "np.nan * f, c", "f[1:], c", "f", "exit(0)"])
-def test_an_estimator_that_answers_wrongly_is_named(wrong: str) -> None:
+def test_invalid_results_of_an_estimator_are_reported_with_its_name(wrong: str) -> None:
     class Wrong:
         def flow(self, rest: Any, *others: Any) -> Any:
             return eval(wrong, {"np": np, "f": np.zeros((24, 32, 2)), "c": np.ones((24, 32))})
@@ -103,7 +99,7 @@ def test_an_estimator_that_answers_wrongly_is_named(wrong: str) -> None:
         track.track(Wrong(), frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
 
 
-def test_opencv_gives_one_answer_to_one_input() -> None:
+def test_opencv_is_deterministic() -> None:
     (pair,) = pairs(Recipe(size=128), 1, 13)
     for name in ("opencv-tvl1", "dis"):
         flows = [estimator.create(name).flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)[0]

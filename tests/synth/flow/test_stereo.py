@@ -1,4 +1,4 @@
-"""The second eye: what OpenCV says of the same rig, and motion in space that was put in."""
+"""Stereo: rectification against OpenCV's projections, and known motion in three dimensions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from synth.errors import UserError
 from synth.flow.stereo import calibration, depth_correction, depth_motion, rest
-from synth.flow.stereo.rig import Eye, Rectified, StereoRig
+from synth.flow.stereo.rig import Intrinsics, Rectified, StereoRig
 from synth.flow.stereo.track import StereoTracker
 
 SIZE = (160, 120)
@@ -19,12 +19,12 @@ FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
 K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
 K_RIGHT = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
 PARALLEL = StereoRig(
-    Eye(K, np.zeros(5)), Eye(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE
+    Intrinsics(K, np.zeros(5)), Intrinsics(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE
 )
 TURN = cv2.Rodrigues(np.array([0.004, 0.08, 0.01]))[0]
 TURNED = StereoRig(
-    Eye(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0])),
-    Eye(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0])),
+    Intrinsics(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0])),
+    Intrinsics(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0])),
     TURN,
     TURN @ np.array([-BASE, 0.4, -0.8]),
     SIZE,
@@ -33,14 +33,14 @@ COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
 
 
 def texture(rng: np.random.Generator) -> np.ndarray:
-    """A picture larger than what is seen, with detail of all sizes."""
+    """A picture larger than the view, with detail of all sizes."""
     noise = rng.normal(size=(400, 400))
     rough = sum(gaussian_filter(noise, s) * s for s in (1.2, 2.5, 6.0))
     return np.asarray(128 + 30 * rough / rough.std(), np.float32)
 
 
-def seen(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: the picture at x, y from its middle."""
+def view(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: the picture sampled at x, y."""
     found = cv2.remap(picture, (x + 120).astype(np.float32), (y + 140).astype(np.float32), cv2.INTER_CUBIC)
     return np.repeat(np.clip(found, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
 
@@ -51,7 +51,7 @@ def dent(amount: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rig", [PARALLEL, TURNED])
-def test_rectified_rows_and_depths_are_opencvs_projections(rig: StereoRig) -> None:
+def test_rectified_rows_and_depths_match_opencvs_projections(rig: StereoRig) -> None:
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(-8, 8, 50), rng.uniform(-6, 6, 50), rng.uniform(290, 310, 50)], axis=1)
     moved = points + rng.normal(scale=1.0, size=points.shape)
@@ -59,12 +59,12 @@ def test_rectified_rows_and_depths_are_opencvs_projections(rig: StereoRig) -> No
     turn = cv2.Rodrigues(rig.rotation)[0]
 
     def straight(where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rectified pixels of points in both eyes, by way of each eye's own picture."""
+        """Rectified pixels of points in both pictures, by way of the original pixels."""
         found = []
-        for eye, pose in enumerate(((np.zeros(3), np.zeros(3)), (turn, rig.translation))):
-            lens = (rig.left, rig.right)[eye]
+        for camera, pose in enumerate(((np.zeros(3), np.zeros(3)), (turn, rig.translation))):
+            lens = (rig.left, rig.right)[camera]
             own = cv2.projectPoints(where, *pose, lens.K, lens.distortion)[0][:, 0]
-            inverse = rectified._inverse[eye]
+            inverse = rectified._inverse[camera]
             x, y = (
                 cv2.remap(part, *own.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for part in inverse
             )
@@ -84,7 +84,7 @@ def test_rectified_rows_and_depths_are_opencvs_projections(rig: StereoRig) -> No
     after_left, after_right = straight(moved)
     flow, change = after_left - left, (after_left - after_right)[:, 0] - disparity
     for k in np.flatnonzero(inside)[:10]:
-        # `motion` is told of a whole picture: one whose pixel nearest to the point is the point.
+        # `motion` takes whole pictures: these have the values of the point everywhere.
         at = np.rint(left[k]).astype(int)
         field = np.full(SIZE[::-1], disparity[k], np.float32)
         planes = np.stack([np.full(SIZE[::-1], part, np.float32) for part in flow[k]])
@@ -92,12 +92,12 @@ def test_rectified_rows_and_depths_are_opencvs_projections(rig: StereoRig) -> No
         np.testing.assert_allclose(found, moved[k] - points[k], atol=0.03)
 
 
-def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
+def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
     def written(name: str, rotation: np.ndarray) -> Path:
         storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
-        for number, eye in (("1", TURNED.left), ("2", TURNED.right)):
-            storage.write(f"M{number}", eye.K)
-            storage.write(f"D{number}", eye.distortion[None])
+        for number, camera in (("1", TURNED.left), ("2", TURNED.right)):
+            storage.write(f"M{number}", camera.K)
+            storage.write(f"D{number}", camera.distortion[None])
         storage.write("R", rotation)
         storage.write("T", TURNED.translation[:, None] / 25.0)
         storage.release()
@@ -115,12 +115,12 @@ def test_a_calibration_that_opencv_wrote_is_read(tmp_path: Path) -> None:
 def test_rest_disparity_of_a_slope_with_a_step() -> None:
     picture = texture(np.random.default_rng(1))
     truth = 4.3 + 0.03 * (COLUMNS - 80) + 3.0 * (ROWS > 60)
-    left = seen(picture, COLUMNS, ROWS)[..., 0].astype(np.float32)
-    # The right eye sees at x - d what the left one sees at x: solved for by fixed-point steps.
+    left = view(picture, COLUMNS, ROWS)[..., 0].astype(np.float32)
+    # The right picture shows at x - d what the left one shows at x, solved by fixed-point iteration.
     x = COLUMNS.astype(np.float64)
     for _ in range(30):
         x = COLUMNS + 4.3 + 0.03 * (x - 80) + 3.0 * (ROWS > 60)
-    right = seen(picture, x, ROWS)[..., 0].astype(np.float32)
+    right = view(picture, x, ROWS)[..., 0].astype(np.float32)
     every = np.ones(truth.shape, bool)
     found = rest.match(left, right, every, every)
     coarse = rest.match(left, right, every, every, refine=False)
@@ -138,16 +138,16 @@ def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
     rng = np.random.default_rng(5)
     picture = texture(rng)
     d, v = dent(0.6), -0.8
-    u = 1.7 - 4.0 * d  # tissue that gives way strains
+    u = 1.7 - 4.0 * d  # the tissue is strained where it is dented
     every = np.ones(SIZE[::-1], bool)
     none = ~every
 
     def noisy(rgb: np.ndarray) -> np.ndarray:
         return np.clip(rgb + rng.normal(scale=2.0, size=rgb.shape), 0, 255).astype(np.uint8)
 
-    # Tissue lies at the distance at which rest disparity is 0.
-    first = noisy(seen(picture, COLUMNS, ROWS)), noisy(seen(picture, COLUMNS, ROWS))
-    left, right = (noisy(seen(picture, _source(along), ROWS - v)) for along in (u, u - d))
+    # The tissue lies at the distance of zero disparity.
+    first = noisy(view(picture, COLUMNS, ROWS)), noisy(view(picture, COLUMNS, ROWS))
+    left, right = (noisy(view(picture, _source(along), ROWS - v)) for along in (u, u - d))
     tracker = StereoTracker(PARALLEL, first[0][None], first[1][None], none, none, every)
     flow = np.stack([u, np.full_like(u, v)], axis=-1).astype(np.float32)
     trust = np.ones(every.shape, np.float32)
@@ -163,10 +163,10 @@ def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
     assert (moved.deviation[inner] > 0).all()
 
 
-def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
+def test_a_blocked_right_camera_raises_the_deviation_and_the_next_frame_recovers() -> None:
     picture = texture(np.random.default_rng(6))
     every = np.ones(SIZE[::-1], bool)
-    rest_frame = seen(picture, COLUMNS, ROWS)
+    rest_frame = view(picture, COLUMNS, ROWS)
     tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
     still = np.zeros((*every.shape, 2), np.float32), np.ones(every.shape, np.float32)
     sure = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
@@ -179,12 +179,12 @@ def test_a_blocked_eye_is_doubted_and_forgotten() -> None:
     np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
 
 
-def test_a_right_eye_of_another_moment_is_found_out() -> None:
+def test_a_right_picture_of_another_moment_is_detected() -> None:
     rng = np.random.default_rng(7)
     picture = texture(rng)
     every = np.ones(SIZE[::-1], bool)
-    rest_frame = seen(picture, COLUMNS, ROWS)
-    now, before = (seen(picture, COLUMNS - 1.5 * part, ROWS - 1.2 * part) for part in (1.0, 0.5))
+    rest_frame = view(picture, COLUMNS, ROWS)
+    now, before = (view(picture, COLUMNS - 1.5 * part, ROWS - 1.2 * part) for part in (1.0, 0.5))
     flow = np.tile(np.array([1.5, 1.2], np.float32), (*every.shape, 1))
     trust = np.ones(every.shape, np.float32)
     lags, spreads, errors = [], [], []
@@ -197,25 +197,25 @@ def test_a_right_eye_of_another_moment_is_found_out() -> None:
         errors.append(np.sqrt(np.square(moved.motion[inner]).mean()))
     assert abs(lags[0]) < 0.05
     assert lags[1] == pytest.approx(0.5, abs=0.2)
-    assert errors[1] > 10 * errors[0], "half of the motion passes for depth"
+    assert errors[1] > 10 * errors[0], "half of the motion appears as depth"
     assert spreads[1] > 0.5 * errors[1]
 
 
-def test_the_depth_that_pictures_would_still_have_is_seen_in_millimetres() -> None:
+def test_features_hold_the_remaining_step_of_depth_in_millimetres() -> None:
     solver = depth_motion.Solver(SIZE[::-1])
     nothing, one = np.zeros(SIZE[::-1], np.float32), np.ones(solver.shape, np.float32)
-    # A tenth of a pixel nearer: at 5 px/mm the tissue is 0.02 mm less far away.
+    # A remaining step of 0.1 px is -0.02 mm at 5 px/mm.
     change = depth_motion.Change(nothing, 1e4 * one, 1e3 * one, one, one, nothing)
     flow = np.stack([nothing, nothing])
-    seen = depth_correction.describe(change, solver, flow, one, 0.5 * one, px_per_mm=5.0, mm_per_px=0.2)
-    assert seen.shape == (depth_correction.CHANNELS, *solver.shape)
-    np.testing.assert_allclose(seen[[5, 7]], -0.02, rtol=1e-2)
-    np.testing.assert_allclose(np.exp(seen[6]), 1 / (100 * 5), rtol=1e-3)
-    np.testing.assert_allclose(np.exp(seen[11]), 0.1, rtol=1e-5)
+    features = depth_correction.describe(change, solver, flow, one, 0.5 * one, px_per_mm=5.0, mm_per_px=0.2)
+    assert features.shape == (depth_correction.CHANNELS, *solver.shape)
+    np.testing.assert_allclose(features[[5, 7]], -0.02, rtol=1e-2)
+    np.testing.assert_allclose(np.exp(features[6]), 1 / (100 * 5), rtol=1e-3)
+    np.testing.assert_allclose(np.exp(features[11]), 0.1, rtol=1e-5)
 
 
 def _source(along: np.ndarray) -> np.ndarray:
-    """Rest columns (H, W) that are seen at each pixel once tissue has moved by (along, -0.8)."""
+    """Rest columns (H, W) visible at each pixel after tissue has moved by (along, -0.8)."""
     x = COLUMNS.astype(np.float64)
     for _ in range(40):
         rows = (ROWS + 0.8).astype(np.float32)
@@ -223,7 +223,7 @@ def _source(along: np.ndarray) -> np.ndarray:
     return x
 
 
-def test_the_plate_is_free_to_tilt_and_not_to_bend() -> None:
+def test_the_plate_penalises_bending_but_not_tilting() -> None:
     bends = depth_motion.second_differences((9, 11))
     rows, columns = np.mgrid[:9, :11]
     assert np.abs(bends @ (2.0 + 0.3 * columns - 0.7 * rows).ravel()).max() < 1e-12

@@ -1,4 +1,4 @@
-"""The masked TV-L1 solver: its parts against formulas, the whole against known warps."""
+"""The masked TV-L1 solver: its parts against formulas, its flow against known warps, tracking with it."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def test_derivative_is_exact_for_cubics() -> None:
     np.testing.assert_allclose(dy[inner] * 10, (2 * y - 2 * x)[inner], atol=1e-4, rtol=1e-4)
 
 
-def test_warp_reads_where_the_flow_points() -> None:
+def test_warp_samples_where_the_flow_points() -> None:
     picture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(1))
     flow = torch.zeros(1, 2, 12, 16)
     flow[:, 0], flow[:, 1] = 2, -1
-    moved, seen = image.warp(picture, torch.ones_like(picture), flow)
+    moved, visible = image.warp(picture, torch.ones_like(picture), flow)
     torch.testing.assert_close(moved[..., 1:, :-2], picture[..., :-1, 2:], atol=1e-5, rtol=0)
-    assert seen[..., 1:, :-2].min() == 1
-    assert seen[..., 0, :].max() == 0
-    assert seen[..., -2:].max() == 0
+    assert visible[..., 1:, :-2].min() == 1
+    assert visible[..., 0, :].max() == 0
+    assert visible[..., -2:].max() == 0
 
 
 def test_pull_with_tool_highlights_and_light() -> None:
@@ -43,7 +43,7 @@ def test_pull_with_tool_highlights_and_light() -> None:
         mean.append(error[pair.inside & ~pair.hidden].mean())
         contact.append(error[pair.contact & ~pair.hidden].mean())
         hidden.append(error[pair.hidden].mean())
-        assert trust[pair.hidden].mean() < 0.02  # what can't be seen isn't vouched for
+        assert trust[pair.hidden].mean() < 0.02  # no confidence where the tissue is hidden
     assert np.mean(mean) < 0.15
     assert np.mean(contact) < 0.4
     assert np.mean(hidden) < 0.5
@@ -110,8 +110,8 @@ def test_flow_from_rest_to_now_does_not_drift() -> None:
     assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
 
 
-class _Given:
-    """An estimator that is as sure as it is told, by whether it may see the surroundings."""
+class _FixedConfidence:
+    """An estimator of given confidence, with and without the surroundings."""
 
     def __init__(self, alone: float, around: float) -> None:
         self.sure, self.shown = (alone, around), []
@@ -126,16 +126,16 @@ class _Given:
 @pytest.mark.parametrize(
     ("alone", "around", "widened"), [(0.3, 0.9, True), (0.3, 0.4, False), (0.8, 1.0, False)]
 )
-def test_surroundings_are_followed_where_tissue_alone_says_little(
+def test_surroundings_are_tracked_where_tissue_alone_has_low_confidence(
     alone: float, around: float, widened: bool
 ) -> None:
     tissue = np.zeros((32, 32), bool)
     tissue[8:24, 8:24] = True
-    picture, given = np.zeros((32, 32, 3), np.uint8), _Given(alone, around)
-    tracker = track.Tracker(given, picture, ~tissue & False, tissue)
+    picture, estimator = np.zeros((32, 32, 3), np.uint8), _FixedConfidence(alone, around)
+    tracker = track.Tracker(estimator, picture, ~tissue & False, tissue)
     for _ in range(6):
         _, confidence = tracker.step(picture, ~tissue & False)
-    assert tracker.widened == widened == given.shown[-1]
+    assert tracker.widened == widened == estimator.shown[-1]
     assert confidence[16, 16] == pytest.approx(around if widened else alone)
     assert not confidence[~tissue].any()
-    assert sum(given.shown) <= (6 if widened else 3), "a film of faint tissue isn't asked for ever"
+    assert sum(estimator.shown) <= (6 if widened else 3), "tries with the surroundings are limited"
