@@ -215,7 +215,7 @@ def from_dataset(
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
     if unseen_by:
-        seen = set[str]().union(*(read_card(find_model(model)).seen for model in unseen_by))
+        seen = set[str]().union(*(read_card(find_model(model)).used for model in unseen_by))
         chosen = [s for s in chosen if s.attrs["content_hash"] not in seen][:1]
     if not chosen:
         raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")

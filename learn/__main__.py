@@ -1,4 +1,4 @@
-"""`python -m learn`: the command without its script."""
+"""`python -m learn`."""
 
 from learn.cli import app
 

@@ -1,7 +1,7 @@
-"""A trained model on disk: a folder with config.json, weights.pt, history.jsonl and what resuming needs.
+"""A trained model on disk: a folder with config.json, weights.pt, history.jsonl and last.pt for resuming.
 
-A model that comes with the package has weights.safetensors instead, which any program can read. The card,
-config.json, holds a hash of the weights and one of itself, so that neither can change unseen.
+A pretrained model has weights.safetensors instead, which any program can read. The card, config.json, holds a
+hash of the weights and one of itself, so that a change of either is detected.
 """
 
 from __future__ import annotations
@@ -35,49 +35,41 @@ from synth.system.checked_file import write_whole
 from synth.system.config_file import first_mistake
 
 _FORMAT = "sulcus-model"
-_LARGEST_BYTES = 100_000_000
-"""Of config.json, which names the sequences that were trained on: a million of them."""
+_LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequences: a million of them
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
-SEEN = ("fit", "select", "intervals")
-"""Parts of `ModelCard.split` that no score of the model may be of."""
+USED = ("fit", "select", "intervals")
+"""Parts of `ModelCard.split` that the model must not be scored on."""
 
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a model says of itself: enough to use it without the data it came from."""
+    """A model's settings, scales, split and intervals: enough to use it without its training data."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
     settings: TrainingSettings
     scales: Scales
-    typical_young_kpa: Positive
-    """Geometric mean of E in the training data: stands in where E is unknown."""
+    typical_young_kpa: Positive  # geometric mean of E in the training data, used where E is unknown
     split: dict[str, list[str]]
-    """Content hashes of the sequences that were fitted (`fit`), that chose the epoch (`select`), that were
-    left (`test`), and, if any, that were kept for intervals (`intervals`)."""
-    groups: dict[str, list[str]]
-    """The anatomies of each, so that a sequence of a seen anatomy is never taken for unseen."""
-    dataset_splits: list[str] = field(default_factory=list)
-    """Hash of the split of each dataset that it was trained on."""
+    """Content hashes of the sequences by use: `fit` (weights), `select` (epoch), `test`, and `intervals`."""
+    groups: dict[str, list[str]]  # the anatomies of each part: other sequences of those are not unseen either
+    dataset_splits: list[str] = field(default_factory=list)  # hash of each training dataset's split
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
-    """R² on the select sequences at the chosen epoch, of the network's own map, before `force_gain`."""
+    """R² of the network's map, before `force_gain`, on the select sequences at the chosen epoch."""
     force_gain: Positive = 1.0
-    """What the network's map is multiplied by: the slope through the origin of the true on the predicted
-    total force, on the select sequences at the chosen epoch."""
-    weights_hash: str = ""
-    """Of the file of weights; empty before an epoch is kept."""
-    intervals: Intervals | None = None
-    """How far off its answers may be; None where nobody fitted that, or it could not be."""
-    no_intervals: str = ""
-    """Why it could not be; empty if it could, or nobody tried."""
+    """Factor on the network's map: the slope through the origin of the true on the predicted total force, on
+    the select sequences at the chosen epoch."""
+    weights_hash: str = ""  # of the file of weights; empty before the first epoch is stored
+    intervals: Intervals | None = None  # prediction intervals; None if not fitted
+    no_intervals: str = ""  # why they could not be fitted; else empty
 
     @property
-    def seen(self) -> set[str]:
-        """Content hashes of the sequences that no score of the model may be of."""
-        return {content for part in SEEN for content in self.split.get(part, [])}
+    def used(self) -> set[str]:
+        """Content hashes of the sequences that the model must not be scored on."""
+        return {content for part in USED for content in self.split.get(part, [])}
 
 
 _CARD = TypeAdapter(ModelCard)
@@ -94,7 +86,7 @@ def write_card(folder: Path, card: ModelCard) -> None:
 def write_model(
     folder: Path, card: ModelCard, state: Mapping[str, Tensor], *, safe: bool = False
 ) -> ModelCard:
-    """Writes weights and card, so that a kill leaves the old ones or the new ones; the card as written.
+    """Writes weights and card atomically and returns the card with the weights' hash.
 
     `safe`: as weights.safetensors, into a folder that holds no model yet.
     """
@@ -109,7 +101,7 @@ def write_model(
 
 
 def read_card(folder: Path) -> ModelCard:
-    """Raises UserError if there is no model, or its config is damaged, edited or of another version."""
+    """A folder's card. Raises UserError if it is missing, damaged, edited or of another version."""
     file = folder / "config.json"
     if not file.exists():
         raise UserError(f"{folder}: no model here (config.json is missing)")
@@ -117,9 +109,9 @@ def read_card(folder: Path) -> ModelCard:
     try:
         tree = json.loads(data)
         if tree.pop("seal", None) != _hash(identity.canonical(tree)):
-            raise UserError(f"{file}: is not as it was written: edited or damaged")
+            raise UserError(f"{file}: edited or damaged: its seal does not match")
         if tree.pop("format") != _FORMAT:
-            raise UserError(f"{file}: not a model of ours")
+            raise UserError(f"{file}: not a Sulcus model")
         check_format(tree.pop("format_version", 1), MODEL, str(file))
         return _CARD.validate_json(json.dumps(tree), strict=True)
     except ValidationError as error:
@@ -129,12 +121,12 @@ def read_card(folder: Path) -> ModelCard:
 
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
-    """Tensors and plain values, whole or not at all. Raises UserError if the file can't be written."""
+    """Writes tensors and plain values atomically. Raises UserError if the file can't be written."""
     _write(file, _packed(tree))
 
 
 def load_tensors(file: Path) -> dict[str, Any]:
-    """Raises UserError if the file is missing or damaged, or holds anything but tensors and plain values."""
+    """Tensors and plain values of a file. Raises UserError if it is damaged or holds other objects."""
     checked_file.check_file(file, _LARGEST_WEIGHTS)
     with as_user_error(f"{file}: corrupt checkpoint"):
         if file.suffix == ".safetensors":
@@ -149,7 +141,7 @@ def load_tensors(file: Path) -> dict[str, Any]:
 def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     """The trained network, in evaluation mode on the CPU, and its card.
 
-    Raises UserError if card or weights are damaged, edited, or not each other's.
+    Raises UserError if card or weights are damaged, edited, or don't belong together.
     """
     card = read_card(folder)
     state = load_tensors(_find_weights(folder, card))
@@ -160,8 +152,10 @@ def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
 
 
 def build_network(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
-    """The network of `arch` with the weights of `state`. Raises UserError, before it takes memory for them,
-    if they aren't its own."""
+    """The network of `arch` with the weights of `state`.
+
+    Raises UserError if names or shapes don't match, before memory is allocated.
+    """
     with torch.device("meta"):
         expected = {name: value.shape for name, value in D2FNet(arch).state_dict().items()}
     found = {name: value.shape for name, value in state.items() if isinstance(value, Tensor)}
@@ -173,53 +167,47 @@ def build_network(state: Mapping[str, Any], arch: Architecture, where: Path) -> 
     return model
 
 
-def room_needed(folder: Path, arch: Architecture) -> int:
-    """Bytes that a training of `arch` still takes on the disk of `folder`, at most."""
+def disk_needed(folder: Path, arch: Architecture) -> int:
+    """Upper bound of the bytes that training `arch` still adds to `folder`."""
     with torch.device("meta"):
         numbers = sum(int(value.numel()) for value in D2FNet(arch).state_dict().values())
-    # Weights, and last.pt with two moments of each beside them; all twice while they are replaced. And logs.
+    # Weights, and last.pt with them and two moments of each; all twice during replacement. And logs.
     needed = 2 * 4 * 4 * numbers + 2_000_000
     written = (folder / name for name in (_WEIGHTS, "last.pt"))
     return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
 
 
 def _find_weights(folder: Path, card: ModelCard) -> Path:
-    """The weights that the card was written for: under their next name if a kill came in between."""
+    """The file whose hash the card holds; weights.next.pt if writing was interrupted."""
     for file in (folder / _WEIGHTS, folder / _NEXT, folder / _SAFE):
         if file.is_file():
             with file.open("rb") as opened:
                 if hashlib.file_digest(opened, _digest).hexdigest() == card.weights_hash:
                     return file
     file = folder / (_SAFE if (folder / _SAFE).exists() else _WEIGHTS)
-    load_tensors(file)  # may say more of what is wrong
+    load_tensors(file)  # its error may be more specific
     raise UserError(f"{file}: not the weights that config.json was written for, or damaged")
 
 
 def _check_archive(file: Path) -> None:
-    """ValueError or what zipfile raises if a checksum of the archive is wrong, which PyTorch doesn't look at.
-
-    Also if it would be larger in memory than on disk.
-    """
+    """Raises an error for a wrong checksum, which PyTorch ignores, or if the archive is compressed."""
     with zipfile.ZipFile(file) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > file.stat().st_size:
-            raise ValueError("packed")
+            raise ValueError("compressed")
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"a checksum of {damaged} does not match")
 
 
 def _packed(tree: Mapping[str, Any]) -> bytes:
-    held = io.BytesIO()
-    torch.save(dict(tree), held)
-    return held.getvalue()
+    buffer = io.BytesIO()
+    torch.save(dict(tree), buffer)
+    return buffer.getvalue()
 
 
 def _write(file: Path, data: bytes) -> None:
-    """`write_whole`, a full disk as a UserError."""
-    try:
+    with as_user_error(f"{file}: cannot be written"):
         write_whole(file, data)
-    except OSError as error:
-        raise UserError(f"{file}: cannot be written ({error.strerror})") from None
 
 
 def _hash(data: bytes) -> str:

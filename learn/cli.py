@@ -1,4 +1,4 @@
-"""`learn train | eval | predict | calibrate | export | models`: from data to a model, scores, forces."""
+"""`learn train | eval | predict | calibrate | export | models`: trained models, their scores and forces."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ app = typer.Typer(
 _console = Console(stderr=True)
 
 Root = Annotated[Path, typer.Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
-Cache = Annotated[Path | None, typer.Option(help="Folder for packed arrays; made once, shared by runs.")]
+Cache = Annotated[Path | None, typer.Option(help="Folder for packed arrays, reused by later runs.")]
 Input = Annotated[
     str | None,
     typer.Option(
-        help="A store's displacement: ideal, recovered or noisy, of two eyes motion or motion-ideal; if not "
-        "given, what is recovered, and for intervals and `learn eval` what the model was trained on."
+        help="Displacement read from a store: ideal, recovered or noisy; of a stereo model motion or "
+        "motion-ideal. Default: recovered; for intervals and `learn eval` as in training."
     ),
 ]
-Threads = Annotated[int | None, typer.Option(help="CPU threads; half the cores if not given.")]
+Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: half the cores.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
 
 
@@ -53,25 +53,23 @@ def train_command(
     changes: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Any setting, as in a model's config.json, as KEY=VALUE or --KEY VALUE: --input mixed "
+            help="Any setting of a model's config.json as KEY=VALUE or --KEY VALUE: --input mixed "
             "--epochs 30 loss=mse arch.width=32."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[
-        list[Path] | None, typer.Option(help="A dataset to train on with the first; may be given again.")
+        list[Path] | None, typer.Option(help="A further training dataset; repeat for more.")
     ] = None,
-    preset: Annotated[
-        str, typer.Option(help="tiny, cpu, live or paper; of two eyes stereo or stereo-live.")
-    ] = "cpu",
+    preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
-    devices: Annotated[int, typer.Option(help="GPUs; under torchrun the number of processes.")] = 1,
+    devices: Annotated[int, typer.Option(help="Number of GPUs; under torchrun of processes.")] = 1,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. The same command continues an interrupted run."""
-    from learn.checkpoint import room_needed
+    from learn.checkpoint import disk_needed
     from learn.data.clips import sources
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
@@ -83,9 +81,9 @@ def train_command(
     from synth.system.config_file import override
 
     set_threads(threads)
-    dataset, given = _sorted_out(str(dataset), changes or [])
+    dataset, given = _split_arguments(str(dataset), changes or [])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
-    with made_folder(out, room_needed(out, settings.arch)):
+    with made_folder(out, disk_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
         clips = _read(datasets, settings.grid, sources(settings.input), cache)
         clips, split = divide(clips, datasets, settings.seed, _console.print)
@@ -103,28 +101,27 @@ def train_command(
     if json:
         print(json_.dumps(result))
         return
-    why = f"No intervals: {card.no_intervals or 'no epoch was kept'}."
+    why = f"No intervals: {card.no_intervals or 'no epoch was stored'}."
     _console.print(
         f"Model in {out}: epoch {card.epoch} of {settings.epochs}, R² {card.score:.3f} on {result['select']} "
         f"select sequences (its force times {card.force_gain:.3g}); fitted on {result['fit']}, "
-        f"{result['test']} kept for `learn eval`. {_describe(card.intervals) if card.intervals else why}"
+        f"{result['test']} left for `learn eval`. {_describe(card.intervals) if card.intervals else why}"
     )
 
 
-def _sorted_out(first: str, words: Sequence[str]) -> tuple[Path, dict[str, str]]:
-    """Dataset and settings, which may stand before it. UserError unless there is one dataset."""
+def _split_arguments(first: str, words: Sequence[str]) -> tuple[Path, dict[str, str]]:
+    """The dataset, and settings in any order around it. UserError unless there is exactly one dataset."""
     from learn.settings import as_changes
 
-    # A dataset that comes first may have = in its name.
+    # A dataset that stands first may have = in its name.
     settings, others = as_changes([first, *words] if first.startswith("--") else words)
     datasets = others if first.startswith("--") else [first, *others]
     if len(datasets) != 1:
-        raise UserError(f"one DATASET, and settings as KEY=VALUE or --KEY VALUE; given {' '.join(datasets)}")
+        raise UserError(f"needs one DATASET, got {' '.join(datasets) or 'none'}; settings are KEY=VALUE")
     return Path(datasets[0]), settings
 
 
 def _read(datasets: Iterable[Path], grid: Grid, wanted: Iterable[str], cache: Path | None) -> list[Clip]:
-    """All sequences of some datasets on a model's grid."""
     from learn.data.clips import load_clips
 
     clips: list[Clip] = []
@@ -141,7 +138,7 @@ def _describe(found: Intervals) -> str:
 
 def _log(numbers: Mapping[str, float]) -> None:
     line = f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
-    if numbers["share_r2"]:  # of a loss of two parts
+    if numbers["share_r2"]:
         line += f", gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
     _console.print(line)
 
@@ -152,15 +149,15 @@ def eval_command(
     dataset: Root,
     input: Input = None,
     against: Annotated[
-        Path | None, typer.Option(help="A second model: paired tests on the sequences neither has seen.")
+        Path | None, typer.Option(help="A second model, for paired tests on sequences new to both.")
     ] = None,
-    all: Annotated[bool, typer.Option("--all", help="Print every score, not just four.")] = False,
+    all: Annotated[bool, typer.Option("--all", help="Print all scores, not just four.")] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """Score a model on the sequences it has not seen; forces in mN."""
-    from learn.data.clips import scored
+    """Score a model on sequences that it was not trained on; forces in mN."""
+    from learn.data.clips import scored_source
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import compare, evaluate
     from learn.evaluation.tables import coverage_table, paired_table, score_table
@@ -170,17 +167,15 @@ def eval_command(
 
     set_threads(threads)
     predictor = load_model(model)
-    source = predictor.readable(input or scored(predictor.card.settings.input))
+    source = predictor.readable(input or scored_source(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
-        _console.print("The model was chosen on brains it is scored on: this says nothing of other brains.")
+        _console.print("Training and test share brains: these scores don't apply to other brains.")
     other = None if against is None else load_model(against)
     if other is not None:
         other.readable(source)
         if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
-            raise UserError(
-                f"{against}: is of another grid or target than {model}; their maps can't be paired"
-            )
+            raise UserError(f"{against}: differs from {model} in grid or target; choose another --against")
     cards = [one.card for one in (predictor, other) if one is not None]
     chosen = choose_unseen(clips, dataset, cards, _console.print)
     with counting("Evaluating") as progress:
@@ -208,7 +203,7 @@ def eval_command(
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
     model: Annotated[
-        Path, typer.Argument(help="Model folder, mono or stereo; may be left out if one of these is there.")
+        Path, typer.Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
     ],
     source: Annotated[
         Path | None,
@@ -222,41 +217,40 @@ def predict_command(
     input: Input = None,
     young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
     membrane: Annotated[
-        MembraneState, typer.Option(help="The tissue's membrane (pia), of a model that asks for it.")
+        MembraneState, typer.Option(help="State of the membrane (pia), for a model with that input.")
     ] = "unknown",
     scale: Annotated[
-        str | None, typer.Option(help="A video's scale [mm a pixel], or unknown: forces up to a factor.")
+        str | None, typer.Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")
     ] = None,
     tissue: Annotated[
         Path | None,
-        typer.Option(help="A picture, white where the video shows tissue; everywhere if not given."),
+        typer.Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
     ] = None,
     flow: Annotated[
         str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")
     ] = "tvl1",
     shrink: Annotated[
         int,
-        typer.Option(
-            min=0, max=8, help="Flow on a video's pictures this many times smaller; 0: to 320 columns."
-        ),
+        typer.Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns."),
     ] = 0,
     rate: Annotated[
-        float, typer.Option(min=0.0, help="At most so many frames a second of a video are looked at; 0: all.")
+        float, typer.Option(min=0.0, help="Most frames per second read from a video; 0: all.")
     ] = 10.0,
     pulse: Annotated[
-        bool, typer.Option(help="Take the tissue's own motion, heart and breath, off a video's first.")
+        bool, typer.Option(help="Subtract heartbeat and breathing from a video's motion first.")
     ] = True,
     masks: Annotated[
         str,
         typer.Option(
-            help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool."
+            help="Masks of a video: auto, none, glare, tool, both, or a folder of instrument masks "
+            "NNNNNN.png or mask.png."
         ),
     ] = "auto",
-    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the film.")] = True,
+    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
-    """Write the force maps and force curves that a model sees in stores, videos or arrays of flow.
+    """Estimate force maps and force curves from stores, videos or arrays of flow.
 
     Exit code 2 if no frame has a force.
     """
@@ -276,18 +270,18 @@ def predict_command(
         source = model
         chosen = choose_model(has_right_camera(source)) if shipped() else None
         if chosen is None:
-            raise UserError(f"{source}: say the model's folder before it: {NONE}")
+            raise UserError(f"{source}: give a model folder before it: {NONE}")
         model = chosen
     predictor = load_model(model, quick=True)
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
     peaks: dict[str, float | None] = {}
-    said: dict[str, list[str]] = {}
+    notes: dict[str, list[str]] = {}
     for motion in motions(source, predictor.stored(input), options):
         written = out / f"{motion.name}.npz"
         if written.exists() and written.samefile(source):
-            raise UserError(f"{written}: is what is read, and would be overwritten; say another --out")
+            raise UserError(f"{written}: is the input and would be overwritten; choose another --out")
         found = apply(predictor, motion, young, membrane)
         write_prediction(found, out / motion.name)
         if overlay:
@@ -295,7 +289,7 @@ def predict_command(
             write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
         size = found["total_force_mn"][found["trusted"]]
         peak = peaks[motion.name] = float(size.max()) if len(size) else None
-        said[motion.name] = found["notes"].tolist()
+        notes[motion.name] = found["notes"].tolist()
         if json:
             continue
         what = "no frame has a force" if peak is None else f"peak force {peak:.3g} mN"
@@ -303,7 +297,7 @@ def predict_command(
         for note in found["notes"]:
             _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
-        print(json_.dumps({"out": str(out), "notes": said, "peak_force_mn": peaks}))
+        print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
     if all(peak is None for peak in peaks.values()):
         raise typer.Exit(2)
 
@@ -314,8 +308,8 @@ def calibrate_command(
     data: Annotated[
         list[Path],
         typer.Argument(
-            help="One press with known force (NNNNNN.zarr store, or .npz with force_mn), or datasets: the "
-            "training data, and any with sequences that the model never met."
+            help="Presses of known force (NNNNNN.zarr stores or .npz with force_mn), or datasets: the "
+            "training data and any with sequences that are new to the model."
         ),
     ],
     input: Input = None,
@@ -323,16 +317,16 @@ def calibrate_command(
         bool,
         typer.Option(
             "--from-test",
-            help="Of datasets: take half of the test's brains; `learn eval` leaves them out then.",
+            help="Use half of the datasets' test brains, which `learn eval` then leaves out.",
         ),
     ] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """From one press the tissue's stiffness; from datasets a model's intervals, into its card."""
+    """Fit Young's modulus to presses of known force, or a model's prediction intervals to datasets."""
     from learn.checkpoint import read_card
-    from learn.data.clips import scored
+    from learn.data.clips import scored_source
     from learn.evaluation.fit_intervals import fit_from_datasets
     from learn.inference.apply import calibrate
     from learn.inference.motion import motions
@@ -342,8 +336,8 @@ def calibrate_command(
     set_threads(threads)
     predictor = load_model(model)
     if any(one.suffix not in (".npz", ".zarr") for one in data):
-        read_card(model)  # the user's own: what comes along is not changed
-        source = predictor.readable(input or scored(predictor.card.settings.input))
+        read_card(model)  # fails for the name of a pretrained model: those are not changed
+        source = predictor.readable(input or scored_source(predictor.card.settings.input))
         clips = _read(data, predictor.grid, (source,), cache)
         with counting("Fitting intervals") as progress:
             intervals = fit_from_datasets(model, predictor, clips, data, source, from_test, progress)
@@ -359,13 +353,13 @@ def calibrate_command(
         print(json_.dumps({"young_kpa": young}))
         return
     for name, kpa in young.items():
-        Console().print(f"{name}: E = {kpa:.3g} kPa; give it to `learn predict` as --young {kpa:.3g}")
+        Console().print(f"{name}: E = {kpa:.3g} kPa; use it as `learn predict --young {kpa:.3g}`")
 
 
 @app.command("export", epilog="Example: learn export model d2fnet.onnx")
 def export_command(
-    model: Annotated[Path, typer.Argument(help="Model's folder, or the name of a pretrained one.")],
-    file: Annotated[Path, typer.Argument(help="ONNX file; NAME.json next to it says how to use it.")],
+    model: Annotated[Path, typer.Argument(help="Model folder, mono or stereo.")],
+    file: Annotated[Path, typer.Argument(help="ONNX file; FILE.json next to it describes its use.")],
 ) -> None:
     """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export
@@ -377,7 +371,7 @@ def export_command(
 
 @app.command("models", epilog="Example: learn models")
 def models_command(json: Json = False) -> None:
-    """List the networks that come with this version."""
+    """List the pretrained networks."""
     from learn.checkpoint import read_card
     from learn.inference.shipped import NONE, describe, hash_data, shipped
     from synth.system.checked_file import folder_bytes
@@ -386,7 +380,7 @@ def models_command(json: Json = False) -> None:
     if json:
         rows = [
             {"name": name, "folder": str(folder), "bytes": folder_bytes(folder), "data": hash_data(card)}
-            | {"eyes": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
+            | {"cameras": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
             for name, (folder, card) in found.items()
         ]
         print(json_.dumps(rows))

@@ -1,17 +1,16 @@
-"""What training minimises: squared error, R², and a price of background force.
+"""Training losses: squared error, R², and a penalty on off-target force.
 
-Everything here is in physical units. Prediction and target are force density at a reference stiffness of
-1 kPa [mN/mm²], and so are the two numbers of the training data that come along: `unit`, the target's 99.9th
-percentile, says what a low force is; `spread`, its root mean square over tissue cells, is what errors are
-divided by. The squared-error and the R² term then are of one size and their weights mean what they say. (In
-the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
+Prediction and target are force density at a reference stiffness of 1 kPa [mN/mm²], as are two constants of
+the training data: `unit`, the target's 99.9th percentile, defines a low force; `spread`, its root mean square
+over tissue cells, is the unit of errors. The squared-error and the R² term are then of similar size. (In the
+published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
 
-Why another loss against false background force, the "ghosts" (`off-target`): a squared price, times three or
-not, fades with the ghost itself, so it moves large ones a little and small ones not at all. A linear price
-does: where the best guess in the mean would be q (in `spread`s) on tissue that is free with probability p, it
-says q − p·BACKGROUND/2, or nothing. Cells that are surely in contact (p = 0) aren't touched. What it costs in
-R² falls on weak presses, whose whole map is of the size of that price; R² by frame gives it back: an error is
-then measured against its frame's own force, so a weak press weighs as much as a strong one.
+Off-target force is force on contact-free tissue. Heraoui et al. penalise it by a larger weight on the squared
+error, their loss `antighost`; but the gradient of a squared penalty fades with the false force, so small ones
+remain. The loss `off-target` adds a linear penalty: where the best estimate in squared error is q (in units
+of `spread`) on tissue that is free with probability p, the minimum is at q − p·OFF_TARGET/2, at least 0.
+Cells in certain contact (p = 0) don't change. The penalty costs R² on weak presses, whose forces are of its
+size; R² by frame makes up for that, as it divides an error by its own frame's force.
 """
 
 from __future__ import annotations
@@ -24,45 +23,38 @@ from torch import Tensor
 from synth.errors import UserError
 
 Loss = Literal["mse", "mse-frame", "antighost", "off-target"]
-"""`mse`: squared error. `mse-frame`: squared error and every frame's own 1 − R², in equal parts. `antighost`:
-of Heraoui et al., squared error, dearer where a low force is over-predicted, and 1 − R² of the batch.
-`off-target`: `mse-frame` and a linear price of force on contact-free tissue, which took the ghosts away at no
-cost in R² (docs/results/learn): its numbers were chosen there."""
-
+"""`mse`: squared error. `mse-frame`: squared error and 1 − R² of each frame, in equal parts. `antighost`
+(name and loss of Heraoui et al.): squared error, weighted more where a low force is over-predicted, and 1 −
+R² of the batch. `off-target`: `mse-frame` and a linear penalty on off-target force, with constants chosen in
+docs/results/learn."""
 R2_SHARE = {"mse": 0.0, "mse-frame": 0.5, "antighost": 0.3, "off-target": 0.5}
-"""Share of the R² term; the rest is the squared error. (Heraoui et al.: 0.3.)"""
-FALSE_POSITIVE = 3.0
-"""`antighost`: price of a squared over-prediction where the true force is low. (Heraoui et al.: 3.)"""
-LOW = 0.05
-"""`antighost`: a cell's force is low under this share of `unit`. (Heraoui et al. ask the frame's mean.)"""
-BACKGROUND = 8.0
-"""`off-target`: price of the mean force density on contact-free tissue [mN/mm²], in units of `spread`."""
-FREE = 0.01
-"""`off-target`: tissue is contact-free where its true density is under this share of `unit`."""
+"""Weight of the R² term; the squared error has the rest. (Heraoui et al.: 0.3.)"""
+FALSE_POSITIVE = 3.0  # `antighost`: weight of squared over-prediction of a low force (Heraoui et al.: 3)
+LOW = 0.05  # `antighost`: a low force is under this share of `unit` (Heraoui et al. compare the frame's mean)
+OFF_TARGET = 8.0  # `off-target`: weight of the mean off-target force density, in units of `spread`
+FREE = 0.01  # `off-target`: tissue is contact-free where its true density is under this share of `unit`
 RAMP = (0.25, 0.75)
-"""`off-target`: shares of the run between which the price grows from none to full. Paid from the start it is
-cheapest to say nothing, and a network learns that first."""
-
-
-def full(kind: Loss, progress: float) -> bool:
-    """Whether nothing of the loss is still to come at a point 0..1 of the run."""
-    return kind != "off-target" or progress >= RAMP[1]
-
-
-SHARES = ("error", "r2", "ghost")
+"""`off-target`: shares of the run between which the penalty grows from zero to full. At full weight from the
+start a network first learns to predict no force."""
+SHARES = ("error", "r2", "off_target")
 """Names of the terms of the loss, as in history.jsonl."""
 
 
+def full(kind: Loss, progress: float) -> bool:
+    """Whether the loss has its full weights at a point 0..1 of the run."""
+    return kind != "off-target" or progress >= RAMP[1]
+
+
 class Terms(NamedTuple):
-    """The parts of the loss, dimensionless, already weighted; they add up to it."""
+    """The weighted terms of the loss, dimensionless."""
 
     error: Tensor
     r2: Tensor
-    background: Tensor
+    off_target: Tensor
 
     @property
     def sum(self) -> Tensor:
-        return self.error + self.r2 + self.background
+        return self.error + self.r2 + self.off_target
 
 
 def loss(
@@ -81,35 +73,32 @@ def loss(
     """
     cells = mask.sum()
     if cells == 0:
-        raise UserError("a batch without a single tissue cell has no loss")
+        raise UserError("a batch has no tissue cell: check the tissue masks")
     squared = ((prediction - target) / spread * mask).square().sum(1, keepdim=True)
     if kind == "antighost":
         squared = squared * false_positive_weights(prediction, target, unit)
     fit, share = squared.sum() / (cells * prediction.shape[1]), R2_SHARE[kind]
-    r2 = background = squared.new_zeros(())
+    r2 = off_target = squared.new_zeros(())
     if share > 0:
         r2 = unexplained(prediction, target, mask, spread, by_frame=kind != "antighost")
     if kind == "off-target":
-        price = BACKGROUND * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
-        background = price * background_force(prediction, target, mask, FREE * unit) / spread
-    return Terms((1 - share) * fit, share * r2, background)
+        weight = OFF_TARGET * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
+        off_target = weight * off_target_force(prediction, target, mask, FREE * unit) / spread
+    return Terms((1 - share) * fit, share * r2, off_target)
 
 
-def background_force(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
-    """Mean over tissue of the force density predicted where the true one is under `free`.
+def off_target_force(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
+    """Predicted force density where the true one is under `free`, averaged over all tissue.
 
-    `prediction`, `target`: (B, C, N, N), `free` in their unit, as is what is returned; `mask`: (B, 1, N, N)
-    0/1. Times the tissue's area it is the force [mN at 1 kPa] that the answer puts where nothing touches.
+    `prediction`, `target`: (B, C, N, N), `free` in their unit, as is the result; `mask`: (B, 1, N, N) 0/1.
+    Times the tissue's area it is the off-target force [mN at 1 kPa].
     """
-    loose = mask * (_length(target) < free)
-    return (_length(prediction).abs() * loose).sum() / mask.sum()
+    contact_free = mask * (_length(target) < free)
+    return (_length(prediction).abs() * contact_free).sum() / mask.sum()
 
 
 def false_positive_weights(prediction: Tensor, target: Tensor, unit: float) -> Tensor:
-    """(B, 1, N, N): `FALSE_POSITIVE` where force is over-predicted and low, 1 elsewhere.
-
-    A vector is over-predicted where it is longer than the true one.
-    """
+    """(B, 1, N, N): `FALSE_POSITIVE` where force is low and over-predicted (longer than the true), else 1."""
     predicted, true = _length(prediction.detach()), _length(target)
     return torch.where((true < LOW * unit) & (predicted > true), FALSE_POSITIVE, 1.0)
 
@@ -119,8 +108,8 @@ def unexplained(
 ) -> Tensor:
     """1 − R² = SSE/SST over the batch's masked cells, each component about its own mean.
 
-    `by_frame` takes the ratio frame by frame and then their mean. What holds hardly any force is measured
-    against a tenth of the training data's mean square, so that rest frames don't divide by zero.
+    `by_frame`: the mean of the frames' ratios. SST is at least a tenth of the training data's mean square, so
+    that frames at rest don't divide by zero.
     """
     over = (2, 3) if by_frame else (0, 2, 3)
     cells = mask.sum(over)
@@ -133,10 +122,7 @@ def unexplained(
 
 
 def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
-    """How much of the gradient on the map each of its terms gives: norms over their sum.
-
-    Must be called before `backward` frees the graph.
-    """
+    """Share of each term in the gradient on the map: norms over their sum. Call before `backward`."""
     norms = dict.fromkeys(SHARES, 0.0)
     for name, term in zip(SHARES, terms, strict=True):
         if term.requires_grad:
@@ -150,5 +136,5 @@ def _length(values: Tensor) -> Tensor:
     """(B, C, …) → (B, 1, …): the value itself for one component, else the vector's length."""
     if values.shape[1] == 1:
         return values
-    # A little inside the root: the gradient of a length at zero is not a number.
+    # The small constant keeps the gradient of a zero length finite.
     return (values.square().sum(1, keepdim=True) + 1e-20).sqrt()

@@ -1,4 +1,4 @@
-"""Everything that decides a training run, and the presets."""
+"""Settings of a training run, and their presets."""
 
 from __future__ import annotations
 
@@ -29,25 +29,24 @@ class TrainingSettings(Section):
     arch: Architecture = Architecture()
     loss: Loss = "antighost"
     input: Input = "ideal"
-    """Displacement to train on. `mixed`: each frame is ideal or recovered by a draw whose odds move from
-    all ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: in
-    three dimensions, as two eyes recover it, true, or both; they go with `arch.depth`."""
+    """Displacement to train on. `mixed`: each frame is drawn ideal or recovered, with odds that move from all
+    ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: stereo
+    motion, recovered, true or mixed; they need `arch.depth`."""
     target: Target = "density"
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
     learning_rate: Positive = 5e-4
     schedule: Literal["plateau", "cosine"] = "plateau"
-    """`plateau`: halved when the score stalls (the paper's); `cosine`: a warm-up over a twentieth of the run,
-    then down to zero by a half cosine, for runs too short to wait for a plateau."""
+    """`plateau`: the learning rate is halved when the score stalls, as published; `cosine`: a warm-up over a
+    twentieth of the run, then half a cosine to zero, for runs too short for a plateau."""
     surface_motion_mm: NonNegative = 0.0
-    """Standard deviation of a motion of the whole surface that half of the frames get on top, drawn anew:
-    along the view (with `arch.depth`), a third of it across. It is even, tilted and bulged, as breath,
-    heartbeat and a table that was pushed make it, and carries no force."""
+    """Standard deviation of a random motion of the whole surface, without force, that is added to half of the
+    frames: along the optical axis (with `arch.depth`), and a third of it across. It shifts, tilts and bulges,
+    as breathing, heartbeat and a pushed table do."""
     frames: Count = 0
-    """Frames a sequence gives an epoch, drawn anew each epoch; 0 takes all."""
+    """Frames per sequence and epoch, drawn each epoch; 0: all."""
     epoch_frames: Count = 0
-    """Most frames that an epoch has, drawn anew each epoch, so that more sequences take no longer; 0 sets no
-    limit."""
+    """Most frames of an epoch, drawn each epoch; 0: no limit."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
     seed: Count = 0
 
@@ -56,11 +55,11 @@ class TrainingSettings(Section):
         if self.target == "intensity" and self.arch.output != "magnitude":
             raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
         if self.arch.depth != has_depth(self.input):
-            raise ValueError(f"input {self.input!r} goes with arch.depth {str(not self.arch.depth).lower()}")
+            raise ValueError(f"input {self.input!r} needs arch.depth {str(not self.arch.depth).lower()}")
         halved = self.arch.stem * 2**self.arch.levels
         if self.size % halved:
             raise ValueError(
-                f"input size {self.size} does not divide by {halved} "
+                f"input size {self.size} is not divisible by {halved} "
                 f"(stem {self.arch.stem}, {self.arch.levels} levels)"
             )
         return self
@@ -71,20 +70,12 @@ class TrainingSettings(Section):
 
 
 def replace(settings: S, **changes: Any) -> S:
-    """Settings or an architecture with some values replaced, and checked anew.
-
-    Raises pydantic's ValidationError for a value that can't be: these come from code, not from a person.
-    """
+    """Settings or an architecture with replaced values. Raises pydantic's ValidationError."""
     return type(settings).model_validate(dict(settings) | changes)
 
 
-_SHORT: dict[str, Any] = {
-    "epochs": 24,
-    "schedule": "cosine",
-    "frames": 12,
-    "epoch_frames": 4000,
-}
-# What lifts the whole surface a second eye sees as well: without sway a breath was read as a press.
+_SHORT: dict[str, Any] = {"epochs": 24, "schedule": "cosine", "frames": 12, "epoch_frames": 4000}
+# Stereo also measures the lift of the whole surface: without surface motion a breath was taken for a press.
 _STEREO: dict[str, Any] = {
     "input": "motion-mixed",
     "loss": "mse-frame",
@@ -93,21 +84,21 @@ _STEREO: dict[str, Any] = {
 }
 _STEREO_ARCH = Architecture(width=16, stem=4, confidence=True, depth=True, dropout=0.05, relative=True)
 PRESETS: dict[str, TrainingSettings] = {
-    # Seconds to minutes: shows that everything joins up, not how good it can be.
+    # Seconds to minutes: for tests.
     "tiny": TrainingSettings(
         size=64,
         arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
         epochs=20,
-        # In a run this short the anti-ghost loss has only learnt to say little (docs/results/learn).
+        # In so short a run the losses against off-target force only lower all forces (docs/results/learn).
         loss="mse",
         learning_rate=2e-3,
         schedule="cosine",
     ),
-    # At most 20 minutes on one core, with however many sequences: tells good choices from bad.
+    # At most 20 minutes on one core, for any number of sequences.
     "cpu": TrainingSettings(
         size=128,
-        # A stem of 2 errs no less and takes twice the time, in training too (docs/results/learn/pareto).
-        # Magnitudes: on vectors this loss leaves 0.10 less of R² than squared error (docs/results/learn).
+        # A stem of 2 has the same error at twice the time, in training too (docs/results/learn/pareto).
+        # Magnitudes: with vectors this loss has an R² 0.10 below squared error's (docs/results/learn).
         arch=Architecture(width=16, stem=4, output="magnitude", dropout=0.05),
         loss="off-target",
         learning_rate=1e-3,
@@ -119,11 +110,11 @@ PRESETS: dict[str, TrainingSettings] = {
         loss="off-target",
         learning_rate=1e-3,
     ),
-    # `cpu` and `live` given motion in three dimensions. Force is then seen along the view as well, so they
-    # answer with vectors, and squared error, a frame's own too, is what serves those.
+    # `cpu` and `live` for stereo motion. Force along the optical axis is then observable, so their output is
+    # vectors, for which squared error with R² by frame is best.
     "stereo": TrainingSettings(size=128, arch=_STEREO_ARCH, **_SHORT, **_STEREO),
     "stereo-live": TrainingSettings(arch=replace(_STEREO_ARCH, levels=3), **_STEREO),
-    # The network, loss weights and schedule of Heraoui et al., on our targets.
+    # The network, loss and schedule of Heraoui et al., on our targets.
     "paper": TrainingSettings(arch=Architecture(width=32, stem=1, dropout=0.1)),
 }
 
@@ -138,10 +129,8 @@ def preset(name: str, **changes: Any) -> TrainingSettings:
 def as_changes(words: Iterable[str]) -> tuple[dict[str, str], list[str]]:
     """A command line's `key=value`, `--key=value` and `--key value` as `{key: value}`, and its other words.
 
-    The last of a key counts. An `input` brings the `arch.depth` that goes with it, unless that is given too.
-
-    Raises:
-        UserError: a `--key` without a value.
+    The last of a key counts. `input` also sets the `arch.depth` that it needs, unless that is given. Raises
+    UserError for a `--key` without a value.
     """
     changes, others, rest = dict[str, str](), list[str](), iter(words)
     for word in rest:

@@ -1,4 +1,4 @@
-"""Who is fitted, who chooses the epoch, who intervals are fitted on and who is tested: every rule of it."""
+"""Division of sequences into training (fit), validation (select), interval and test parts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from learn.checkpoint import SEEN, ModelCard
+from learn.checkpoint import USED, ModelCard
 from learn.data.clips import Clip
 from learn.uncertainty import conformal
 from learn.uncertainty.conformal import LEVELS
@@ -18,49 +18,46 @@ from synth.dataset.split import SIDES, DatasetSplit, find_crossings, join_groups
 from synth.errors import UserError
 
 Note = Callable[[str], None]
-"""Gets what a person should know of a split."""
+"""Receives warnings about a split."""
 Unit = Literal["anatomy", "opening", "sequence"]
-"""What is never on two sides."""
-_SEQUENCE = "/"  # between the anatomy and the sequence in a group's name; in none of an anatomy or opening
-_OPENING = " at "  # between the anatomy and the place
-LEAST_CHOSEN = 3
-"""Brains that the scale of the errors must be seen on."""
+"""What is never on two sides of a split."""
+_SEQUENCE = "/"  # between anatomy and sequence in a group's name; never in the name of an anatomy or opening
+_OPENING = " at "  # between anatomy and place of the craniotomy
+LEAST_SELECTED = 3  # brains that the error model needs
 
 
 @dataclass(frozen=True)
 class Split:
-    """Indices into the list of clips; the parts share no sequence, no group and no held-out family."""
+    """Indices into the list of clips; the parts share no sequence and no group."""
 
     fit: tuple[int, ...]
     select: tuple[int, ...]
     test: tuple[int, ...]
-    intervals: tuple[int, ...] = ()
-    """Neither fitted nor chosen on, and no test: what intervals are fitted on."""
-    hashes: tuple[str, ...] = ()
-    """Of the split of each dataset that this is made from."""
+    intervals: tuple[int, ...] = ()  # for prediction intervals only
+    hashes: tuple[str, ...] = ()  # of the splits of the datasets
 
 
 def divide(
     clips: list[Clip], datasets: Sequence[Path], seed: int, note: Note = lambda text: None
 ) -> tuple[list[Clip], Split]:
-    """The clips in their groups, and the parts: train, validation and test of the datasets' splits.
+    """The clips with their groups, and their division by the datasets' splits.
 
-    A group that two datasets put on two sides is in the later one's part only, and what is elsewhere is left
-    out: nothing is fitted that a dataset calls test.
+    Of a group on different sides in two datasets only the sequences on the later side (train, validation,
+    test) are used, so that no brain of a test side is trained on.
 
     Args:
         clips: all sequences of the datasets.
-        datasets: where they came from.
-        seed: of the draw of those that are kept for intervals.
+        datasets: their folders.
+        seed: for the draw of the interval part.
         note: see `Note`.
 
     Raises:
-        UserError: a dataset with too few groups to split, or none to fit or to choose on.
+        UserError: a dataset with too few groups to split, or an empty fit or select part.
     """
     splits, where = [read_split(one) for one in datasets], " ".join(map(str, datasets))
     if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
         clips = regroup(clips, "opening" if shared == {True} else "sequence")
-        note("One brain may be on several sides of the split: scores say nothing of other brains.")
+        note("Brains may be on several sides of the split: scores don't apply to other brains.")
     names = [clip.content_hash for clip in clips]
     DatasetSplit(sides={k: v for one in splits for k, v in one.sides.items()}).find(names, where)
     own = [{SIDES.index(one.sides[name]) for one in splits if name in one.sides} for name in names]
@@ -71,19 +68,18 @@ def divide(
         tuple(k for k, group in enumerate(number) if own[k] == {part} == {last[group]}) for part in range(3)
     )
     if left := len(clips) - len(fit) - len(select) - len(test):
-        note(f"{left} sequences are left out: another of the datasets has their brain on another side.")
+        note(f"{left} sequences are left out: another dataset has their brain on another side.")
     for side, part in zip(SIDES, (fit, select), strict=False):
         if not part:
-            raise UserError(f"{where}: no sequence is for {side}; give it some by `synth split --shares`")
+            raise UserError(f"{where}: the {side} side is empty; change it with `synth split --shares`")
     split = Split(fit, select, test, hashes=tuple(one.hash for one in splits))
     return clips, keep_back(clips, split, seed)
 
 
 def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
-    """The split with half of the brains that choose the epoch kept for intervals instead.
+    """The split with half of the select part's brains, drawn at random, moved to the interval part.
 
-    They are drawn, not dealt by size, so that they are like any brain to come. Where half would be too few
-    for 90%, the split stays as it is.
+    If half are too few for 90% intervals, the split is returned unchanged.
     """
     number = groups(clips)
     names = np.unique([number[i] for i in split.select])
@@ -96,7 +92,7 @@ def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
 
 
 def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    """Content hashes and groups of each part, as a model's card has them. UserError if two share a group."""
+    """Content hashes and groups of each part, for a model's card. UserError if two parts share a group."""
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
     if split.intervals:
         parts["intervals"] = split.intervals
@@ -112,91 +108,94 @@ def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]
 def choose_unseen(
     clips: list[Clip], dataset: Path, cards: Sequence[ModelCard], note: Note = lambda text: None
 ) -> list[Clip]:
-    """Those that no model has seen; of a dataset that one has met, of its test side. UserError if none is."""
-    split, asked = read_split(dataset, required=False), clips
-    met = {name for card in cards for part in card.split.values() for name in part}
-    if split.sides and any(clip.content_hash in met for clip in clips):
-        asked = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = asked
+    """Sequences to score models on: those that none was trained on; of a training dataset, of its test side.
+
+    Raises UserError if there are none.
+    """
+    split, candidates = read_split(dataset, required=False), clips
+    known = {name for card in cards for part in card.split.values() for name in part}
+    if split.sides and any(clip.content_hash in known for clip in clips):
+        candidates = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
+    chosen = candidates
     for card in cards:
         chosen = unseen(chosen, card)
     if not chosen:
         raise UserError(
-            f"{dataset}: the model was fitted or chosen on the brains of all {len(asked)} sequences that are "
-            "for testing; `synth split` says which are"
+            f"{dataset}: the model was trained on the brains of all {len(candidates)} test sequences; use "
+            "other data (`synth split` lists the sides)"
         )
-    if left := len(asked) - len(chosen):
-        note(f"{left} of {len(asked)} left out: the model was fitted or chosen on their brains.")
+    if left := len(candidates) - len(chosen):
+        note(f"{left} of {len(candidates)} left out: the model was trained on their brains.")
     return chosen
 
 
 def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
-    """Clips of no sequence and no anatomy that the model was fitted or chosen on, or its intervals fitted."""
-    met = _met(regroup(clips, find_unit(card)), card, SEEN)
-    return [clip for i, clip in enumerate(clips) if i not in met]
+    """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
+    used = _in_parts(regroup(clips, find_unit(card)), card, USED)
+    return [clip for i, clip in enumerate(clips) if i not in used]
 
 
 def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], from_test: bool) -> Split:
-    """Who of a dataset's sequences a trained model's intervals are fitted on, brain by brain.
+    """Division of a dataset's sequences for fitting a trained model's intervals, by brains.
 
-    Kept for it is what was already; else every brain that the model has not met and that has no test
-    sequence; with `from_test` half of the brains of the test instead, drawn, and the other half stays it.
-    Where too few brains chose the epoch, those that the error model still lacks are drawn from these.
+    The interval part is the card's; else every brain that is neither in the card nor in a test; with
+    `from_test` a random half of the test brains. If the select part has fewer brains than the error model
+    needs, the missing ones are drawn from the interval part.
 
     Args:
         clips: of the dataset.
         card: of the model.
-        test: content hashes of those marked test, beside the card's.
-        from_test: whether test sequences may be taken.
+        test: content hashes of further test sequences.
+        from_test: whether to use test sequences.
     """
     number = groups(clips)
 
     def brains(part: str, more: Collection[str] = ()) -> set[int]:
-        return {number[i] for i in _met(clips, card, [part], more)}
+        return {number[i] for i in _in_parts(clips, card, [part], more)}
 
     def of(chosen: Collection[int]) -> tuple[int, ...]:
         return tuple(i for i in range(len(clips)) if number[i] in chosen)
 
     rng = np.random.default_rng(card.settings.seed)
-    fitted, chosen = brains("fit"), brains("select")
-    calibration, tests = brains("intervals") - fitted - chosen, brains("test", test) - fitted - chosen
+    fitted, selected = brains("fit"), brains("select")
+    calibration, tests = brains("intervals") - fitted - selected, brains("test", test) - fitted - selected
     if from_test:
         drawn = rng.permutation(sorted(tests))
         calibration = {int(brain) for brain in drawn[: len(tests) // 2]}
     elif not calibration:
-        calibration = set(number) - fitted - chosen - tests
-    left, lacking = tests - calibration, max(LEAST_CHOSEN - len(chosen), 0)
-    if len(calibration) >= conformal.least_units(LEVELS[0]) + lacking:
-        lent = {int(brain) for brain in rng.permutation(sorted(calibration))[:lacking]}
-        chosen, calibration = chosen | lent, calibration - lent
-    return Split(of(fitted), of(chosen), of(left), of(calibration))
+        calibration = set(number) - fitted - selected - tests
+    left, missing = tests - calibration, max(LEAST_SELECTED - len(selected), 0)
+    if len(calibration) >= conformal.least_units(LEVELS[0]) + missing:
+        moved = {int(brain) for brain in rng.permutation(sorted(calibration))[:missing]}
+        selected, calibration = selected | moved, calibration - moved
+    return Split(of(fitted), of(selected), of(left), of(calibration))
 
 
 def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:
-    """Why there can be no intervals; empty if there can be.
+    """Why intervals can't be fitted; empty if they can.
 
-    `selection`: sequences that the scale is fitted on; `calibration`: those that the factors come from.
+    `selection`: sequences for the error model; `calibration`: for the factors.
     """
     least = conformal.least_units(LEVELS[0])
     parts = (
-        ("kept for intervals", calibration, least),
-        ("left to choose the epoch, on which the scale of errors is fitted", selection, LEAST_CHOSEN),
+        ("left for intervals", calibration, least),
+        ("left to choose the epoch and to fit the error model", selection, LEAST_SELECTED),
     )
     for what, part, needed in parts:
         found = len(set(groups(part)))
         if found < needed:
             brains = "brain is" if found == 1 else "brains are"
             return (
-                f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}: of {2 * least} or more "
-                "on the validation side half are kept (more sequences, or `synth split --shares`)"
+                f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
+                "validation side, half of which are used (more sequences, or `synth split --shares`)"
             )
     return ""
 
 
 def regroup(clips: Sequence[Clip], unit: Unit) -> list[Clip]:
-    """The clips with their anatomies, each place that these are opened at, or each sequence as groups.
+    """The clips grouped by anatomy, by place of the craniotomy, or not at all.
 
-    Two of one brain are then no strangers: scores say nothing of other brains.
+    In the last two cases one brain may be on several sides, and scores don't apply to other brains.
     """
     if unit == "opening":
         return [replace(c, group=c.opening or c.group) for c in clips]
@@ -206,7 +205,7 @@ def regroup(clips: Sequence[Clip], unit: Unit) -> list[Clip]:
 
 
 def find_unit(card: ModelCard) -> Unit:
-    """What the groups of a model's card are."""
+    """The unit of the groups in a model's card."""
     names = [name for part in card.groups.values() for name in part]
     if any(_SEQUENCE in name for name in names):
         return "sequence"
@@ -214,14 +213,14 @@ def find_unit(card: ModelCard) -> Unit:
 
 
 def groups(clips: Sequence[Clip]) -> list[int]:
-    """A group number for each clip: equal where two share an anatomy or are the same sequence twice."""
+    """A group number for each clip, equal for clips of one anatomy and for copies of one sequence."""
     return join_groups([c.group for c in clips], [c.content_hash for c in clips])
 
 
-def _met(
+def _in_parts(
     clips: Sequence[Clip], card: ModelCard, parts: Sequence[str], more: Collection[str] = ()
 ) -> set[int]:
-    """Indices of the clips that some parts of a card hold, by content (`more` too) or by group."""
+    """Indices of the clips in some parts of a card, by content hash (or one of `more`) or by group."""
     hashes = {*more, *(name for part in parts for name in card.split.get(part, ()))}
     names = {name for part in parts for name in card.groups.get(part, ())}
     return {i for i, c in enumerate(clips) if c.content_hash in hashes or c.group in names}

@@ -9,7 +9,7 @@ from bench.bootstrap import Interval
 from bench.methods.comparison import FUSION, MAIN
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
-from learn.uncertainty.out_of_distribution import UNSEEN
+from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
@@ -84,7 +84,7 @@ def _trust(result: Result) -> str:
     network = MAIN if result.main == FUSION else result.main
     asked = result.methods.get(network)  # without intervals nothing is known of what it was trained on
     if network in result.settings.get("networks", {}) and asked is not None and asked.low_mn is not None:
-        unlike = any(note.startswith(f"{network}: {UNSEEN}") for note in result.notes)
+        unlike = any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes)
         parts.append(f"it moves {'unlike anything' if unlike else 'as what'} the network was trained on")
     young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E of 1 kPa, for none is known"
     given = [young + _within(meta.get("young_uncertainty", 0.0))]

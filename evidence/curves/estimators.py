@@ -238,4 +238,4 @@ def figures(answer: Answer, part: Sequence[Clip], bare: Sequence[bool]) -> dict[
 def map_figures(predictor: Predictor, part: Sequence[Clip], source: str) -> dict[str, Any]:
     """R² of the force map over all cells, and the share of contact-free area that says a force."""
     known = evaluate(predictor, part, source).summary()
-    return {"map_r2": round(known["map_r2_pooled"], 4), "ghosts": round(known["ghost_relative"], 5)}
+    return {"map_r2": round(known["map_r2_pooled"], 4), "ghosts": round(known["false_positive_relative"], 5)}

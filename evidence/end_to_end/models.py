@@ -120,7 +120,7 @@ def read_force(predictor: Predictor, clip: Clip, source: str, told: bool = False
     """Force (T, 3) mN that a network of vectors gives for a displacement (`told`: and membrane), summed."""
     moved = np.asarray(clip.displacement[source])
     membrane = clip.membrane if told else "unknown"
-    density = predictor.density(moved, clip.mask, clip.young_kpa, clip.sure(source), membrane)
+    density = predictor.density(moved, clip.mask, clip.young_kpa, clip.confidence_of(source), membrane)
     return np.asarray(density.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)
 
 

@@ -35,7 +35,15 @@ from synth.job.schema import Job
 
 JOB = report.RESULTS / "learn/data/labels.yaml"
 LOSSES: tuple[Loss, ...] = ("mse", "antighost", "off-target")
-SCORES = ("map_r2", "map_rmse", "force_mae", "ghost_relative", "stray_mn", "low_over_mn", "localisation_mm")
+SCORES = (
+    "map_r2",
+    "map_rmse",
+    "force_mae",
+    "false_positive_relative",
+    "off_target_mn",
+    "low_over_mn",
+    "localisation_mm",
+)
 """Of a tested sequence; `learn.evaluation.metrics` says what they are."""
 
 

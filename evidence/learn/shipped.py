@@ -18,7 +18,7 @@ from evidence import report, status
 from evidence.curves.estimators import figures, map_figures
 from evidence.curves.experiment import percent
 from evidence.end_to_end import models
-from learn.data.clips import load_clips, scored
+from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
@@ -64,7 +64,7 @@ def main(
 
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:
     """What a model errs by on the sequences of a dataset that it has not met, and what its intervals hold."""
-    source = scored(predictor.card.settings.input)
+    source = scored_source(predictor.card.settings.input)
     every = load_clips(root, predictor.grid, (source,), cache=cache)
     clips = never_met(every, predictor.card)
     if not clips:
@@ -79,7 +79,7 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     held = next(one for one in cover(predictor, clips, source) if one.level == _LEVEL).as_dict()
     for part in ("size", "x", "y", "z"):
         row[f"held_{part}"] = [held[part][end] for end in ("mean", "low", "high")]
-    return row | {key: held[key] for key in _WIDTHS}
+    return row | {key: held[key] for key in (*_WIDTHS, *_DISTANCES)}
 
 
 def _told(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
@@ -106,7 +106,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         | {part: percent(row[f"held_{part}"]) for part in ("size", "x", "y", "z")}
         | {"width, of the peak": f"{row['width_of_peak']:.0%}"}
         | {"widths of x, y, z [mN]": ", ".join(f"{row[f'width_{axis}_mn']:.1f}" for axis in "xyz")}
-        | {"frames of an unseen world": f"{row['unseen']:.0%}"}
+        | {"frames of an unseen world": f"{row['out_of_distribution']:.0%}"}
         for row in found["rows"]
     ]
     sections = [
@@ -126,7 +126,8 @@ def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> report.Ch
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Frames that a 90% interval holds", "held_size"))
-_WIDTHS = ("width_mn", "width_of_peak", "width_x_mn", "width_y_mn", "width_z_mn", "unseen", "distance")
+_WIDTHS = ("width_mn", "width_of_peak", "width_x_mn", "width_y_mn", "width_z_mn")
+_DISTANCES = ("out_of_distribution", "distance")
 _PARTS = ("whole", "told", "across", "along", "force_size", "bare")
 _ERRORS = {key.removeprefix("force_"): key for key in _PARTS}
 _ERRORS_ARE = (

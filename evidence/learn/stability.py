@@ -114,8 +114,8 @@ def numbers(found: EvaluationReport, young: str = "known") -> dict[str, float | 
         "map R²": one["map_r2_pooled"],
         "force R²": one["force_r2_pooled"],
         "force MAE [mN]": one["force_mae"],
-        "off contact [mN]": one["stray_mn"],
-        "ghost area": one["ghost_relative"],
+        "off contact [mN]": one["off_target_mn"],
+        "ghost area": one["false_positive_relative"],
     }
 
 

@@ -45,7 +45,7 @@ _SCENES = (("opening", 1), ("edge to edge", 0))
 _CLEAN = 8  # films of either kind that nothing is wrong with
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
-_NOTES = "unseen world|again, frozen"
+_NOTES = "out of distribution|again, frozen"
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,7 +422,7 @@ def _both_bumped(film: Film) -> Film:
     return replace(_moved(film, shift=5.0), right=right)
 
 
-_UNSEEN, _AGAIN = "unseen world", "again"
+_UNSEEN, _AGAIN = "out of distribution", "again"
 _MISSING = r"^pictures: .*missing|^clocks|^times"
 _LATE = "^second eye: .*(late|early)"
 _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", np.s_[::-1]

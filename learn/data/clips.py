@@ -1,4 +1,4 @@
-"""Sequences as the network meets them: displacement and force density on the grid, read from stores."""
+"""Sequences on the network's grid: displacement and force density, read from stores."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ FIELDS = {
     "motion": "motion_recovered",
     "motion-ideal": "motion",
 }
-"""Field of a store that holds each displacement. `noisy` is the published regime: true flow with its
-noise. `motion` has three components, as two eyes recover them; `motion-ideal` is the truth."""
+"""Store field of each displacement. `noisy`: true flow with the published noise. `motion`: recovered stereo
+motion in three components; `motion-ideal`: its ground truth."""
 UNKNOWN_YOUNG_KPA = 1.0
-"""Tissue whose E nobody knows is answered for as if it were of this: forces are then right up to a factor."""
+"""E assumed where it is unknown: forces are then right up to a factor."""
 _MIXED = {"mixed": ("ideal", "recovered"), "motion-mixed": ("motion-ideal", "motion")}
 _CURE = {
     "ideal": "render it anew",
@@ -60,37 +60,31 @@ class Clip:
 
     name: str
     content_hash: str
-    group: str
-    """Sequences of equal group may never be on both sides of a split."""
+    group: str  # sequences of equal group are never on both sides of a split
     family: str
     gesture: str
     young_kpa: float
-    mask: NDArray[np.float32]
-    """(N, N) 0/1, tissue."""
+    mask: NDArray[np.float32]  # (N, N) 0/1, tissue
     displacement: dict[str, NDArray[np.float32]]
     """`ideal`, `recovered` and/or `noisy`: (T, 2, N, N) mm in picture axes; `motion` and/or `motion-ideal`:
     (T, 3, N, N) mm in camera axes."""
-    confidence: NDArray[np.float32]
-    """(T, N, N) 0..1 of the recovered flow; 1 where there is none."""
+    confidence: NDArray[np.float32]  # (T, N, N) 0..1 of the recovered flow; 1 without one
     density: NDArray[np.float32]
     """(T, 3, N, N) force density per unit stiffness, camera axes [mN/mm² at E = 1 kPa]. Its sum times the
-    cell's area times E is the force on the tissue in view: what falls into cells that are mostly not tissue
-    is carried by the nearest cell that is; only what lies off the grid is in `force` alone."""
-    force: NDArray[np.float64]
-    """(T, 3) total force on the tissue, camera axes [mN]."""
+    cell's area times E is the force on the tissue in view: force in cells that are mostly not tissue is moved
+    to the nearest tissue cell; only force off the grid is missing."""
+    force: NDArray[np.float64]  # (T, 3) mN, total force on the tissue, camera axes
     motion_confidence: NDArray[np.float32] | None = None
-    """(T, 2, N, N) 0..1 of the motion that two eyes recover, across and along the view; None without it."""
-    opening: str = ""
-    """Which place of a user's brain it shows; empty of procedural ones."""
+    """(T, 2, N, N) 0..1 of recovered stereo motion, across and along the optical axis; None without it."""
+    opening: str = ""  # place of the craniotomy on a user's brain; empty for procedural brains
     membrane: MembraneState = "unknown"
-    """Whether its tissue has one; unknown of what was never simulated."""
 
     @property
     def frames(self) -> int:
         return len(self.density)
 
-    def sure(self, source: str) -> NDArray[np.float32]:
-        """Confidence in a displacement, (T, 1, N, N), or (T, 2, N, N) of motion; 1 where it is true."""
+    def confidence_of(self, source: str) -> NDArray[np.float32]:
+        """Confidence in a displacement, (T, 1, N, N), with depth (T, 2, N, N); 1 for ground truth."""
         if source == "recovered":
             return np.asarray(self.confidence)[:, None]
         if source == "motion" and self.motion_confidence is not None:
@@ -99,22 +93,22 @@ class Clip:
 
 
 def has_depth(wanted: str) -> bool:
-    """Whether an input kind or a source is motion in three dimensions, which one eye doesn't see."""
+    """Whether an input kind or a source is motion in three dimensions, from stereo."""
     return wanted.startswith("motion")
 
 
 def components(wanted: str) -> int:
-    """Of its displacement: 2 or 3."""
+    """Number of components of a displacement, 2 or 3."""
     return 3 if has_depth(wanted) else 2
 
 
-def scored(wanted: Input) -> str:
-    """The source that a model of an input kind is scored on and used with: of a mixture the real one."""
+def scored_source(wanted: Input) -> str:
+    """The source that a model of an input kind is scored on: of a mixture the recovered one."""
     return sources(wanted)[-1]
 
 
 def sources(wanted: Input) -> tuple[str, ...]:
-    """Which displacements an input kind needs."""
+    """Displacements that an input kind uses."""
     if wanted not in INPUTS:
         raise UserError(f"unknown input {wanted!r}: one of {', '.join(INPUTS)}")
     return _MIXED.get(wanted, (wanted,))
@@ -123,8 +117,8 @@ def sources(wanted: Input) -> tuple[str, ...]:
 def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     """One store on the grid.
 
-    `wanted`: any of `FIELDS`. Raises UserError if the store lacks the flow (or the second eye) or has no
-    tissue, or values are not those that were sealed.
+    `wanted`: any of `FIELDS`. Raises UserError if the store lacks one of them or tissue, or if values don't
+    match their seal.
     """
     wanted = tuple(wanted)
     check_readable(sequence, wanted)
@@ -167,7 +161,7 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
         if source not in FIELDS:
             raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
         if FIELDS[source] not in sequence:
-            what = "motion of two eyes" if has_depth(source) else f"{source} flow"
+            what = "stereo motion" if has_depth(source) else f"{source} flow"
             alike = (one for one in FIELDS if has_depth(one) is has_depth(source))
             others = [f"use --input {one}" for one in alike if FIELDS[one] in sequence]
             hint = ", or ".join([_CURE[source], *others[:1]])
@@ -177,8 +171,9 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
 
 
 def _plain(sequence: Sequence) -> dict[str, Any]:
-    """What a clip takes from the attributes."""
+    """A clip's fields that come from the attributes."""
     scenario: dict[str, Any] = sequence.attrs.get("scenario") or {}
+    tissue = scenario.get("tissue") or {}
     return {
         "name": sequence.path.name,
         "content_hash": sequence.attrs["content_hash"],
@@ -187,15 +182,8 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "gesture": (scenario.get("gesture") or {}).get("kind") or "",
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "opening": sequence.attrs.get("opening_id") or "",
-        "membrane": _membrane(scenario.get("tissue")),
+        "membrane": ("intact" if tissue.get("membrane") else "stripped") if tissue else "unknown",
     }
-
-
-def _membrane(tissue: Any) -> MembraneState:
-    """Of a scenario's tissue, if there is one."""
-    if not tissue:
-        return "unknown"
-    return "intact" if tissue.get("membrane") else "stripped"
 
 
 def load_clips(
@@ -208,9 +196,9 @@ def load_clips(
 ) -> list[Clip]:
     """All sealed sequences of a dataset, in order.
 
-    `cache`: folder of packed arrays, made on first use and memory-mapped after; keyed by content hash, grid
-    and the code that packs, so it can be shared and can't be stale. Raises UserError for an empty dataset,
-    and for a sequence whose attributes or values are not those that were sealed.
+    `cache`: folder of packed arrays, written on first use and memory-mapped after; keyed by content hash,
+    grid and packing code, so it can be shared and is never stale. Raises UserError for an empty dataset, and
+    for a sequence whose attributes or values don't match their seal.
     """
     wanted = tuple(wanted)
     dataset = Dataset(root)
@@ -228,20 +216,20 @@ def load_clips(
 
 
 def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path, code: str) -> Clip:
-    # The content hash is no word of the store's own: opening it has checked that it is its attributes', and
-    # reading a field that it is the hash there. What is packed under it is what it stands for.
+    # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
+    # reading a field checks its values.
     key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
     folder = cache / hashlib.blake2b(identity.canonical(key), digest_size=16).hexdigest()
     if not folder.is_dir():
         pack(read_clip(sequence, grid, wanted), folder)
     found = unpack(folder)
     if found.displacement.keys() != set(wanted) or found.density.shape[-1] != grid.size:
-        raise UserError(f"{folder}: packed sequence of another grid or input; remove it")
+        raise UserError(f"{folder}: packed for another grid or input; remove it")
     return replace(found, **_plain(sequence))
 
 
 def pack(clip: Clip, folder: Path) -> None:
-    """Writes a clip as plain arrays into a new folder, whole or not at all; one that is there already stays.
+    """Writes a clip as plain arrays into a new folder, atomically; an existing folder is left as it is.
 
     Raises UserError if it can't be written.
     """
@@ -253,11 +241,11 @@ def pack(clip: Clip, folder: Path) -> None:
     plain["checksums"] = {name: _checksum(values) for name, values in arrays.items()}
     try:
         with checked_file.folder_of(folder) as part:
-            # One file: a mapping each, of which a process has some ten thousands, for thousands of clips.
+            # One file per clip: a process may have 65,530 mappings, a dataset has thousands of clips.
             save_file({name: np.ascontiguousarray(values) for name, values in arrays.items()}, part / _FILE)
             (part / "clip.json").write_text(json.dumps(plain))
     except (OSError, UserError, SafetensorError) as error:
-        if not folder.is_dir():  # else another run was faster
+        if not folder.is_dir():  # else another run wrote it meanwhile
             why = getattr(error, "strerror", error)
             raise UserError(f"{folder}: cannot be written ({why})") from None
 
@@ -280,7 +268,7 @@ def unpack(folder: Path) -> Clip:
 
 
 def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:
-    """The arrays of a packed clip, mapped and held against their checksums; no file stays open."""
+    """The arrays of a packed clip, mapped and checked against their checksums; no file stays open."""
     checked_file.check_file(file, 64 << 30)
     arrays: dict[str, NDArray[Any]] = {name: values.numpy() for name, values in load_file(file).items()}
     if arrays.keys() != checksums.keys():
@@ -297,10 +285,10 @@ def _checksum(values: NDArray[Any]) -> int:
 
 
 def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.float32]:
-    """(C, N, N) what the network should say about a frame [mN/mm² or, for intensity, mN; at E = 1 kPa].
+    """Training target of a frame, (C, N, N) [mN/mm² or, for intensity, mN; at E = 1 kPa].
 
-    `density` is the truth; one component gives its length. `intensity` is the paper's map: the density's
-    shape with its peak raised to the total force. It does not integrate to anything.
+    `density`: the true force density; with one component its length. `intensity`: the published map, the
+    density scaled so that its peak is the total force; its integral has no meaning.
     """
     density = clip.density[frame]
     if kind == "density" and components == 3:
@@ -308,7 +296,7 @@ def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.
     length: NDArray[np.float32] = np.sqrt(np.square(density).sum(0, keepdims=True))
     if kind == "intensity":
         if components != 1:
-            raise UserError("the paper's intensity map has no direction: use output 'magnitude' with it")
+            raise UserError("target 'intensity' has no direction: use output 'magnitude'")
         peak = float(length.max())
         total = float(np.linalg.norm(clip.force[frame])) / clip.young_kpa
         length = length * np.float32(total / peak) if peak > 0 else length
@@ -316,12 +304,11 @@ def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.
 
 
 def amount(clip: Clip, kind: Target, components: int, pitch_mm: float) -> NDArray[np.float64]:
-    """(T, C) total force that a map of this kind can be held to [mN at E = 1 kPa].
+    """True total force that a map of this kind is compared with, (T, C) [mN at E = 1 kPa].
 
-    A vector map adds up to the force on the tissue, and an intensity map peaks at its size. A map of lengths
-    knows no direction: two jaws that pull against each other add up in it, so it is held to the sum of
-    lengths
-    (C = 1), which is the force's size where all of it points one way.
+    A vector map sums to the force on the tissue, and an intensity map peaks at its size. In a map of lengths
+    two jaws that pull against each other add up, so it is compared with the sum of lengths (C = 1), which is
+    the force's size where all of it points one way.
     """
     if components == 3:
         return clip.force / clip.young_kpa
@@ -334,10 +321,10 @@ def amount(clip: Clip, kind: Target, components: int, pitch_mm: float) -> NDArra
 
 
 def typical_young(clips: Iterable[Clip]) -> float:
-    """Geometric mean of E over sequences [kPa]: the best guess when a recording's E is unknown."""
+    """Geometric mean of E over sequences [kPa]."""
     return float(np.exp(np.mean([np.log(c.young_kpa) for c in clips])))
 
 
 def assumed_young(young_kpa: float | None) -> float:
-    """E to answer for [kPa]: the one known, else `UNKNOWN_YOUNG_KPA`; for every method, learnt or not."""
+    """E [kPa] that a method uses: the known one, else `UNKNOWN_YOUNG_KPA`."""
     return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa

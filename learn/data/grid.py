@@ -1,7 +1,4 @@
-"""The network's view of a picture: an isotropic grid in millimetres, and the input channels on it.
-
-Training, evaluation, prediction and export all come through here, so a channel can't mean two things.
-"""
+"""The network's isotropic grid in millimetres, and its input channels; for training and prediction."""
 
 from __future__ import annotations
 
@@ -23,12 +20,13 @@ CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
 SMOOTHING_MM = 0.5
 """Standard deviation of the Gaussian under the derivative [mm]; physical, so that resolutions agree."""
 HALF_SURE_MM = 0.04
-"""Standard deviation at which motion is half trusted [mm]: the error that force bears in depth motion."""
+"""Standard deviation of motion at which its confidence is a half [mm]: the error of depth motion that force
+estimates tolerate."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """N×N cells over a square of the picture, `extent_mm` wide, whatever the picture's own scale."""
+    """N×N cells over a square of the picture that is `extent_mm` wide."""
 
     size: int
     extent_mm: float = 36.0
@@ -46,45 +44,42 @@ class Grid:
 
 @dataclass(frozen=True)
 class Scales:
-    """99.9th percentiles of the training data, by which input and target are divided; and one spread.
+    """99.9th percentiles of the training data, by which input and target are divided; and the target's rms.
 
-    One scale serves dx and dy (and dz): two would make the answer depend on how the camera is turned.
+    dx, dy and dz share one scale: else the estimate would depend on how the camera is turned.
     """
 
     displacement_mm: Positive
     divergence: Positive
-    target: Positive
-    """Force density per unit stiffness [mN/mm² at E = 1 kPa] (or intensity [mN at E = 1 kPa])."""
-    force: Positive
-    """Total force per unit stiffness [mN at E = 1 kPa]."""
-    spread: Positive
-    """Root mean square of the target over tissue cells and components, unit of `target`."""
+    target: Positive  # force density per unit stiffness [mN/mm² at E = 1 kPa], or intensity [mN at E = 1 kPa]
+    force: Positive  # total force per unit stiffness [mN at E = 1 kPa]
+    spread: Positive  # root mean square of the target over tissue cells and components, unit of `target`
 
 
 def centre(tissue: NDArray[np.bool_]) -> tuple[float, float]:
     """Centroid of the tissue mask as (x, y) px. `tissue`: (H, W) bool. Raises UserError if it is empty."""
     rows, cols = np.nonzero(tissue)
     if rows.size == 0:
-        raise UserError("the tissue mask is empty: nothing to put on the grid")
+        raise UserError("the tissue mask is empty")
     return float(cols.mean()), float(rows.mean())
 
 
 def check_scale(scale_mm_per_px: float) -> float:
-    """The scale of a picture. UserError if it isn't positive, or above 100: what it costs grows with it."""
+    """The scale of a picture. UserError if it isn't positive, or is above 100, as cost grows with it."""
     return as_positive("scale [mm/px]", scale_mm_per_px, largest=100)
 
 
 class Resampler:
-    """Carries pixel arrays of one picture to the grid, with hat functions as wide as the coarser of both.
+    """Resampling of a picture's pixel arrays to the grid, by hat functions as wide as the coarser of both.
 
-    `mean` is a weighted average (for displacement), `sum` keeps the total (for force). Both are the same
-    two small sparse matrices, rows then columns, so a frame costs two sparse products a channel.
+    `mean` is a weighted average (for displacement), `sum` preserves the total (for force). Both apply the
+    same two small sparse matrices, to rows and columns.
     """
 
     def __init__(
         self, shape: tuple[int, int], scale_mm_per_px: float, centre_px: tuple[float, float], grid: Grid
     ) -> None:
-        """`shape`: (H, W) of the picture; `centre_px`: the (x, y) px that lands on the grid's centre."""
+        """`shape`: (H, W) of the picture; `centre_px`: (x, y) px of the grid's centre."""
         self.grid = grid
         self.shape = shape
         self.scale_mm_per_px = check_scale(scale_mm_per_px)
@@ -112,9 +107,9 @@ class Resampler:
         return (self._apply(mask.astype(np.float32), self._rows, self._cols) / full).astype(np.float32)
 
     def sum(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Totals over each cell: what lies inside the grid is kept to rounding.
+        """Totals over each cell, which preserve the sum inside the grid.
 
-        `values`: (..., H, W), amount a pixel. Returns (..., N, N) float32, amount a cell.
+        `values`: (..., H, W), amount per pixel. Returns (..., N, N) float32, amount per cell.
         """
         return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
 
@@ -134,7 +129,7 @@ class Resampler:
         return out
 
     def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Grid values on the picture's pixels, bilinearly; 0 outside. (..., N, N) → (..., H, W) float32."""
+        """Grid values at the picture's pixels, bilinear, 0 outside: (..., N, N) → (..., H, W) float32."""
         n, ratio = self.grid.size, self.scale_mm_per_px / self.grid.pitch_mm
         x = (np.arange(self.shape[1]) - self.centre_px[0]) * ratio + (n - 1) / 2
         y = (np.arange(self.shape[0]) - self.centre_px[1]) * ratio + (n - 1) / 2
@@ -148,7 +143,7 @@ class Resampler:
 
 
 class GridView:
-    """A still picture's geometry (tissue and scale), prepared once and used for each of its frames."""
+    """The grid on one video: its resampler and tissue mask, made once for all frames."""
 
     def __init__(
         self,
@@ -157,7 +152,7 @@ class GridView:
         grid: Grid,
         centre_px: tuple[float, float] | None = None,
     ) -> None:
-        """`centre_px`: (x, y) on which the grid is centred; None: the middle of the tissue."""
+        """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid."""
         if tissue.ndim != 2:
             raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
         self.tissue = tissue.astype(bool)
@@ -167,21 +162,21 @@ class GridView:
         )
         self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
         if not self.mask.any():
-            raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue fills no cell of the network's grid")
+            raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue covers no cell of the network's grid")
 
-    def is_of(
+    def matches(
         self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None
     ) -> bool:
-        """Whether it was made of these, on the same grid."""
+        """Whether it was made from these arguments."""
         same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.resample.scale_mm_per_px)
         return same and np.array_equal(self.tissue, tissue)
 
 
 def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Amounts outside the mask carried to the nearest cell inside, so that the total is kept.
+    """Moves amounts outside the mask to the nearest cell inside, which preserves the total.
 
-    A cell at the tissue's edge may hold force and yet be mostly not tissue: dropping it would lose that.
-    `amount`: (C, N, N) a cell; `mask`: (N, N) 0/1, not empty. Returns (C, N, N), 0 outside the mask.
+    A cell at the tissue's edge may hold force though it is mostly not tissue.
+    `amount`: (C, N, N) per cell; `mask`: (N, N) 0/1, not empty. Returns (C, N, N), 0 outside the mask.
     """
     inside = mask > 0
     out = np.where(inside, amount, np.float32(0))
@@ -195,7 +190,7 @@ def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[n
 
 
 def _hats(length: int, centre_px: float, scale: float, grid: Grid) -> sparse.csr_array:
-    """(N, length) hat weights between grid nodes and pixel centres, both placed in mm from the centre."""
+    """(N, length) hat weights between grid nodes and pixel centres."""
     pixels = (np.arange(length) - centre_px) * scale
     nodes = (np.arange(grid.size) - (grid.size - 1) / 2) * grid.pitch_mm
     width = max(grid.pitch_mm, scale)
@@ -211,7 +206,7 @@ def _hats(length: int, centre_px: float, scale: float, grid: Grid) -> sparse.csr
 
 
 def _partition(hats: sparse.csr_array) -> sparse.csr_array:
-    """The same weights with every pixel's summing to one, so that totals are kept."""
+    """The same weights, normalised to a sum of one for every pixel, which preserves totals."""
     total = np.asarray(hats.sum(axis=0)).ravel()
     scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
     return (hats @ sparse.diags_array(scale.astype(np.float32))).tocsr()
@@ -221,9 +216,8 @@ def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
     """∂dx/∂x + ∂dy/∂y of the smoothed displacement, dimensionless, 0 outside the mask.
 
     Smoothing and differences use only masked cells (normalised convolution; at the mask's edge the
-    difference is one-sided), so that the step from tissue to nothing isn't read as strain.
-    `displacement`: (B, 2, N, N) mm (or 3: the third has no part in it), `mask`: (B, 1, N, N) 0/1. Returns
-    (B, 1, N, N).
+    difference is one-sided), so that the tissue's edge causes no strain.
+    `displacement`: (B, 2 or 3, N, N) mm, dz unused; `mask`: (B, 1, N, N) 0/1. Returns (B, 1, N, N).
     """
     sigma = SMOOTHING_MM / pitch_mm
     smooth = _smooth(displacement[:, :2] * mask, sigma) / _smooth(mask, sigma).clamp_min(1e-6)
@@ -231,7 +225,7 @@ def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
 
 
 def _difference(values: Tensor, mask: Tensor, dim: int) -> Tensor:
-    """Mean of the forward and backward differences whose both ends lie in the mask, a cell."""
+    """Mean of the forward and backward differences with both ends in the mask."""
     n = values.shape[dim]
     step = values.narrow(dim, 1, n - 1) - values.narrow(dim, 0, n - 1)
     both = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
@@ -274,14 +268,13 @@ def _smoother(size: int, sigma_px: float) -> Tensor:
 
 
 def channel_names(confidence: bool, depth: bool, membrane: bool) -> tuple[str, ...]:
-    """Of the network's input, with the confidence of the motion, with what a second eye adds, with what is
-    known of the membrane."""
+    """Names of the network's channels, with those of confidence, of stereo depth and of the membrane."""
     along = ("dz", "confidence of dz") if confidence else ("dz",)
     return (*CHANNELS, *["confidence"] * confidence, *along[: 2 * depth], *["membrane"] * membrane)
 
 
 def membrane_code(known: MembraneState) -> float:
-    """What the network is told of a membrane: -1 stripped, 0 unknown, 1 intact."""
+    """Value of the membrane channel: -1 stripped, 0 unknown, 1 intact."""
     return get_args(MembraneState).index(known) - 1.0
 
 
@@ -297,11 +290,11 @@ def channels(
 
     `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
     0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N); `membrane`: (B,) of `membrane_code`.
-    Returns (B, 5 to 9, N, N) without unit.
-    Source: Heraoui et al., the five channels of D2FNet; here in mm and with one displacement scale.
+    Returns (B, 5 to 9, N, N), dimensionless.
+    Source: the five channels of D2FNet (Heraoui et al.), here in mm and with one displacement scale.
     """
     moved = displacement * mask / scales.displacement_mm
-    # Not vector_norm: over so short an axis it takes ten times as long as the planes by themselves.
+    # vector_norm takes ten times as long over so short an axis.
     length = (moved[:, :1].square() + moved[:, 1:2].square()).sqrt()
     parts = [moved[:, :2], length, mask, divergence(displacement, mask, pitch_mm) / scales.divergence]
     if confidence is not None:
@@ -315,7 +308,10 @@ def channels(
 
 
 def certainty(deviation_mm: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Confidence in 0..1 of motion across and along the view, (2, ...), from its deviation (..., 3) mm."""
+    """Confidence in 0..1 of motion across and along the optical axis, (2, ...).
+
+    `deviation_mm`: (..., 3), standard deviation of the motion [mm].
+    """
     across = np.sqrt(np.square(deviation_mm[..., :2]).mean(axis=-1))
     spread = np.stack([across, deviation_mm[..., 2]])
     return np.asarray(1 / (1 + np.square(spread / HALF_SURE_MM)), np.float32)

@@ -1,1 +1,1 @@
-"""How right a model is, and how sure that is."""
+"""Scores of a model, with their confidence intervals, and the fit of its prediction intervals."""

@@ -1,4 +1,4 @@
-"""Whether a model's intervals hold on sequences of known truth, and how wide they are."""
+"""Coverage and width of a model's prediction intervals on sequences of known force."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from learn.data.clips import Clip
 from learn.evaluation.fit_intervals import predict_clip
-from learn.evaluation.statistics import Interval, interval
+from learn.evaluation.statistics import Interval, interval, null_if_nan
 from learn.inference.predict import Predictor
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
@@ -21,28 +21,26 @@ from synth.errors import UserError
 
 @dataclass(frozen=True)
 class Coverage:
-    """Whether intervals of one level hold, on sequences that weigh alike."""
+    """Coverage of one level's intervals, all sequences weighted equally."""
 
     level: float
     shares: dict[str, Interval]
-    """Frames whose force's `size`, `x`, `y` and `z` lie within: means over sequences with 95% BCa."""
+    """Share of frames with `size`, `x`, `y` or `z` of the force within: means with 95% BCa intervals."""
     values: dict[str, float]
     """`width_mn`: mean width of the interval of the force's size [mN]; `width_of_peak`: the same over the
-    sequence's largest force; `width_x_mn` and its like. `unseen`: share of moving frames that are further
-    from what was fitted than 99% of held-out frames; `distance`: median of theirs, as a multiple of that."""
+    sequence's largest force; `width_x_mn`, `_y_` and `_z_`: of the components. `out_of_distribution`: share
+    of moving frames further from the training data than 99% of held-out frames; `distance`: median distance
+    of moving frames, as a multiple of that."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
         ends = {name: {"mean": s.mean, "low": s.low, "high": s.high} for name, s in self.shares.items()}
-        known = {name: _known(one) for name, one in ends.items()}
-        return {"level": self.level, **known, **_known(self.values)}
+        known = {name: null_if_nan(one) for name, one in ends.items()}
+        return {"level": self.level, **known, **null_if_nan(self.values)}
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
-    """Compares a model's intervals, at every level, with sequences of known truth.
-
-    Raises UserError if it has none.
-    """
+    """Coverage of a model's intervals at every level. Raises UserError if it has none."""
     found = predictor.card.intervals
     if found is None:
         raise UserError("the model has no intervals; `learn calibrate` fits them")
@@ -50,28 +48,24 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
     far = [np.zeros(0)]
     for clip in clips:
         predicted = predict_clip(predictor, clip, source)
-        for level, held in rows.items():
-            held.append(_held(found, predicted, clip, level))
-        far.append(found.world.relative_distance(predicted.motion)[is_moving(predicted.motion)])
+        for level, own in rows.items():
+            own.append(_cover_clip(found, predicted, clip, level))
+        far.append(found.distribution.relative_distance(predicted.motion)[is_moving(predicted.motion)])
     moved = np.concatenate(far)
     nan, out = float("nan"), []
-    for level, held in rows.items():
+    for level, own in rows.items():
         rng = np.random.default_rng(0)
-        columns = {name: np.array([row[name] for row in held]) for name in held[0]}
+        columns = {name: np.array([row[name] for row in own]) for name in own[0]}
         shares = {name: interval(columns.pop(name), rng) for name in ("size", *"xyz")}
         values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else nan for k, v in columns.items()}
-        values["unseen"] = float((moved > 1).mean()) if len(moved) else nan
+        values["out_of_distribution"] = float((moved > 1).mean()) if len(moved) else nan
         values["distance"] = float(np.median(moved)) if len(moved) else nan
         out.append(Coverage(level, shares, values))
     return out
 
 
-def _known(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
-
-
-def _held(found: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:
-    """One sequence's shares of frames held, and widths, by the names of `Coverage`."""
+def _cover_clip(found: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:
+    """One sequence's coverages and widths, by the names of `Coverage`."""
     band, young = found.bound(predicted, level), clip.young_kpa
     force = clip.force / young
     size = np.linalg.norm(force, axis=1)

@@ -1,11 +1,10 @@
-"""How right a model is on sequences it has never seen: in mN, sequence by sequence, for three states of E."""
+"""Scores of a model by sequence, in mN, for E known, wrong by a factor of two, and unknown."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,38 +14,36 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments
-from learn.evaluation.statistics import Interval, Paired, interval, paired, pooled_r2
+from learn.evaluation.statistics import Interval, Paired, interval, null_if_nan, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
-GHOST_MN = 5.0
-"""A false positive is where a contact-sized patch would seem to carry more than this [mN]."""
+FALSE_POSITIVE_MN = 5.0
+"""A contact-free cell is a false positive if a patch of `PATCH_MM2` at its density would carry more [mN]."""
 PATCH_MM2 = math.pi * 4.0**2
-"""Area of that patch: a contact of the jobs' mean radius, 4 mm."""
+"""Area of a contact of the jobs' mean radius, 4 mm."""
 FREE = 0.01
-"""Contact-free is where the true density is under this share of the training data's 99.9th percentile."""
+"""A cell is contact-free if its true density is under this share of the training data's 99.9th percentile."""
 RIM_MM = 2.0
-"""Width of the rim around a contact that `ghost_far` leaves out."""
+"""Width of the rim around a contact that `false_positive_far` leaves out."""
 LOW = 0.05
-"""A frame is of low force, and a prediction above it a relative false positive, at this share."""
+"""Share of the training data's 99.9th percentile: low-force frames are under it, relative false positives
+above."""
 YOUNG = ("known", "half", "double", "unknown")
-"""Columns: E as it is, taken ×½, taken ×2, and not known at all (the training data's typical value)."""
+"""Columns: the true E, half and twice of it, and the training data's typical E."""
 
 
 @dataclass(frozen=True)
 class ClipScore:
-    """One sequence's numbers. Forces in mN, densities in mN/mm² (intensity in mN)."""
+    """Scores of one sequence. Forces in mN, densities in mN/mm² (intensity in mN)."""
 
     name: str
     young_kpa: float
-    map: NDArray[np.floating]
-    """(7,) `moments` over tissue cells of all frames, of the density's length."""
-    true_mn: NDArray[np.float64]
-    """(T,) size of the total force; for a map of lengths the sum of lengths (`learn.data.clips.amount`)."""
+    map: NDArray[np.floating]  # (7,) `moments` of the density's length, over tissue cells of all frames
+    true_mn: NDArray[np.float64]  # (T,) size of the total force; of a map of lengths see `amount`
     predicted_mn: NDArray[np.float64]
-    others: dict[str, float]
-    """Further scores by key of `METRICS`."""
+    others: dict[str, float]  # further scores by key of `METRICS`
 
     def as_row(self) -> dict[str, float]:
         """All scores by key of `METRICS`."""
@@ -81,10 +78,10 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
         others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
     others |= {
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
-        "ghost": false_positive_share(patch, free, GHOST_MN),
-        "ghost_relative": false_positive_share(size, free, LOW * unit),
-        "ghost_far": false_positive_share(size, inside & _away(contact, grid), LOW * unit),
-        "stray_mn": float((size * free).sum((1, 2)).mean() * cell),
+        "false_positive": false_positive_share(patch, free, FALSE_POSITIVE_MN),
+        "false_positive_relative": false_positive_share(size, free, LOW * unit),
+        "false_positive_far": false_positive_share(size, inside & _off_contact(contact, grid), LOW * unit),
+        "off_target_mn": float((size * free).sum((1, 2)).mean() * cell),
         "localisation_mm": float(np.median(off)) if off else math.nan,
         "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
     }
@@ -92,8 +89,8 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
     return ClipScore(clip.name, young, agreed, true_mn, predicted_mn, others)
 
 
-def _away(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
-    """(T, N, N) beyond `RIM_MM` of any contact in the same frame."""
+def _off_contact(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
+    """(T, N, N) cells further than `RIM_MM` from any contact in the same frame."""
     out = np.ones_like(contact)
     for t in np.flatnonzero(contact.any((1, 2))):
         out[t] = ndimage.distance_transform_edt(~contact[t]) * grid.pitch_mm > RIM_MM
@@ -102,7 +99,7 @@ def _away(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """A model's scores over sequences, once for every state of knowledge of E."""
+    """A model's scores by sequence, in the columns of `YOUNG`."""
 
     columns: dict[str, list[ClipScore]]
     card: ModelCard
@@ -113,13 +110,11 @@ class EvaluationReport:
         return self.columns["known"]
 
     def per_clip(self, young: str = "known") -> list[dict[str, float]]:
-        """One row a sequence, plain numbers."""
-        if young not in self.columns:
-            raise UserError(f"unknown E column {young!r}: one of {', '.join(self.columns)}")
+        """Scores of each sequence in one E column."""
         return [c.as_row() for c in self.columns[young]]
 
     def summary(self, young: str = "known") -> dict[str, float]:
-        """Mean over sequences of every per-sequence number, and pooled R² (`*_pooled`), in one E column."""
+        """Means over sequences of every score, and pooled R² (`*_pooled`), in one E column."""
         rows, clips = self.per_clip(young), self.columns[young]
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
         out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0)).r2
@@ -130,7 +125,7 @@ class EvaluationReport:
         return out
 
     def intervals(self) -> dict[str, Interval]:
-        """Mean and BCa interval over sequences of every per-sequence number, and of the pooled R²."""
+        """Mean and BCa interval over sequences of every score, and of the pooled R²."""
         rows, rng = self.per_clip(), np.random.default_rng(0)
         out = {k: interval(np.array([r[k] for r in rows]), rng) for k in rows[0]}
         forces = [moments(c.true_mn, c.predicted_mn) for c in self.clips]
@@ -142,10 +137,12 @@ class EvaluationReport:
         """JSON-ready; NaN as null."""
         return {
             "sequences": [
-                {"name": c.name, "young_kpa": c.young_kpa} | _plain(c.as_row()) for c in self.clips
+                {"name": c.name, "young_kpa": c.young_kpa} | null_if_nan(c.as_row()) for c in self.clips
             ],
-            "columns": {young: _plain(self.summary(young)) for young in self.columns},
-            "intervals": {k: _plain({"low": i.low, "high": i.high}) for k, i in self.intervals().items()},
+            "columns": {young: null_if_nan(self.summary(young)) for young in self.columns},
+            "intervals": {
+                k: null_if_nan({"low": i.low, "high": i.high}) for k, i in self.intervals().items()
+            },
         }
 
 
@@ -154,17 +151,13 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(good)) if good else math.nan
 
 
-def _plain(row: dict[str, float]) -> dict[str, Any]:
-    return {k: v if math.isfinite(v) else None for k, v in row.items()}
-
-
 def evaluate(
     predictor: Predictor,
     clips: Sequence[Clip],
     source: str,
     report: ProgressCallback = lambda done, of: None,
 ) -> EvaluationReport:
-    """Scores a model on clips, with displacement from `source` (`ideal` or `recovered`)."""
+    """Scores a model on clips, with displacement from `source`, as in `learn.data.clips.FIELDS`."""
     if not clips:
         raise UserError("no sequence to evaluate on")
     columns: dict[str, list[ClipScore]] = {}
@@ -172,24 +165,24 @@ def evaluate(
         report(i, len(clips))
         if source not in clip.displacement:
             raise UserError(f"{clip.name}: holds no {source} flow")
-        taken = {"known": 1.0, "half": 0.5, "double": 2.0}
-        young = {name: clip.young_kpa * factor for name, factor in taken.items()}
-        young["unknown"] = predictor.card.typical_young_kpa
-        # The prediction is proportional to E: one pass does for all.
+        known = clip.young_kpa
+        young = dict(
+            zip(YOUNG, (known, known * 0.5, known * 2.0, predictor.card.typical_young_kpa), strict=True)
+        )
+        # The prediction is proportional to E: one pass serves all columns.
         shift = np.asarray(clip.displacement[source])
-        per_kpa = predictor.density(shift, clip.mask, 1.0, clip.sure(source))
-        for name, given in young.items():
-            columns.setdefault(name, []).append(score(clip, per_kpa * np.float32(given), predictor.card))
+        per_kpa = predictor.density(shift, clip.mask, 1.0, clip.confidence_of(source))
+        for name, assumed in young.items():
+            columns.setdefault(name, []).append(score(clip, per_kpa * np.float32(assumed), predictor.card))
     report(len(clips), len(clips))
     return EvaluationReport(columns, predictor.card)
 
 
 def compare(a: EvaluationReport, b: EvaluationReport) -> dict[str, Paired]:
-    """B against A on the same sequences, number by number; numbers that no sequence has from both are left
-    out."""
+    """Paired tests of B against A on the same sequences, for every score that both have."""
     rows, rng = (a.per_clip(), b.per_clip()), np.random.default_rng(0)
     if [c.name for c in a.clips] != [c.name for c in b.clips]:
-        raise UserError("paired test: the two models were not scored on the same sequences")
+        raise UserError("paired test: the two models were scored on different sequences")
     out = {}
     for key in rows[0][0]:
         one, two = (np.array([row.get(key, math.nan) for row in side]) for side in rows)

@@ -1,4 +1,4 @@
-"""A model's intervals fitted on sequences of known truth, and written into its card."""
+"""Fitting of a model's prediction intervals on sequences of known force, into its card."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from learn.checkpoint import ModelCard, write_card
-from learn.data.clips import Clip, scored
+from learn.data.clips import Clip, scored_source
 from learn.inference.predict import Predictor, length, net_force
 from learn.split import Split, find_obstacle, find_sides, find_unit, groups, regroup
 from learn.uncertainty.features import motion_features, motion_names
@@ -19,7 +19,7 @@ from synth.dataset.index import read_split
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
 
-_MOST_FITTED = 500  # sequences that the distance is measured from
+_MOST_FITTED = 500  # training sequences that the distribution of motion is fitted on
 
 
 def add_intervals(
@@ -30,18 +30,18 @@ def add_intervals(
     source: str | None = None,
     report: ProgressCallback = lambda done, of: None,
 ) -> ModelCard:
-    """Fits intervals and writes them, or why there are none, into the card of a model's folder; that card.
+    """Fits intervals and writes them, or why there are none, into a model's card, which is returned.
 
-    Whoever of `split.select` did not choose the epoch counts as kept for intervals from then on.
+    Sequences of `split.select` that did not choose the epoch count as used for intervals from then on.
 
     Args:
         folder: of the model.
         predictor: the model.
-        clips: sequences of known truth.
-        split: `fit`: what the network was fitted on, from which a frame's distance is measured; `select` and
-            `intervals`: what the error model and the factors are fitted on.
-        source: displacement that the intervals hold for; None: the one that the model is scored on.
-        report: told how many sequences are done, and how many there are.
+        clips: sequences of known force.
+        split: `fit`: training sequences, for the distribution of motion; `select`: for the error model;
+            `intervals`: for the factors.
+        source: displacement that the intervals are for; None: the one that the model is scored on.
+        report: receives the number of sequences done and in all.
 
     Raises:
         UserError: nothing moves in the sequences.
@@ -50,14 +50,14 @@ def add_intervals(
     fitted, selection, calibration = ([clips[i] for i in part] for part in parts)
     why, found = find_obstacle(selection, calibration), None
     if not why:
-        source = source or scored(predictor.card.settings.input)
+        source = source or scored_source(predictor.card.settings.input)
         found = _fit(predictor, fitted, selection, calibration, source, report)
     choosers = set(predictor.card.groups.get("select", ()))
     used = [*calibration, *(clip for clip in selection if calibration and clip.group not in choosers)]
     taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
     hashes, brains = (
-        {part: [one for one in names if one not in gone] for part, names in parts.items()}
-        for parts, gone in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
+        {part: [one for one in names if one not in moved] for part, names in parts.items()}
+        for parts, moved in zip((predictor.card.split, predictor.card.groups), taken, strict=True)
     )
     if used:
         hashes["intervals"] = [clip.content_hash for clip in used]
@@ -76,31 +76,24 @@ def fit_from_datasets(
     from_test: bool,
     report: ProgressCallback = lambda done, of: None,
 ) -> Intervals:
-    """Fits intervals of a trained model on the sequences of some datasets, into its card.
+    """Fits a trained model's intervals on all sequences `clips` of some `datasets`, into its card.
 
-    Args:
-        folder: of the model.
-        predictor: the model.
-        clips: all sequences of the datasets.
-        datasets: where they came from: the training data, and any that the model never met.
-        source: displacement that the intervals hold for.
-        from_test: whether half of the test's brains may be taken.
-        report: told how many sequences are done, and how many there are.
+    Args as of `add_intervals`, and:
+        datasets: the training data, and any with sequences that are new to the model.
+        from_test: whether to use half of the test brains.
 
     Raises:
-        UserError: none of the sequences was fitted, or there are too few of others.
+        UserError: no training sequence among them, or too few others.
     """
     clips = regroup(clips, find_unit(predictor.card))
     marked = [read_split(one, required=False).sides.items() for one in datasets]
     tests = [name for part in marked for name, side in part if side == "test"]
     split = find_sides(clips, predictor.card, tests, from_test)
     if not split.fit:
-        raise UserError(
-            f"{datasets[0]}: holds no sequence that {folder} was fitted on; name its training data"
-        )
+        raise UserError(f"{datasets[0]}: holds no training sequence of {folder}; add its training dataset")
     why = find_obstacle([clips[i] for i in split.select], [clips[i] for i in split.intervals])
     if why:
-        hint = "" if from_test else "; name a dataset that it never met, or say --from-test"
+        hint = "" if from_test else "; add a dataset that is new to it, or use --from-test"
         raise UserError(f"{folder}: {why}{hint}")
     found = add_intervals(folder, predictor, clips, split, source, report).intervals
     assert found is not None
@@ -115,7 +108,6 @@ def _fit(
     source: str,
     report: ProgressCallback,
 ) -> Intervals:
-    """Intervals from the parts of `add_intervals`' split."""
     card = predictor.card
     unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
     brains, examples = [0] * len(selection) + groups(calibration), []
@@ -126,27 +118,29 @@ def _fit(
     report(len(brains), len(brains))
     some = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
     motion = [
-        motion_features(np.asarray(c.displacement[source]), c.mask, c.sure(source), card.settings.extent_mm)
+        motion_features(
+            np.asarray(c.displacement[source]), c.mask, c.confidence_of(source), card.settings.extent_mm
+        )
         for c in some
     ]
     first, second = examples[: len(selection)], examples[len(selection) :]
-    world = fit_distribution(motion, [one.motion for one in first])
-    if world is None:
+    distribution = fit_distribution(motion, [one.motion for one in first])
+    if distribution is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
-    # No error says how far a recording is: all that were not fitted count.
-    world = world.calibrated([one.motion for one in examples])
-    return fit(first, second, world, motion_names(card.settings.arch.depth), unit, source)
+    # A recording's distance doesn't depend on errors: all sequences but the training ones count.
+    distribution = distribution.calibrated([one.motion for one in examples])
+    return fit(first, second, distribution, motion_names(card.settings.arch.depth), unit, source)
 
 
 def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
-    """A sequence's forces per unit stiffness; no motion is no force, as to `ForceEstimator`."""
+    """A sequence's forces per unit stiffness, the estimate at rest subtracted as in `ForceEstimator`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
-    sure, young = clip.sure(source), clip.young_kpa
+    confidence, young = clip.confidence_of(source), clip.young_kpa
     kind = predictor.card.settings.target
-    density = predictor.density(shift, mask, young, sure)
+    density = predictor.density(shift, mask, young, confidence)
     at_rest = predictor.density(np.zeros_like(shift[:1]), mask, young)
     return Prediction(
-        motion=motion_features(shift, mask, sure, grid.extent_mm),
+        motion=motion_features(shift, mask, confidence, grid.extent_mm),
         force=net_force(density, at_rest, kind, grid) / young,
         magnitude=length(density) / np.float32(young),
         pitch_mm=grid.pitch_mm,

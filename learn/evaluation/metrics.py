@@ -1,4 +1,4 @@
-"""How right a force is: what each number is, and pure functions on arrays, in the arrays' own unit."""
+"""Definitions of the scores, and pure functions on arrays, in the arrays' own unit."""
 
 from __future__ import annotations
 
@@ -13,31 +13,25 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Metric:
-    """One score: what it is called and how it is shown, wherever it is shown."""
+    """Name, unit and format of one score."""
 
     name: str
-    unit: str = ""
-    """As shown: ms and % are made of s and shares; empty for a number."""
+    unit: str = ""  # as displayed: ms and % are converted from s and shares; empty if dimensionless
     about: str = ""
-    best: Literal["low", "high", "zero", "one", ""] = ""
-    """Which value is the best; empty for what is no merit."""
-    digits: int = 3
-    """How many digits are shown."""
-    relative: bool = False
-    """Whether a constant factor on the prediction leaves it as it is, or it speaks of the truth alone."""
-    column: str = ""
-    """Heading in a narrow table; empty: not there."""
-    listed: bool = True
-    """Whether `learn eval` lists it; its JSON holds it in any case."""
+    best: Literal["low", "high", "zero", "one", ""] = ""  # the best value; empty if there is none
+    digits: int = 3  # significant digits displayed
+    relative: bool = False  # whether a constant factor on the prediction doesn't change it
+    column: str = ""  # heading in a narrow table; empty: not listed there
+    listed: bool = True  # whether `learn eval --all` lists it; its JSON has it in any case
 
     @property
     def cell_unit(self) -> str:
-        """What is written behind each number under a heading."""
+        """The unit displayed after each number instead of in the heading."""
         return self.unit if self.unit in ("%", "ms") else ""
 
     @property
     def heading(self) -> str:
-        """The name, with its unit if the numbers are shown without."""
+        """The name, with the unit unless that is displayed after each number."""
         return f"{self.name} [{self.unit}]" if self.unit and not self.cell_unit else self.name
 
 
@@ -60,37 +54,37 @@ METRICS = {
     "map_r": Metric("force map: correlation", about="Pearson's r over tissue cells."),
     "map_ccc": Metric("force map: concordance", about="Lin's concordance over cells.", listed=False),
     "vector_r2": Metric("force map: R² of components", about="1 − SSE/SST of x, y and z."),
-    "ghost": Metric(
+    "false_positive": Metric(
         "false positives: contact-free area above 5 mN",
         about="Share of it where a contact-sized patch would carry more.",
     ),
-    "ghost_relative": Metric(
+    "false_positive_relative": Metric(
         "false positives: contact-free area above 5% of scale",
         about="Share of it; the scale is the training data's 99.9th percentile.",
-        column="ghost area",
+        column="false-positive area",
     ),
-    "ghost_far": Metric(
+    "false_positive_far": Metric(
         "false positives: the same beyond 2 mm of a contact",
-        about="Without the rim, where a contact found a cell aside shows up too.",
-        column="ghost area beyond 2 mm",
+        about="Leaves out the rim, where a contact that is estimated one cell off counts too.",
+        column="false-positive area beyond 2 mm",
     ),
-    "stray_mn": Metric(
-        "background force: on contact-free area", "mN", "Mean over frames.", column="force off contact [mN]"
+    "off_target_mn": Metric(
+        "off-target force: on contact-free area", "mN", "Mean over frames.", column="off-target force [mN]"
     ),
     "low_over_mn": Metric(
         "over-prediction in low-force frames", "mN", "Of the total force.", column="over in low frames [mN]"
     ),
     "localisation_mm": Metric(
-        "contact centre: median error", "mm", "Over frames that aren't low.", column="contact centre [mm]"
+        "contact centre: median error", "mm", "Over frames above low force.", column="contact centre [mm]"
     ),
     "calibration_slope": Metric("calibration: slope of truth on prediction", about="By least squares."),
     "calibration_offset_mn": Metric("calibration: offset of truth on prediction", "mN", listed=False),
 }
-"""By key of `learn eval --json`: the only place that says what a score is."""
+"""Every score by its key in `learn eval --json`."""
 
 
 def moments(true: Floats, predicted: Floats) -> Floats:
-    """Sums over pairs (true, predicted), from which every agreement metric follows; those of parts add up.
+    """Sums over pairs (true, predicted), of which every agreement score is a function; sums of parts add up.
 
     Returns: (7,) count and sums of t, p, t², p², tp and |p − t|.
     """
@@ -100,9 +94,8 @@ def moments(true: Floats, predicted: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Agreement:
-    """R² = 1 − SSE/SST about the truth's mean, so bias and gain errors count; errors in the unit of the data;
-    r (Pearson); CCC (Lin, "A concordance correlation coefficient to evaluate reproducibility", Biometrics
-    1989)."""
+    """R² = 1 − SSE/SST about the truth's mean; errors in the unit of the data; Pearson's r; CCC of Lin,
+    "A concordance correlation coefficient to evaluate reproducibility", Biometrics 1989."""
 
     r2: float
     mae: float
@@ -113,7 +106,7 @@ class Agreement:
 
 
 def agreement(moments: Floats) -> Agreement:
-    """Agreement from moments (7,). R², r and CCC are NaN where the truth (for r the answer) is constant."""
+    """Agreement from moments (7,). R², r and CCC are NaN for constant truth, r for a constant prediction."""
     return Agreement(**{name: float(value) for name, value in agreements(moments).items()})
 
 
@@ -137,18 +130,12 @@ def agreements(moments: Floats) -> dict[str, NDArray[np.float64]]:
 
 
 def false_positive_share(predicted: Floats, free: NDArray[np.bool_], threshold: float) -> float:
-    """Share of the contact-free cells in which the prediction is above `threshold`; NaN if none is free.
-
-    `predicted`, `free`: (T, N, N); `threshold` in the unit of `predicted`.
-    """
+    """Share of the cells `free` with a prediction above `threshold`, in its unit; NaN if there are none."""
     return float((predicted[free] > threshold).mean()) if free.any() else float("nan")
 
 
 def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
-    """Centre (x, y) of what is above half the peak, weighted by force; mm on the grid. NaN for no force.
-
-    `map_`: (N, N) ≥ 0.
-    """
+    """Centroid (x, y) [mm on the grid] of a map (N, N) ≥ 0 above half its peak; NaN without force."""
     peak = float(map_.max(initial=0.0))
     if peak <= 0:
         return np.full(2, np.nan)
@@ -159,7 +146,7 @@ def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
 
 
 def line(x: Floats, y: Floats) -> tuple[float, float]:
-    """Slope and intercept of `y` on `x` by least squares; of truth on prediction (1, 0) is calibrated."""
+    """Slope and intercept of `y` on `x` by least squares; NaN for constant `x`."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if len(x) == 0 or np.ptp(x) == 0:
         return float("nan"), float("nan")

@@ -1,13 +1,14 @@
-"""How sure a mean over sequences is, and whether two models differ. The sequence is the unit, not the frame.
+"""Confidence intervals of means over sequences, and paired tests of two models.
 
-Frames of one sequence show one contact on one tissue; counting them as independent would make any interval
-ten times too narrow.
+The sequence is the unit: its frames share one contact and one tissue, and counted as independent they would
+make intervals ten times too narrow.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,9 +22,14 @@ from synth.errors import UserError
 Floats = NDArray[np.float64]
 
 LEAST_GROUPS = 5
-"""Of fewer, a 95% interval is little more than the two that are furthest apart."""
+"""Of fewer specimens a 95% interval would hardly exceed the range of their means."""
 _DRAWS = 4000
 _SIGNS = 10_000
+
+
+def null_if_nan(values: Mapping[str, float]) -> dict[str, float | None]:
+    """Numbers as JSON can store them: None for NaN and infinity."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -37,19 +43,19 @@ class Interval:
 
 
 def interval(values: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
-    """Mean and BCa bootstrap interval over sequences (Efron 1987). NaNs are sequences without a value.
+    """Mean and BCa bootstrap interval over sequences (Efron 1987); sequences with NaN are left out.
 
-    `values`: (n,), any unit. With fewer than three values, or none that differ, there is no interval (NaN).
+    `values`: (n,), any unit. The interval is NaN with fewer than three values, or if all are equal.
     """
     v = np.asarray(values, np.float64)
     return _bootstrap(np.mean, (v[np.isfinite(v)],), rng, draws)
 
 
 def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
-    """R² over everything that the sequences hold together, and its BCa interval over sequences.
+    """R² over the pooled values of all sequences, and its BCa interval over sequences.
 
-    `moments`: (n, 7), `learn.evaluation.metrics.moments` of each sequence. With fewer than three sequences
-    there is no interval (NaN).
+    `moments`: (n, 7), `learn.evaluation.metrics.moments` of each sequence. The interval is NaN with fewer
+    than three sequences.
     """
 
     def r2(*sums: Floats, axis: int) -> Floats:
@@ -59,15 +65,10 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
 
 
 def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
-    """Mean over recordings and its percentile interval, whole groups (specimens) being resampled.
+    """Mean over recordings and its percentile interval; whole groups (specimens) are resampled.
 
-    Args:
-        values: one a recording; NaN are left out.
-        groups: the specimen of each.
-        rng: source of the resamples.
-
-    Returns:
-        The mean; its interval is NaN of fewer than `LEAST_GROUPS`.
+    `values`: one per recording, NaN is left out; `groups`: the specimen of each. The interval is NaN with
+    fewer than `LEAST_GROUPS`.
     """
     v = np.asarray(values, np.float64)
     known = np.isfinite(v)
@@ -88,13 +89,13 @@ def _bootstrap(
     method: Literal["BCa", "percentile"] = "BCa",
     least: int = 3,
 ) -> Interval:
-    """A statistic of (n,) columns, and its interval, their rows being resampled together."""
+    """A statistic of (n,) columns and its interval; rows are resampled together."""
     low = high = float("nan")
     n = len(data[0])
     value = float(statistic(*data, axis=-1)) if n else low
     if n >= least and np.isfinite(value):
         with warnings.catch_warnings(), np.errstate(invalid="ignore"):
-            warnings.simplefilter("ignore", stats.DegenerateDataWarning)  # all are alike: NaN
+            warnings.simplefilter("ignore", stats.DegenerateDataWarning)  # equal values: NaN
             found = stats.bootstrap(
                 data, statistic, paired=True, vectorized=True, n_resamples=draws, method=method, rng=rng
             ).confidence_interval
@@ -106,19 +107,16 @@ def _bootstrap(
 class Paired:
     """Model B against model A on the same sequences."""
 
-    difference: Interval
-    """B − A, mean over sequences."""
-    p: float
-    """Two-sided, sign-flip permutation test of the mean difference."""
-    wins: float
-    """Share of sequences on which B's value is the larger; ties count half."""
+    difference: Interval  # B − A, mean over sequences
+    p: float  # two-sided, sign-flip permutation test of the mean difference
+    wins: float  # share of sequences on which B's value is the larger; ties count half
 
 
 def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
     """Compares two models, sequence by sequence. `a`, `b`: (n,) in the same order.
 
-    Exact (all sign patterns) up to 13 sequences, by random patterns above. Raises UserError for lengths that
-    differ or no common sequence.
+    The test is exact up to 13 sequences and uses random sign patterns above. Raises UserError if lengths
+    differ or no sequence has both values.
     """
     if len(a) != len(b):
         raise UserError(f"paired test: {len(a)} against {len(b)} sequences")
@@ -126,7 +124,7 @@ def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
     d = d[np.isfinite(d)]
     if d.size == 0:
         raise UserError("paired test: no sequence has a value from both models")
-    p = 1.0  # of a single sequence, which both signs make as extreme
+    p = 1.0  # of a single sequence: both sign patterns are equally extreme
     if d.size > 1:
         p = stats.permutation_test(
             (d,), np.mean, permutation_type="samples", vectorized=True, n_resamples=_SIGNS, rng=rng

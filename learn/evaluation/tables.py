@@ -13,12 +13,11 @@ from learn.evaluation.evaluate import YOUNG, EvaluationReport
 from learn.evaluation.metrics import METRICS, Metric
 from learn.evaluation.statistics import Paired
 
-FIRST = ("force_mae", "force_r2_pooled", "peak_error_share", "map_r2_pooled")
-"""What `learn eval` prints without --all."""
+FIRST = ("force_mae", "force_r2_pooled", "peak_error_share", "map_r2_pooled")  # printed without --all
 
 
 def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
-    """Means over sequences; `all`: not only `FIRST`, and a column for each state of knowledge of E."""
+    """Means over sequences; `all`: every score, in every column of `YOUNG`."""
     heads = ("E known [95%]", "E × ½", "E × 2", "E unknown")[: 4 if all else 1]
     table = _open_table(title, *heads)
     columns, sure = [report.summary(y) for y in YOUNG[: len(heads)]], report.intervals()
@@ -33,14 +32,16 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
 
 
 def coverage_table(covered: Sequence[Coverage]) -> Table:
-    """Whether the model's intervals hold, and how wide they are."""
+    """Coverage and width of the model's intervals."""
     table = _open_table("intervals", *(f"{one.level:.0%}" for one in covered))
     for name, key in (("force", "size"), ("x", "x"), ("y", "y"), ("z", "z")):
         shares = [one.shares[key] for one in covered]
         table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
     table.add_row("width of the force's [mN]", *(f"{one.values['width_mn']:.3g}" for one in covered))
     table.add_row("the same over the peak", *(f"{one.values['width_of_peak']:.0%}" for one in covered))
-    table.add_row("moving frames out of distribution", *(f"{one.values['unseen']:.0%}" for one in covered))
+    table.add_row(
+        "moving frames out of distribution", *(f"{one.values['out_of_distribution']:.0%}" for one in covered)
+    )
     return table
 
 
@@ -56,7 +57,7 @@ def paired_table(pairs: Mapping[str, Paired], title: str, card: ModelCard, all: 
 
 
 def _open_table(title: str, *heads: str) -> Table:
-    """A table that keeps its numbers whole in eighty columns: labels wrap, there are no upright lines."""
+    """A table that fits eighty columns without breaking numbers: labels wrap, no vertical lines."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("", overflow="fold")
     for head in heads:
@@ -65,7 +66,6 @@ def _open_table(title: str, *heads: str) -> Table:
 
 
 def _label(metric: Metric, card: ModelCard) -> str:
-    """A score's heading, in the unit of the model's map."""
     return metric.heading.replace("mN/mm²", "mN") if card.settings.target == "intensity" else metric.heading
 
 

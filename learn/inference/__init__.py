@@ -1,1 +1,1 @@
-"""A trained model applied: to stores, videos, arrays, other programs."""
+"""A trained model applied to stores, videos and arrays, and exported to other programs."""

@@ -1,4 +1,4 @@
-"""From a film's motion to its forces, and from one press of known force to the tissue's stiffness."""
+"""Forces of a video from its motion, and the tissue's stiffness from a press of known force."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ def apply(
     young_kpa: float | None = None,
     membrane: MembraneState = "unknown",
 ) -> dict[str, Any]:
-    """Force of every frame of a film, ready for np.savez; what is done to it is `ForceEstimator`'s.
+    """Force of every frame of a video, by `ForceEstimator`.
 
-    `young_kpa` overrides the film's own, but not where the scale is unknown; `membrane` is what is known of
-    the tissue's. Returns fields of
-    `prediction_file.FIELDS`, those that the film and the model have. Mask and centre are the last frame's;
-    they change only where the tissue is wider than the grid.
+    `young_kpa` overrides the motion's own, unless the scale is unknown. Returns those of
+    `prediction_file.FIELDS` that the video and the model have. Mask and centre are the last frame's; they
+    change only where the tissue is wider than the grid.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     if not motion.scale_known:
@@ -50,7 +49,7 @@ def apply(
     trusted = np.array(followed) & (not fault)
     force = np.where(trusted[:, None], [one.force_mn for one in found], np.nan)
     last = found[-1].map
-    # A picture begins half a pixel before its first pixel, whatever its pixels' size.
+    # Pixel coordinates are of pixel centres: a picture begins at -0.5.
     centres = motion.shrink * (np.array([one.map.view.resample.centre_px for one in found]) + 0.5) - 0.5
     out: dict[str, Any] = {
         "density": np.stack([one.map.density for one in found]),
@@ -82,7 +81,7 @@ def apply(
 
 
 def _ends(found: Sequence[FrameForce], trusted: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
-    """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where `trusted` (T,) is False; none of none."""
+    """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where not `trusted` (T,)."""
     if not found[0].bands:
         return {}
     wide, narrow = ([one.bands[level] for one in found] for level in LEVELS)
@@ -100,13 +99,13 @@ def _ends(found: Sequence[FrameForce], trusted: NDArray[np.bool_]) -> dict[str, 
 
 
 def calibrate(predictor: Predictor, press: Motion) -> float:
-    """Young's modulus [kPa] from a film of one press whose force is known. Raises UserError if it isn't."""
+    """Young's modulus [kPa] from one press. Raises UserError if its force is not known."""
     if press.force_mn is None:
-        raise UserError(f"{press.name}: holds no force to calibrate on (force_mn in an .npz)")
+        raise UserError(f"{press.name}: needs a known force (force_mn in an .npz)")
     view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
     inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in press.frames]
-    sure = [confidence for _, confidence in inputs if confidence is not None]
-    displacement, confidence = np.stack([shift for shift, _ in inputs]), np.stack(sure) if sure else None
+    known = [confidence for _, confidence in inputs if confidence is not None]
+    displacement, confidence = np.stack([shift for shift, _ in inputs]), np.stack(known) if known else None
     return stiffness(predictor, displacement, view.mask, press.force_mn, confidence)
 
 
@@ -117,20 +116,20 @@ def stiffness(
     force_mn: NDArray[np.float64],
     confidence: NDArray[np.float32] | None = None,
 ) -> float:
-    """Young's modulus [kPa] that makes the prediction of a press fit its force best, in the least squares.
+    """Young's modulus [kPa] by a least-squares fit of the prediction to the known force of a press.
 
-    The network's prediction per unit stiffness times E is the force, so one press with a known force (a
-    weight, a sensor on the tool) gives the E that video can't know, for the rest of the recording.
+    Force is the network's prediction per unit stiffness times E, so one press with a known force (a weight, a
+    sensor on the tool) gives E for the rest of the recording.
 
     Args:
         predictor: the model.
-        displacement: (T, 2, N, N) mm on the model's grid, of a model of two eyes (T, 3, N, N).
+        displacement: (T, 2, N, N) mm on the model's grid, for a stereo model (T, 3, N, N).
         mask: (N, N) tissue.
         force_mn: (T,) size of the known force.
         confidence: as of `Predictor.density`.
 
     Raises:
-        UserError: the lengths differ, or there is no force or no prediction to fit.
+        UserError: the lengths differ, or force or prediction are zero.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")
@@ -140,5 +139,5 @@ def stiffness(
     size = force_size(net_force(density, at_rest, predictor.card.settings.target, predictor.grid))
     fit = float(size @ force_mn), float(size @ size)
     if not (np.isfinite(fit).all() and min(fit) > 0):
-        raise UserError("calibration press: no force was given, or the model sees none in the motion")
+        raise UserError("calibration press: the known force or the model's estimate of it is zero")
     return young * fit[0] / fit[1]

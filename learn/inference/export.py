@@ -1,11 +1,10 @@
-"""A trained model as one ONNX file for other programs, channels and scales inside.
+"""A trained model as one ONNX file for other programs, which computes the input channels itself.
 
-The file's input is displacement in mm on the grid, not the channels, so that nobody has to rebuild them:
-`displacement` (B, 2, N, N) mm and `mask` (B, 1, N, N) 0/1; for some models `confidence` (B, 1, N, N) 0..1.
-For stereo: `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N). For some models `membrane` (B,): -1
-stripped, 0 unknown, 1 intact. Its output is force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa].
-Times E in kPa it is mN/mm², times the cell's area and summed, mN. How a picture's flow comes onto the grid is
-written into the .json next to it.
+Inputs: `displacement` (B, 2, N, N) mm on the grid and `mask` (B, 1, N, N) 0/1; for some models `confidence`
+(B, 1, N, N) 0..1. For stereo: `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N). For some models
+`membrane` (B,): -1 stripped, 0 unknown, 1 intact. Output: force density per unit stiffness (B, C, N, N)
+[mN/mm² at 1 kPa]; times E in kPa it is mN/mm², times the cell's area and summed, mN. The .json next to it
+describes how a picture's flow is resampled to the grid.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ TOLERANCE = 1e-4
 
 
 class Portable(nn.Module):
-    """From displacement to force density per unit stiffness, in one module."""
+    """The channels, the network and its scale in one module."""
 
     def __init__(self, model: nn.Module, card: ModelCard) -> None:
         super().__init__()
@@ -45,13 +44,13 @@ class Portable(nn.Module):
 
 
 def input_names(card: ModelCard) -> list[str]:
-    """The file's inputs, in order."""
+    """Names of the file's inputs, in order."""
     arch = card.settings.arch
     return ["displacement", "mask", *["confidence"] * arch.confidence, *["membrane"] * arch.membrane]
 
 
 def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
-    """Inputs of the right shapes and sizes, drawn from a seed: smooth motion over a round mask."""
+    """Random inputs of realistic size: smooth motion over a round mask."""
     n = card.settings.size
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
@@ -71,10 +70,11 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
 
 @torch.no_grad()
 def export(predictor: Predictor, file: Path) -> float:
-    """Writes `file` as ONNX and a description `file`.json, reads it back, and compares it with PyTorch.
+    """Writes `file` as ONNX and a description `file`.json, and compares its output with PyTorch's.
 
-    Returns the largest difference in units of the 99.9th percentile, or of the largest output where that is
-    more. Raises UserError if it is above 1e-4 (the file is removed), or if ONNX's packages are not installed.
+    Returns the largest difference, in units of the 99.9th percentile or of the largest output if that is
+    more. Raises UserError if it is above `TOLERANCE` (the file is removed), or if ONNX's packages are not
+    installed.
     """
     card = predictor.card
     module = Portable(predictor.model.cpu(), card).eval()
@@ -94,14 +94,14 @@ def export(predictor: Predictor, file: Path) -> float:
 
 
 def describe(card: ModelCard, difference: float) -> dict[str, Any]:
-    """Everything that a program needs to use the file."""
+    """Contents of the .json: shapes, units and preprocessing."""
     grid, arch = card.settings.grid, card.settings.arch
     output = f"{card.settings.target} per unit stiffness, one component"
     if arch.components == 3:
         output = "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
     inputs = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]
     if arch.depth:
-        inputs = ["displacement [mm] is motion in camera axes, x right, y down, z away, as stereo gives it"]
+        inputs = ["displacement [mm] is stereo motion in camera axes, x right, y down, z away"]
     if arch.depth and arch.confidence:
         inputs.append(
             "confidence, across and along the view: means over tissue of 1 / (1 + (s / s0)^2), "
@@ -132,7 +132,7 @@ def describe(card: ModelCard, difference: float) -> dict[str, Any]:
 def _write(
     module: nn.Module, inputs: list[Tensor], names: list[str], file: Path
 ) -> Callable[[list[Tensor]], Tensor]:
-    """Writes `file`, for batches of any size; what runs it."""
+    """Writes `file`, for batches of any size, and returns a function that runs it."""
     try:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")

@@ -1,4 +1,4 @@
-"""A network's force of each frame of a video, for `learn predict` and bench: tare, unknown E, intervals."""
+"""A network's force estimates for the frames of a video: rest frame subtracted, unknown E, intervals."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ def predict_force(
     confidence: Iterable[NDArray[np.float32]] | None = None,
     membrane: MembraneState = "unknown",
 ) -> NDArray[np.float64]:
-    """The force curve of one video: (T, 3) mN on the tissue, camera axes; that of the rest frame subtracted.
+    """Force of each frame of one video, (T, 3) mN on the tissue, camera axes; the rest frame's is subtracted.
 
-    Of a model without direction the size is in x and the rest NaN.
+    A model without direction returns the size in x, and NaN in y and z.
 
     Args:
-        model: of `load_model`.
+        model: from `load_model`.
         flow: T times (H, W, 2) px, motion from the rest frame at the rest frame's pixels.
         tissue: (H, W), in the rest frame.
         scale_mm_per_px: of the picture.
         young_kpa: of the tissue; None: forces are those of tissue of 1 kPa.
         confidence: T times (H, W) in 0..1, for a model that uses it.
-        membrane: whether the tissue has its membrane (pia), for a model that asks.
+        membrane: state of the membrane (pia), for a model with that input.
 
     Raises:
-        UserError: shapes that don't fit, values that aren't finite, or a stereo model.
+        UserError: shapes that don't match, values that aren't finite, or a stereo model.
     """
     if not isinstance(model, Predictor):
-        raise UserError(f"model: expected what `load_model` gives, got {type(model).__name__}")
+        raise UserError(f"model: expected what `load_model` returns, got {type(model).__name__}")
     if len(size := np.shape(tissue)) != 2:
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0
@@ -60,16 +60,16 @@ def predict_force(
         known = _each("confidence", confidence, size, (0.0, 1.0))
     found = list[NDArray[np.float64]]()
     for moved in _each("flow", flow, (*size, 2)):
-        if (sure := next(known, None)) is None:
-            raise UserError(f"confidence: of {len(found)} frames, flow has more")
-        found.append(estimator.estimate(FrameMotion(moved, sure)).force_mn)
+        if (weight := next(known, None)) is None:
+            raise UserError(f"confidence: has {len(found)} frames, flow has more")
+        found.append(estimator.estimate(FrameMotion(moved, weight)).force_mn)
     if confidence is not None and next(known, None) is not None:
-        raise UserError(f"confidence: of more frames than flow's {len(found)}")
+        raise UserError(f"confidence: has more frames than flow's {len(found)}")
     return np.array(found).reshape(-1, 3)
 
 
 def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32]]:
-    """Each of some arrays; UserError for one of another shape or range, as `check_answer`."""
+    """Checked frames of an argument. UserError for another shape or range, as `check_answer`."""
     if not isinstance(frames, Iterable):
         raise UserError(f"{what}: expected an array a frame, got {type(frames).__name__}")
     return (check_answer("predict_force", what, one, *about) for one in frames)
@@ -77,22 +77,20 @@ def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32
 
 @dataclass(frozen=True)
 class FrameForce:
-    """What a model predicts of one frame."""
+    """A model's estimate for one frame."""
 
     force_mn: NDArray[np.float64]
-    """(3,) total force on the tissue in camera axes [mN], that of no motion subtracted; of a model without
-    direction the size in x, the rest NaN."""
-    map: ForceMap  # as the network predicts it, nothing subtracted
-    bands: dict[float, Band]
-    """By level, the intervals of the force, T = 1 [mN]; empty of a model without intervals."""
+    """(3,) total force on the tissue in camera axes [mN], the estimate at rest subtracted; of a model without
+    direction the size in x, the others NaN."""
+    map: ForceMap  # the network's prediction, nothing subtracted
+    bands: dict[float, Band]  # intervals of the force by level, T = 1 [mN]; empty without intervals
 
 
 class ForceEstimator:
-    """A network's force estimates, frame by frame of one video.
+    """Force estimates for the frames of one video.
 
-    What the model predicts of the rest frame, where nothing has moved, is subtracted from the total force, as
-    a sensor's tare is. Without a known E forces are those of tissue of 1 kPa: the model's own typical E would
-    make the number depend on its training data.
+    The prediction for no motion is subtracted from the total force, as a sensor's tare is. Without a known E
+    forces are those of tissue of 1 kPa: the model's typical E would make them depend on its training data.
     """
 
     def __init__(
@@ -103,54 +101,52 @@ class ForceEstimator:
         young_kpa: float | None,
         membrane: MembraneState = "unknown",
     ) -> None:
-        """`tissue`: (H, W) in the rest frame; `young_kpa` [kPa], None if unknown, and `membrane`: of it."""
+        """`tissue`: (H, W) in the rest frame; `young_kpa`: None if unknown."""
         self._predictor, self._tissue = predictor, tissue
         self._scale, self._young_kpa, self._membrane = scale_mm_per_px, young_kpa, membrane
         self._at_rest: dict[Point, ForceMap] = {}
         self.placement = GridPlacement(tissue, scale_mm_per_px, predictor.grid)
-        """Where the network's grid lies."""
-        self._seen: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each frame that was followed
+        self._tracked: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each tracked frame
 
     def estimate(self, frame: FrameMotion) -> FrameForce:
-        """The force of a frame; errors as `Predictor`."""
+        """The force of a frame. Raises as `Predictor`."""
         place = self.placement.place(frame.flow, frame.confidence)
         found = self._predict(frame, place)
         if place not in self._at_rest:
             motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
             still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
             self._at_rest[place] = self._predict(still, place)
-        # Of a frame that is lost nothing has the confidence of what is found again.
+        # In a lost frame no pixel reaches the confidence of tracked tissue.
         if found.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
-            self._seen.append(found.motion)
+            self._tracked.append(found.motion)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
         force = net_force(density, at_rest, found.kind, found.grid)[0]
         return FrameForce(force, found, self._bound(force, found))
 
     @property
     def notes(self) -> list[str]:
-        """What its user should know of the model and of where the grid lay, after the last frame."""
-        deaf = self._membrane != "unknown" and not self._predictor.card.settings.arch.membrane
-        notes = ["this network ignores what is known of a membrane"] if deaf else []
+        """Warnings about the model and the grid's position, complete after the last frame."""
+        ignored = self._membrane != "unknown" and not self._predictor.card.settings.arch.membrane
+        notes = ["this network has no membrane input: --membrane is ignored"] if ignored else []
         if self.placement.fits:
             return notes
         wide = self._predictor.grid.extent_mm
-        note = f"the tissue is wider than the network's {wide:g} mm: it looks at what moves most"
-        note += f", and was moved there {self.placement.moves} times" if self.placement.moves else ""
+        note = f"the tissue is wider than the network's {wide:g} mm: its grid lies on what moves most"
+        note += f", and was moved {self.placement.moves} times" if self.placement.moves else ""
         return [*notes, note]
 
     @property
     def interval_notes(self) -> list[str]:
-        """What the user of the model's intervals should know, after the last frame."""
+        """Warnings about the intervals, complete after the last frame."""
         found = self._predictor.card.intervals
         if found is None:
             return []
-        ideal = ["intervals are of true motion: of recovered motion they are too narrow"]
+        ideal = ["intervals were fitted on true motion: for recovered motion they are too narrow"]
         notes = ideal if found.source in ("ideal", "motion-ideal") else []
-        return notes + (
-            describe_out_of_distribution(found.world, found.features, np.stack(self._seen))
-            if self._seen
-            else []
-        )
+        if self._tracked:
+            motion = np.stack(self._tracked)
+            notes = notes + describe_out_of_distribution(found.distribution, found.features, motion)
+        return notes
 
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
         young = self._young_kpa
@@ -165,11 +161,11 @@ class ForceEstimator:
         return replace(found, density=part * found.density, young_kpa=UNKNOWN_YOUNG_KPA)
 
     def _bound(self, force: NDArray[np.float64], found: ForceMap) -> dict[float, Band]:
-        """Intervals of a frame's force by level, as of `FrameForce`."""
+        """Intervals of a frame's force, as `FrameForce.bands`."""
         if found.motion is None:
             return {}
         intervals, young, motion = self._predictor.card.intervals, found.young_kpa, found.motion[None]
-        assert intervals is not None, "a map has its motion from a model with intervals only"
+        assert intervals is not None, "only a model with intervals gives a map its motion"
         magnitude = found.magnitude[None] / np.float32(young)
         predicted = Prediction(motion, force[None] / young, magnitude, found.grid.pitch_mm)
         return {level: intervals.bound(predicted, level).times(young) for level in LEVELS}

@@ -1,4 +1,4 @@
-"""Where the network's grid lies on a picture that is wider than it: on what moves."""
+"""Position of the network's grid on a picture that is wider than it: on the tissue that moves."""
 
 from __future__ import annotations
 
@@ -12,50 +12,46 @@ from synth.flow.confidence import LOW_CONFIDENCE
 Point = tuple[float, float]
 """(x, y) px."""
 
-# By hand.
-_CUT_OFF = 0.005  # share of the tissue beyond the grid that doesn't count
-_STILL_PX = 0.5  # motion that says where something happens
-_COARSE = 8  # the place is looked for on a map this much coarser
-_STRAYED = 0.25  # of the grid's width: nearer than that to its centre, motion doesn't move the grid
+# Chosen by hand.
+_CUT_OFF = 0.005  # share of the tissue that may lie beyond a grid that covers it
+_STILL_PX = 0.5  # 98th percentile of motion under which the grid isn't moved
+_COARSE = 8  # reduction of the map on which the motion's centre is searched
+_OFF_CENTRE = 0.25  # share of the grid's width; the grid is moved to motion further from its centre
 
 
 class GridPlacement:
-    """Places the grid frame by frame; it stays as long as what moves is in its middle."""
+    """The grid's position, frame by frame; it is moved only if motion is far from its centre."""
 
     def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
-        """`tissue`: (H, W). UserError if it is empty, or for a scale that can't be."""
-        self.centre_px = centre(tissue)
-        """Where the grid's centre lies now."""
-        self.moves = 0
-        """How often it was moved."""
+        """`tissue`: (H, W). UserError if it is empty, or if the scale is invalid."""
+        self.centre_px = centre(tissue)  # current centre of the grid
+        self.moves = 0  # number of times the grid was moved
         rows, columns = np.nonzero(tissue)
         self._half = 0.5 * grid.extent_mm / check_scale(scale_mm_per_px)
         away = np.maximum(abs(columns - self.centre_px[0]), abs(rows - self.centre_px[1]))
+        # Whether the grid covers all of the tissue, so that it needn't be moved.
         self.fits = float(np.mean(away > self._half + 0.5)) <= _CUT_OFF
-        """Whether the grid covers all of the tissue, so that it needn't be placed."""
         self._tissue = tissue
         self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
 
     def place(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Point:
-        """The grid's centre for a frame.
+        """The grid's centre for a frame, from flow (H, W, 2) px and its confidence (H, W) in 0..1.
 
-        Args:
-            flow: (H, W, 2) px.
-            confidence: (H, W) in 0..1: motion is looked for where no pixel is lost; None: everywhere.
+        Pixels of low confidence don't count; None: all count.
         """
         if self.fits:
             return self.centre_px
-        sure = self._tissue if confidence is None else self._tissue & (confidence >= LOW_CONFIDENCE)
-        power = np.square(flow.astype(np.float32)).sum(-1) * sure
+        usable = self._tissue if confidence is None else self._tissue & (confidence >= LOW_CONFIDENCE)
+        power = np.square(flow.astype(np.float32)).sum(-1) * usable
         if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
             return self.centre_px
         found = self._within(self._strongest(power))
-        if max(abs(a - b) for a, b in zip(found, self.centre_px, strict=True)) > _STRAYED * 2 * self._half:
+        if max(abs(a - b) for a, b in zip(found, self.centre_px, strict=True)) > _OFF_CENTRE * 2 * self._half:
             self.centre_px, self.moves = found, self.moves + 1
         return self.centre_px
 
     def _strongest(self, power: NDArray[np.float32]) -> Point:
-        """About which point most of the motion lies; of two places the stronger, not their middle."""
+        """The centre of the strongest motion; of two places the stronger, not their mean."""
         height, width = power.shape
         size = (max(1, width // _COARSE), max(1, height // _COARSE))
         small = cv2.resize(power, size, interpolation=cv2.INTER_AREA)
@@ -65,7 +61,7 @@ class GridPlacement:
         return (float(column) + 0.5) * step[0] - 0.5, (float(row) + 0.5) * step[1] - 0.5
 
     def _within(self, point: Point) -> Point:
-        """The nearest centre whose grid doesn't reach beyond the tissue more than it must."""
+        """The nearest centre whose grid reaches as little as possible beyond the tissue."""
         placed = []
         for value, (low, high) in zip(point, self._ends, strict=True):
             low, high = low + self._half, high - self._half

@@ -1,4 +1,4 @@
-"""Motion of a film, wherever it comes from: sequence stores, datasets, videos, and arrays of flow."""
+"""Motion of a video, read from sequence stores, datasets, videos or arrays of flow."""
 
 from __future__ import annotations
 
@@ -29,48 +29,38 @@ from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of one film."""
+    """Motion of one video. The functions need its frames to be exhausted."""
 
     name: str
-    frames: Iterator[FrameMotion]
-    """In order; once."""
-    tissue: NDArray[np.bool_]
+    frames: Iterator[FrameMotion]  # in order
+    tissue: NDArray[np.bool_]  # (H, W) in the rest frame
     scale_mm_per_px: float
     young_kpa: float | None
-    force_mn: NDArray[np.float64] | None = None
-    """(T,) size of the true force, where it is known."""
-    shrink: int = 1
-    """How many times smaller than the film's own pictures those are that flow is on."""
-    notes: Callable[[], list[str]] = list
-    """What was done to the film that its user should know, once its frames are through."""
-    findings: Callable[[], list[Finding]] = list
-    """What is wrong with it, once its frames are through."""
-    scale_known: bool = True
-    """False: a width was taken for the picture's, so E is of no use, and forces are right up to a factor."""
-    again: Callable[[], Motion | None] = lambda: None
-    """The same film with the tissue's own motion taken off, if its frames, once through, showed any."""
+    force_mn: NDArray[np.float64] | None = None  # (T,) size of the true force, if known
+    shrink: int = 1  # factor by which pictures were shrunk before flow
+    notes: Callable[[], list[str]] = list  # what its user should know about its processing
+    findings: Callable[[], list[Finding]] = list  # its faults
+    scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
+    again: Callable[[], Motion | None] = lambda: None  # its motion without heartbeat and breathing, if any
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """What a video doesn't say of itself."""
+    """What a video file lacks, and settings of its flow."""
 
     scale_mm_per_px: StatedScale | None = None
-    tissue: Path | None = None
-    """A picture, white where there is tissue; everywhere if not given."""
+    tissue: Path | None = None  # a picture, white on tissue; None: tissue everywhere
     settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
-    """How it is followed."""
-    tool: MaskFiles | None = None
-    """Where the tool is; looked for in the pictures if not given."""
+    tool: MaskFiles | None = None  # instrument masks; None: detected in the pictures
 
 
 def motions(path: Path, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
-    """What `path` holds: a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video or its PNGs.
+    """Motions in a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video or its PNGs.
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
-    `confidence` (T, H, W) and `force_mn` (T,); or, of two eyes, `motion` and `deviation` (T, H, W, 3) mm
-    instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for
-    anything else, and for a video without a scale.
+    `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
+    instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for anything
+    else, and for a video without a scale.
     """
     if video.is_video(path):
         yield _video(path, options or VideoOptions())
@@ -82,7 +72,7 @@ def motions(path: Path, source: str, options: VideoOptions | None = None) -> Ite
 
 
 def has_right_camera(path: Path) -> bool:
-    """Whether what `motions` reads holds motion in three dimensions; of a dataset its first sequence."""
+    """Whether `path` holds motion in three dimensions; of a dataset its first sequence decides."""
     if video.is_video(path):
         return False
     if path.suffix == ".npz":
@@ -102,16 +92,17 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
 
     def frames() -> Iterator[FrameMotion]:
-        certain = repeat(np.ones(tissue.shape, np.float32), sequence.frames)
-        sure = source == "recovered" and "flow_confidence" in sequence
-        confidence = sequence.read_sealed("flow_confidence") if sure else certain
-        exact = repeat(np.zeros((*tissue.shape, 3), np.float32), sequence.frames)
-        spread = sequence.read_sealed("motion_deviation") if source == "motion" else exact
-        arrays = zip(sequence.read_sealed(FIELDS[source]), confidence, spread, time_s, strict=True)
-        for t, (values, one, deviation, at) in enumerate(arrays):
+        confidences: Iterator[Any] = repeat(np.ones(tissue.shape, np.float32), sequence.frames)
+        if source == "recovered" and "flow_confidence" in sequence:
+            confidences = sequence.read_sealed("flow_confidence")
+        deviations: Iterator[Any] = repeat(np.zeros((*tissue.shape, 3), np.float32), sequence.frames)
+        if source == "motion":
+            deviations = sequence.read_sealed("motion_deviation")
+        arrays = zip(sequence.read_sealed(FIELDS[source]), confidences, deviations, time_s, strict=True)
+        for t, (values, confidence, deviation, at) in enumerate(arrays):
             motion = Moved(values, deviation) if has_depth(source) else None
             flow = values if motion is None else np.asarray(values[..., :2] / scale, np.float32)
-            yield FrameMotion(flow, one, motion=motion, index=t, time_s=float(at))
+            yield FrameMotion(flow, confidence, motion=motion, index=t, time_s=float(at))
 
     return Motion(
         name=sequence.path.stem,
@@ -125,9 +116,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
 
 def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) -> Motion:
     if options.scale_mm_per_px is None:
-        raise UserError(
-            f"{path}: a video doesn't say how large it shows things; give --scale in mm a pixel, or unknown"
-        )
+        raise UserError(f"{path}: a video needs its scale: give --scale in mm/px, or --scale unknown")
     scale_known = options.scale_mm_per_px != "unknown"
     tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
     taken: list[str] = []
@@ -146,7 +135,7 @@ def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) 
     def notes() -> list[str]:
         found = [*taken, *([] if scale_known else [UNKNOWN_NOTE]), *following.notes]
         if path.is_dir():
-            found = [f"nobody knows the pictures' times: {video.FPS:g} a second are taken", *found]
+            found = [f"the pictures have no times: {video.FPS:g} per second are assumed", *found]
         return found if following.removed is None else [*found, following.removed.describe(mm_per_px)]
 
     return Motion(
@@ -167,7 +156,7 @@ def _arrays(path: Path) -> Motion:
     found = checked_file.read_arrays(path)
     names = ("motion", "deviation") if "motion" in found else ("flow",)
     if missing := {*names, "tissue", "scale_mm_per_px"} - found.keys():
-        raise UserError(f"{path}: lacks {', '.join(sorted(missing))}")
+        raise UserError(f"{path}: needs {', '.join(sorted(missing))}")
     tissue, count = found["tissue"].astype(bool), found[names[0]].shape[:1]
     if not count or not count[0]:
         raise UserError(f"{path}: {names[0]} holds no frames")
@@ -181,12 +170,12 @@ def _arrays(path: Path) -> Motion:
     scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
 
     def frames() -> Iterator[FrameMotion]:
-        sure = found.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
+        confidence = found.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
         for t in range(count[0]):
             first, *rest = (found[name][t].astype(np.float32) for name in names)
             motion = Moved(first, rest[0]) if rest else None
             flow = first[..., :2] / scale if rest else first
-            yield FrameMotion(flow, sure[t].astype(np.float32), motion=motion, index=t)
+            yield FrameMotion(flow, confidence[t].astype(np.float32), motion=motion, index=t)
 
     return Motion(
         name=path.stem,
@@ -199,7 +188,7 @@ def _arrays(path: Path) -> Motion:
 
 
 def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
-    """The one number under a name. UserError if it is another number of them, or not positive."""
+    """The number under a name. UserError unless it is one and positive."""
     if found[name].size != 1 or not 0 < found[name].item() < math.inf:
         raise UserError(f"{path}: {name} must be one positive number")
     return float(found[name].item())

@@ -1,4 +1,4 @@
-"""A trained model from its folder, and the force map that it predicts of one frame's motion."""
+"""A trained model, and the force map that it predicts from one frame's motion."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from synth.job.types import MembraneState
 
 
 def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
-    """A trained model, to be asked frame by frame (`Predictor`) or for a whole film (`predict_force`).
+    """A trained model, to be called frame by frame (`Predictor`) or for a whole video (`predict_force`).
 
     Args:
-        name: the folder that `learn train` wrote, or `mono` or `stereo`, if they come with this version.
-        device: PyTorch's name of where it runs.
-        quick: spend a second on a graph that runs a fifth faster on a CPU.
+        name: the folder that `learn train` wrote, or `mono` or `stereo` for a pretrained network.
+        device: PyTorch's name of the device.
+        quick: compile the network in a second so that it runs a fifth faster on a CPU.
 
     Raises:
         UserError: the folder is missing, damaged or edited.
@@ -41,7 +41,7 @@ def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: b
 
 
 class Predictor:
-    """A trained model, ready for pictures of any size and scale."""
+    """A trained model for pictures of any size and scale."""
 
     def __init__(
         self, network: nn.Module, card: ModelCard, device: torch.device | str = "cpu", quick: bool = False
@@ -57,15 +57,15 @@ class Predictor:
         self._view: GridView | None = None
 
     def readable(self, source: str) -> str:
-        """The source of displacement as given, if this model can read it; else UserError."""
+        """The source of displacement as given. Raises UserError if this model can't use it."""
         fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
         if source not in fit:
-            what = "this model can't read" if source in FIELDS else "unknown"
+            what = "this model can't use" if source in FIELDS else "unknown"
             raise UserError(f"{what} input {source!r}: one of {', '.join(fit)}")
         return source
 
     def stored(self, source: str | None) -> str:
-        """The same, of a store: what a real pipeline recovers if none is given."""
+        """The source to read from a store; the recovered one if none is given. Raises as `readable`."""
         return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
 
     def __call__(
@@ -86,22 +86,22 @@ class Predictor:
             flow: (H, W, 2) px, motion from the rest frame on the rest frame's pixels.
             tissue: (H, W) bool.
             scale_mm_per_px: of the picture.
-            young_kpa: of the tissue; None stands for the training data's typical value.
+            young_kpa: of the tissue; None: the training data's typical value.
             confidence: (H, W) 0..1, used only by a model with that channel; None: 1.
-            moved: motion in three dimensions and its deviation, which a model of two eyes reads instead of
-                flow and confidence.
+            moved: motion in three dimensions and its deviation, which a stereo model uses instead of flow and
+                confidence.
             centre_px: as of `GridView`.
             membrane: as of `density`.
 
         Raises:
-            UserError: other shapes, values that aren't finite, or such a model without `moved`.
+            UserError: other shapes, values that aren't finite, or a stereo model without `moved`.
         """
         young = self.card.typical_young_kpa if young_kpa is None else as_positive("young_kpa", young_kpa)
-        if self._view is None or not self._view.is_of(tissue, scale_mm_per_px, centre_px):
+        if self._view is None or not self._view.matches(tissue, scale_mm_per_px, centre_px):
             self._view = GridView(tissue, scale_mm_per_px, self.grid, centre_px)
         view = self._view
-        displacement, sure = self.on_grid(view, flow, confidence, moved)
-        known = None if sure is None else sure[None]
+        displacement, cell_confidence = self.on_grid(view, flow, confidence, moved)
+        known = None if cell_confidence is None else cell_confidence[None]
         density = self.density(displacement[None], view.mask, young, known, membrane)
         motion = None
         if self.card.intervals is not None:
@@ -128,9 +128,7 @@ class Predictor:
             shift = mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
             return shift, None if confidence is None else mean(confidence, view.tissue)[None]
         if moved is None:
-            raise UserError(
-                "this model reads motion in three dimensions: it needs a second eye or depth pictures"
-            )
+            raise UserError("this model needs motion in three dimensions: give it stereo or depth images")
         for what, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
             if values.shape != (height, width, 3):
                 raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")
@@ -149,20 +147,20 @@ class Predictor:
         """Force density of frames already on the grid, (T, C, N, N) mN/mm² at `young_kpa`.
 
         Args:
-            displacement: (T, 2, N, N) mm, of a model of two eyes (T, 3, N, N).
+            displacement: (T, 2, N, N) mm, for a stereo model (T, 3, N, N).
             mask: (N, N) 0/1.
             young_kpa: of the tissue.
             confidence: (T, 1, N, N), with depth (T, 2, N, N); None: 1.
-            membrane: what is known of the tissue's; a model without `arch.membrane` has no use for it.
+            membrane: state of the membrane; used only by a model with `arch.membrane`.
 
         Raises:
-            UserError: another grid or number of components, or values or a prediction that aren't finite.
+            UserError: another grid or number of components, or non-finite values or predictions.
         """
         n, settings, scales = self.grid.size, self.card.settings, self.card.scales
         parts = settings.arch.displacements
         if displacement.ndim != 4 or displacement.shape[1:] != (parts, n, n):
             raise UserError(
-                f"this model takes displacement of shape (T, {parts}, {n}, {n}) "
+                f"this model needs displacement of shape (T, {parts}, {n}, {n}) "
                 f"[{', '.join(('dx', 'dy', 'dz')[:parts])} in mm], got {displacement.shape}"
             )
         if not np.isfinite(displacement).all():
@@ -172,24 +170,25 @@ class Predictor:
             frames = slice(start, start + settings.batch)
             u = torch.from_numpy(np.array(displacement[frames])).to(self.device)
             m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
-            sure = None
+            c = codes = None
             if settings.arch.confidence:
-                sure = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
+                c = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
                 if confidence is not None:
-                    sure = torch.from_numpy(np.array(confidence[frames])).to(self.device)
-            told = torch.full_like(u[:, 0, 0, 0], membrane_code(membrane)) if settings.arch.membrane else None
-            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, sure, told))
+                    c = torch.from_numpy(np.array(confidence[frames])).to(self.device)
+            if settings.arch.membrane:
+                codes = torch.full_like(u[:, 0, 0, 0], membrane_code(membrane))
+            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, c, codes))
             maps.append(predicted.float().cpu().numpy())
-        with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below
             density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)
         if not np.isfinite(density).all():
-            raise UserError("the model answers NaN or infinity: its weights or scales can't be right")
+            raise UserError("the model predicts NaN or infinity: its weights or scales are invalid")
         return density
 
 
 @dataclass(frozen=True)
 class ForceMap:
-    """What the model predicts of one frame."""
+    """A model's force map of one frame."""
 
     density: NDArray[np.float32]
     """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
@@ -198,7 +197,7 @@ class ForceMap:
     kind: str
     """`density` or `intensity`."""
     young_kpa: float
-    """Young's modulus the numbers rest on: the one given, else the training data's typical one."""
+    """Young's modulus that the map is for: the one given, else the training data's typical one."""
     young_known: bool
     view: GridView
     motion: NDArray[np.float64] | None = None
@@ -233,9 +232,10 @@ def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
 
 
 def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[np.float64]:
-    """Total force of frames (T, C, N, N), (T, 3) mN in camera axes; of sizes alone in x, the rest NaN.
+    """Total force of maps (T, C, N, N), (T, 3) mN in camera axes: integral of a density, peak of an
+    intensity.
 
-    The integral of a density; the peak of an intensity (`kind`).
+    A map without direction gives the size in x, and NaN in y and z.
     """
     if kind == "intensity":
         total = density.max((2, 3)).astype(np.float64)
@@ -247,11 +247,11 @@ def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[
 def net_force(
     density: NDArray[np.float32], at_rest: NDArray[np.float32], kind: str, grid: Grid
 ) -> NDArray[np.float64]:
-    """`total_force` less that of `at_rest` (1, C, N, N), the prediction for no motion; a size ≥ 0."""
+    """`total_force` minus that of `at_rest` (1, C, N, N), the prediction for no motion; a size is ≥ 0."""
     net = total_force(density, kind, grid) - total_force(at_rest, kind, grid)
     return net if density.shape[1] == 3 else np.maximum(net, 0.0)
 
 
 def force_size(force_mn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T,) size of forces (T, 3) as of `total_force`."""
+    """(T,) size of forces (T, 3) of `total_force`."""
     return np.asarray(np.sqrt(np.nansum(force_mn**2, axis=-1)))

@@ -1,4 +1,4 @@
-"""What `learn predict` leaves: NAME.npz with the fields of a table, NAME.force.csv, NAME.force.mp4 to see."""
+"""Output of `learn predict`: NAME.npz with the arrays of `FIELDS`, NAME.force.csv and NAME.force.mp4."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class PredictedField(NamedTuple):
 
 
 FIELDS: dict[str, PredictedField] = {
-    "frame": PredictedField("T", "-", "number in the film"),
-    "time_s": PredictedField("T", "s", "on the film's clock; absent where it has none"),
+    "frame": PredictedField("T", "-", "number in the video"),
+    "time_s": PredictedField("T", "s", "on the video's clock; absent without one"),
     "trusted": PredictedField("T", "-", "whether the frame could be followed"),
     "total_force_mn": PredictedField("T", "mN", "size of the total force on the tissue; NaN if not trusted"),
     "force_mn": PredictedField(
@@ -44,35 +44,35 @@ FIELDS: dict[str, PredictedField] = {
     "density": PredictedField(
         "T, C, N, N",
         "mN/mm²",
-        "force density on the network's grid, nothing taken off: its size (C = 1) or x, y, z; of a model of "
+        "force density on the network's grid, nothing subtracted: its size (C = 1) or x, y, z; of a model of "
         "the published target the intensity [mN]",
     ),
     "low_mn": PredictedField(
-        "T", "mN", "lower end of the size's 90% interval; this and its like of a model with intervals"
+        "T", "mN", "lower end of the size's 90% interval; as the next five, of a model with intervals"
     ),
-    "high_mn": PredictedField("T", "mN", "upper end of it"),
+    "high_mn": PredictedField("T", "mN", "upper end of the size's 90% interval"),
     "low68_mn": PredictedField("T", "mN", "lower end of the size's 68% interval"),
-    "high68_mn": PredictedField("T", "mN", "upper end of it"),
+    "high68_mn": PredictedField("T", "mN", "upper end of the size's 68% interval"),
     "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the components' 90% intervals, camera axes"),
-    "force_high_mn": PredictedField("T, 3", "mN", "upper ends of them"),
+    "force_high_mn": PredictedField("T, 3", "mN", "upper ends of the components' 90% intervals, camera axes"),
     "mask": PredictedField("N, N", "-", "cells with tissue"),
     "pitch_mm": PredictedField("", "mm", "width of a cell"),
-    "scale_mm_per_px": PredictedField("", "mm/px", "of the film's own pixels"),
-    "centre_px": PredictedField("2", "px", "x, y of the grid's centre in the film's own pixels, last frame"),
-    "centres_px": PredictedField("T, 2", "px", "the same by frame"),
-    "young_kpa": PredictedField("", "kPa", "Young's modulus that forces are for: all are proportional to it"),
-    "young_known": PredictedField("", "-", "whether it was given or is the film's own; else assumed"),
-    "notes": PredictedField("K", "-", "what was done to the film that its user should know"),
+    "scale_mm_per_px": PredictedField("", "mm/px", "of the video's own pixels"),
+    "centre_px": PredictedField("2", "px", "x, y of the grid's centre in the video's own pixels, last frame"),
+    "centres_px": PredictedField("T, 2", "px", "x, y of the grid's centre by frame"),
+    "young_kpa": PredictedField("", "kPa", "Young's modulus; forces are proportional to it"),
+    "young_known": PredictedField("", "-", "whether Young's modulus was known; else it is assumed"),
+    "notes": PredictedField("K", "-", "warnings about the video and its processing"),
 }
-"""Every field by name, in the order in which the documentation lists them."""
+"""Every field by name, in the documentation's order."""
 
 _ENDS = ("low_mn", "high_mn")
 COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_y_mn", "force_z_mn", *_ENDS)
-"""Of NAME.force.csv; empty where there is no value."""
+"""Columns of NAME.force.csv; missing values are empty."""
 
 
 def write_prediction(found: dict[str, Any], stem: Path) -> None:
-    """`stem`.npz and `stem`.force.csv, whole or not at all, of what `apply` returns."""
+    """Writes `stem`.npz and `stem`.force.csv, each atomically, from the fields that `apply` returns."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
         np.savez_compressed(file, **{name: found[name] for name in FIELDS if name in found})
@@ -80,7 +80,7 @@ def write_prediction(found: dict[str, Any], stem: Path) -> None:
 
 
 def tabulate(found: dict[str, Any]) -> str:
-    """The force by frame as CSV, a row a frame, `COLUMNS` on top."""
+    """The force by frame as CSV text with the header `COLUMNS`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -94,14 +94,14 @@ def tabulate(found: dict[str, Any]) -> str:
 
 
 def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
-    """`stem`.force.mp4: the frames that were looked at, with the force map over them and its curve below.
+    """Writes `stem`.force.mp4: the processed frames with the force map on them and its curve below.
 
-    The map lies where the tissue was at rest. None, and no file, where the source holds no pictures.
+    The map is drawn in the rest frame. Returns None, without a file, if the source holds no pictures.
 
     Args:
-        found: what `apply` returns.
+        found: fields that `apply` returns.
         source: a video, or a sequence's store.
-        stem: of the file.
+        stem: path of the file without its ending.
     """
     pictures = _pictures(source, {int(number) for number in found["frame"]})
     if pictures is None:
@@ -147,7 +147,7 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
 def on_picture(
     cells: NDArray[np.floating], found: dict[str, Any], t: int, shape: tuple[int, ...]
 ) -> NDArray[np.float32]:
-    """Values of the grid's cells (N, N) at the film's own pixels, (H, W); 0 outside the grid."""
+    """Values of the grid's cells (N, N) at the video's own pixels, (H, W); 0 outside the grid."""
     step = float(found["scale_mm_per_px"]) / float(found["pitch_mm"])
     offset = (np.array(cells.shape[::-1]) - 1) / 2 - step * np.asarray(found["centres_px"][t])
     way = np.array([[step, 0, offset[0]], [0, step, offset[1]]])

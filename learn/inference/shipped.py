@@ -1,4 +1,4 @@
-"""Networks that come with the package: `mono` of one eye, `stereo` of two, each a folder in `MODELS`."""
+"""The pretrained networks, `mono` (one camera) and `stereo`, each a folder in `MODELS`."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from synth.system.checked_file import folder_bytes, write_whole
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")
-LARGEST_BYTES = 4_000_000
-"""Of a network that comes along, all of its files."""
-NONE = "no trained network comes with this version; train one: learn train DATASET --out model"
+LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
+NONE = "this version has no pretrained network; train one: learn train DATASET --out model"
 
 
 def shipped() -> dict[str, Path]:
-    """The networks that are there, by name."""
+    """Folders of the pretrained networks by name."""
     return {name: MODELS / name for name in NAMES if (MODELS / name / "config.json").is_file()}
 
 
 def find_model(named: Path | str) -> Path:
-    """The folder of a model that somebody named: his own, else of what comes along.
+    """The folder of a model: a folder of that name, else of the pretrained network.
 
-    Raises UserError if he means one that could come along, and doesn't.
+    Raises UserError if that network is not in the package.
     """
     if str(named) not in NAMES or Path(named).exists():
         return Path(named)
@@ -38,27 +37,27 @@ def find_model(named: Path | str) -> Path:
 
 
 def choose_model(stereo: bool) -> Path | None:
-    """The one to use where none is named: `stereo` for what two eyes saw, else `mono`; None if not there."""
+    """The default network's folder: `stereo` for stereo recordings, else `mono`; None if there is none."""
     found = shipped()
     return next((found[name] for name in ("stereo", "mono")[not stereo :] if name in found), None)
 
 
 def require_model(stereo: bool) -> Path:
-    """As `choose_model`. UserError if none comes along."""
+    """As `choose_model`. Raises UserError if there is none."""
     found = choose_model(stereo)
     if found is None:
-        raise UserError(f"say a model (--model): {NONE}")
+        raise UserError(f"give a model (--model): {NONE}")
     return found
 
 
 def find_name(card: ModelCard) -> str:
-    """The name of the network that comes along with these very weights; empty if it is none of them."""
+    """The name of the pretrained network with the same weights; empty if there is none."""
     found = {checkpoint.read_card(folder).weights_hash: name for name, folder in shipped().items()}
     return found.get(card.weights_hash, "")
 
 
 def hash_data(card: ModelCard) -> str:
-    """Of all sequences that a model was fitted, chosen and to be tested on; their order doesn't count."""
+    """Hash of all sequences in a model's split, in any order."""
     named = {part: sorted(hashes) for part, hashes in card.split.items()}
     return hashlib.blake2b(identity.canonical(named), digest_size=16).hexdigest()
 
@@ -66,17 +65,17 @@ def hash_data(card: ModelCard) -> str:
 def pack_model(
     model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
 ) -> ModelCard:
-    """Writes a trained model as one that comes along: weights.safetensors, config.json and a card, README.md.
+    """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
 
     Args:
         model: folder of `learn train`.
-        folder: of the new one, `MODELS` and its name; replaced if it is there.
+        folder: of the pretrained network, `MODELS` and its name; replaced if it exists.
         commit: of the code that trained it.
-        metrics: what was measured, and the figure with its unit.
-        limits: what it can't do, a sentence each.
+        metrics: name and value of each measurement, with its unit.
+        limits: known limits, a sentence each.
 
     Raises:
-        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is left then.
+        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is written then.
     """
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
@@ -86,19 +85,19 @@ def pack_model(
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
         raise UserError(
-            f"{model}: takes {size / 1e6:.1f} MB, what comes along at most {LARGEST_BYTES / 1e6:g}; "
+            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
             "train it with a smaller arch.width"
         )
     return card
 
 
 def describe(card: ModelCard) -> str:
-    """A line for a person."""
+    """A one-line summary of a model."""
     settings, arch = card.settings, card.settings.arch
-    eyes = "two eyes" if arch.depth else "one eye"
     return (
-        f"{eyes}, {arch.output}, {settings.size}² cells, {settings.extent_mm:g} mm, input {settings.input}; "
-        f"R² {card.score:.3f} on sequences that chose it, {len(card.split.get('fit', []))} fitted"
+        f"{'stereo' if arch.depth else 'monocular'}, {arch.output}, {settings.size}² cells, "
+        f"{settings.extent_mm:g} mm, input {settings.input}; R² {card.score:.3f} on validation sequences, "
+        f"{len(card.split.get('fit', []))} training sequences"
     )
 
 

@@ -1,4 +1,4 @@
-"""D2FNet, from displacement to force map, as Heraoui et al. draw it, in any width, depth and input size.
+"""D2FNet of Heraoui et al., from displacement to force map, in any width, depth and input size.
 
     x ─ stem ─ Block ─┬─ ½ ─ Block ─┬─ ½ ─ … ─ ½ ─ Block ─ Pyramid
                       │             └──────── … ─ ×2 ─ ⊕ ─ Block ─┐
@@ -26,40 +26,40 @@ from learn.data.grid import channel_names
 from synth.job.types import Section
 
 BOUNDS = (0.25, 0.75, 1.5)
-"""Largest value each head can give, in units of the training data's 99.9th percentile. The paper's heads stop
-at 1/6, 1/2 and 1 of the largest force it has; half as much again is kept in hand here."""
+"""Largest output of each head, in units of the training data's 99.9th percentile. The published heads reach
+1/6, 1/2 and 1 of the largest force; here 1.5 times that, as a reserve."""
 SMALL_CONTACTS = 4.0
-"""By how much `relative` heads reach further: a contact half as wide moves the tissue half as far."""
+"""Factor on the bounds of `relative` heads: a contact half as wide moves the tissue half as far."""
 LEAST_MOTION = 0.01
-"""Of the training data's 99.9th percentile, some 0.02 mm: under it what moves is noise, and stays small."""
+"""Lower limit of the motion that `relative` divides by, as noise is smaller: share of the training data's
+99.9th percentile, some 0.02 mm."""
 
 
 class Architecture(Section):
-    """Everything that decides the network's shape; stored in the checkpoint."""
+    """The network's shape; stored in the model's card."""
 
     width: Annotated[int, Field(ge=4, le=512, multiple_of=4)] = 32
     """Channels of the first level; each level doubles them."""
     levels: Annotated[int, Field(ge=1, le=5)] = 4
-    """Times the picture is halved after the stem."""
+    """Number of halvings after the stem."""
     stem: Literal[1, 2, 4] = 1
-    """Stride of the first convolution; 4 makes the network live (`d2fnet-s`)."""
+    """Stride of the first convolution; 4 makes the network fast enough for live use (`d2fnet-s`)."""
     output: Literal["magnitude", "vector"] = "vector"
     """`magnitude`: force density ≥ 0; `vector`: its x, y, z in camera axes."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     confidence: bool = False
     """Whether a sixth channel holds the flow's confidence."""
     depth: bool = False
-    """Whether channels hold motion along the view too, from a second eye: `input` motion; with confidence its
-    confidence as well."""
+    """Whether channels hold stereo motion along the optical axis, with `confidence` also its confidence."""
     membrane: bool = False
-    """Whether a last channel says what is known of the tissue's membrane: stripped, nothing, intact."""
+    """Whether a last channel holds the state of the membrane (pia): stripped, unknown or intact."""
     relative: bool = False
-    """Whether displacement comes in as a share of the frame's largest, and the map is multiplied by that:
-    twice the motion is then twice the force, as in linear elasticity, and need not be learnt."""
+    """Whether displacement is divided by the frame's largest, and the map multiplied by it: twice the motion
+    is then twice the force, as in linear elasticity, by construction."""
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of what comes in."""
+        """Names of the input channels."""
         return channel_names(self.confidence, self.depth, self.membrane)
 
     @property
@@ -113,20 +113,20 @@ class D2FNet(nn.Module):
         return y * largest if self.arch.relative else y
 
     def largest_motion(self, x: Tensor) -> Tensor:
-        """The frame's largest displacement, averaged over 3 × 3 cells, (B, 1, 1, 1) in their unit."""
+        """The largest mean displacement of 3 × 3 cells, (B, 1, 1, 1) in the channels' unit."""
         axes = [k for k, name in enumerate(self.arch.channels) if name in ("dx", "dy", "dz")]
         size = torch.cat([x[:, k : k + 1] for k in axes], dim=1).square().sum(1, keepdim=True)
         peak = F.avg_pool2d(size, 3, 1, 1).flatten(1).amax(1)
         return (peak + LEAST_MOTION**2).sqrt()[:, None, None, None]
 
     def per_motion(self, x: Tensor, largest: Tensor) -> Tensor:
-        """The channels over the largest motion, but for those that are of no motion."""
+        """The channels with those of motion divided by the largest."""
         plain = [name.startswith(("mask", "confidence", "membrane")) for name in self.arch.channels]
         return torch.where(x.new_tensor(plain)[None, :, None, None] > 0, x, x / largest)
 
 
 class Block(nn.Module):
-    """Two 3×3 convolutions with batch norm, the gate and dropout of whole channels."""
+    """Two 3×3 convolutions with batch norm, then the gate and dropout of whole channels."""
 
     def __init__(self, inputs: int, outputs: int, dropout: float) -> None:
         super().__init__()
@@ -147,7 +147,7 @@ class Block(nn.Module):
 
 
 class Gate(nn.Module):
-    """Attention over place times attention over channels."""
+    """Spatial attention times channel attention."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ class Gate(nn.Module):
 
 
 class Pyramid(nn.Module):
-    """Context of the whole picture, its quarters, sixteenths and sixty-fourths (Zhao et al. 2017)."""
+    """Pyramid pooling over 1, 4, 16 and 64 parts of the picture (Zhao et al. 2017)."""
 
     BINS = (1, 2, 4, 8)
 
@@ -181,9 +181,9 @@ class Pyramid(nn.Module):
 
 
 class Heads(nn.Module):
-    """Three bounded maps from the same features, mixed a pixel at a time by soft weights.
+    """Three bounded maps from the same features, mixed in every pixel by softmax weights.
 
-    A magnitude is a sigmoid times its bound; a component has a sign and is a tanh times its bound.
+    A magnitude is a sigmoid times its bound, a component a tanh times its bound.
     """
 
     def __init__(self, inputs: int, components: int, bounds: Sequence[float]) -> None:
@@ -206,10 +206,10 @@ class Heads(nn.Module):
         return low + middle + high
 
     def begin_small(self) -> None:
-        """Begin near no force at all: half a bound everywhere would be one large false positive to unlearn.
+        """Initialises the heads near zero force: half a bound everywhere would be a large false positive.
 
-        A bias of -2 is a tenth of a bound; at -4 the sigmoids are so flat that little force left at the start
-        is also slow to go.
+        A bias of -2 gives a tenth of a bound; at -4 the sigmoids are so flat that what is left vanishes
+        slowly.
         """
         for conv in self.ranges:
             nn.init.normal_(conv.weight, std=0.02)  # type: ignore[arg-type]
@@ -225,7 +225,7 @@ def _he_initialise(module: nn.Module) -> None:
 
 
 def fused(model: nn.Module) -> nn.Module:
-    """A copy for evaluation in which every batch norm is folded into the convolution before it."""
+    """A copy for evaluation with every batch norm folded into the convolution before it."""
     quick = copy.deepcopy(model).eval()
     for block in quick.modules():
         if isinstance(block, Block):

@@ -1,4 +1,4 @@
-"""All frames on the device at once, batches cut and turned there: nothing but indices crosses the bus."""
+"""All frames in a GPU's memory, where batches are selected and turned."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from learn.data.grid import membrane_code
 from learn.settings import TrainingSettings
 from learn.training.batches import Batch, FrameDataset, FrameItem
 
-SHARE = 0.6
-"""Part of the device's free memory that frames may take; the rest is the network's."""
+SHARE = 0.6  # of the device's free memory that frames may take; the rest is the network's
 
 
 class DeviceDataset(FrameDataset):
-    """The same frames as `FrameDataset`, in the same order, held by the device."""
+    """The frames of `FrameDataset`, in its order, stored on a device."""
 
     def __init__(self, clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> None:
         super().__init__(clips, settings)
@@ -36,16 +35,16 @@ class DeviceDataset(FrameDataset):
 
         self._moved = {s: whole([c.displacement[s] for c in self.clips]) for s in self.sources}
         self._mask = whole([np.asarray(c.mask)[None, None] for c in self.clips])
-        self._sure = None
+        self._confidence = None
         if settings.arch.confidence:
-            self._sure = {s: whole([c.sure(s) for c in self.clips]) for s in self.sources}
+            self._confidence = {s: whole([c.confidence_of(s) for c in self.clips]) for s in self.sources}
         self._true = whole(
             [np.stack([target(c, t, settings.target, parts) for t in range(c.frames)]) for c in self.clips]
         )
         self._device = device
 
     def batch(self, items: Sequence[FrameItem]) -> Batch:
-        """As `FrameDataset.batch`; within it frames of one turn stand together."""
+        """As `FrameDataset.batch`, but ordered by turn."""
         alike = {(item.turn, self.sources.index(item.source)) for item in items}
         parts = []
         for turn, k in sorted(alike):
@@ -53,17 +52,18 @@ class DeviceDataset(FrameDataset):
             at = torch.tensor([int(self._first[one.clip]) + one.frame for one in some], device=self._device)
             clip = torch.tensor([one.clip for one in some], device=self._device)
             mask = self._mask[clip]
-            sure = torch.ones_like(mask) if self._sure is None else self._sure[self.sources[k]][at]
-            told = torch.tensor(
-                [one.told * membrane_code(self.clips[one.clip].membrane) for one in some], device=self._device
-            )
+            confidence = torch.ones_like(mask)
+            if self._confidence is not None:
+                confidence = self._confidence[self.sources[k]][at]
+            codes = [one.membrane_known * membrane_code(self.clips[one.clip].membrane) for one in some]
+            membrane = torch.tensor(codes, device=self._device)
             moved = self._moved[self.sources[k]][at]
-            parts.append(Batch(moved, mask, sure, self._true[at], told).turned(turn))
+            parts.append(Batch(moved, mask, confidence, self._true[at], membrane).turned(turn))
         return Batch(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def place_frames(clips: Sequence[Clip], settings: TrainingSettings, device: torch.device) -> FrameDataset:
-    """Frames on a GPU whose memory is enough, else read as they are asked for."""
+    """The clips' frames, on the device if it is a GPU with enough memory, else read batch by batch."""
     if device.type != "cuda":
         return FrameDataset(clips, settings)
     arch = settings.arch

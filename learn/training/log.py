@@ -1,4 +1,4 @@
-"""What a run says of itself, epoch by epoch: history.jsonl for programs, TensorBoard events for eyes."""
+"""The log of a run, epoch by epoch: history.jsonl and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ class Log:
     """Writes each epoch's numbers into `folder`/history.jsonl and `folder`/tensorboard."""
 
     def __init__(self, folder: Path, start: int) -> None:
-        """`start`: epochs done before, when a run is continued; what was logged after them is dropped."""
+        """`start`: number of epochs done by a run that is continued; later entries are dropped."""
         self._file = folder / "history.jsonl"
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=start)
 
     def __call__(self, epoch: int, numbers: dict[str, float]) -> None:
-        """The numbers of epoch `epoch`, counted from 0."""
+        """Logs the numbers of epoch `epoch`, counted from 0."""
         lines = self._file.read_text().splitlines()[:epoch] if self._file.exists() else []
         self._file.write_text("\n".join([*lines, json.dumps(numbers)]) + "\n")
         for name, value in numbers.items():

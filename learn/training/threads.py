@@ -1,4 +1,4 @@
-"""What a training runs on: threads, and the devices that Fabric puts it on."""
+"""CPU threads and devices of a training."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 def set_threads(wanted: int | None = None) -> int:
-    """Half the cores, at most 8, at least one, unless told otherwise; returns what was set.
+    """Sets and returns PyTorch's number of threads; default: half the cores, from 1 to 8.
 
-    Two threads on two busy cores wait for each other (measured: thirty seconds for what one thread did in
-    half a second), so a small machine gets one.
+    Two threads on two busy cores wait for each other (measured: thirty seconds instead of half a second of
+    one thread), so a small machine gets one.
     """
     if wanted is not None and wanted < 1:
-        raise UserError(f"threads {wanted}: at least 1")
+        raise UserError(f"threads {wanted}: must be at least 1")
     cores = len(os.sched_getaffinity(0))
     count = wanted or min(max(cores // 2, 1), 8)
     torch.set_num_threads(count)
@@ -29,7 +29,7 @@ def set_threads(wanted: int | None = None) -> int:
 
 
 def make_fabric(**settings: Any) -> Fabric:
-    """`Fabric(**settings)`, without its hint that `srun` is there: on a cluster's machines it always is."""
+    """`Fabric(**settings)` without its hint to use `srun`, which is unwanted on a cluster."""
     from lightning_fabric import Fabric
 
     with warnings.catch_warnings():

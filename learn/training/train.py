@@ -1,4 +1,4 @@
-"""Training: AdamW on a plateau schedule, clipped, checkpointed every epoch, resumed to the bit."""
+"""Training with AdamW; every epoch is checkpointed, and a run resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -33,16 +33,12 @@ from learn.training.threads import make_fabric
 from synth.errors import UserError, as_user_error
 from synth.system.terminal import ProgressCallback
 
-CLIP = 1.0
-"""Largest norm of the gradient."""
+CLIP = 1.0  # largest norm of the gradient
 WEIGHT_DECAY = 1e-5
-PATIENCE = 5
-"""`plateau`: epochs without a better score after which the learning rate is halved."""
-LOOK = 16
-"""Steps between two looks at the loss and its gradient: each makes a GPU wait."""
-_TELLING, _GAINS = 8, (0.67, 1.5)
-"""Anatomies that a force gain is told by at least, and its limits: a network further off than that has not
-learnt, and stretching it would hide it."""
+PATIENCE = 5  # `plateau`: epochs without a better score after which the learning rate is halved
+CHECK_EVERY = 16  # steps between two checks of the loss and its gradient, each of which makes a GPU wait
+_GAIN_ANATOMIES = 8  # least number of anatomies that a force gain is fitted on
+_GAINS = 0.67, 1.5  # limits of the gain: a larger correction would hide that a network has not learnt
 
 
 def train(
@@ -55,11 +51,10 @@ def train(
     fabric: Fabric | None = None,
     log: Callable[[dict[str, float]], None] = lambda numbers: None,
 ) -> ModelCard:
-    """Trains on `split.fit`, chooses the epoch on `split.select`, never looks at `split.test`.
+    """Trains on `split.fit` and chooses the epoch on `split.select`; `split.test` is not used.
 
-    A folder that holds an unfinished run of the same settings and data is continued; the result is the same,
-    bit for bit on one CPU, as that of an uninterrupted run. `report` is told after every batch, `log` gets
-    each epoch's numbers.
+    An unfinished run of the same settings and data in `out` is continued, with the result (bit for bit on one
+    CPU) of an uninterrupted run. `report` is called after every batch, `log` with each epoch's numbers.
 
     Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
     """
@@ -89,7 +84,7 @@ def train(
                 fabric.barrier()
                 log(numbers)
     except (UserError, OSError):
-        # Nothing to go on from: a full disk, say, leaves nothing.
+        # A new run without a checkpoint, on a full disk for instance, leaves no folder.
         if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
             shutil.rmtree(out)
         raise
@@ -98,22 +93,20 @@ def train(
 
 @dataclasses.dataclass
 class _Run:
-    """A run between two epochs: what continuing it needs."""
+    """State of a run between two epochs, from which it can be continued."""
 
     model: torch.nn.Module
     optimizer: Any
     plateau: ReduceLROnPlateau
-    epoch: int = 0
-    """Epochs done."""
-    best: float = -math.inf
-    """R² on the select sequences of the epoch that is kept."""
+    epoch: int = 0  # epochs done
+    best: float = -math.inf  # R² on the select sequences of the stored epoch
 
     def end_epoch(self, score: float, settings: TrainingSettings) -> bool:
-        """Takes an epoch's score into account; whether it is the best so far."""
+        """Updates the state by an epoch's score; returns whether it is the best so far."""
         self.epoch += 1
         if settings.schedule == "plateau":
             self.plateau.step(score)
-        # Before its price is whole no epoch has been asked to have no ghosts: none of those is chosen.
+        # Epochs before the loss has its full penalty on off-target force are not chosen.
         improved = full(settings.loss, self.epoch / settings.epochs) and score > self.best
         self.best = score if improved else self.best
         return improved
@@ -125,16 +118,15 @@ class _Run:
 
 
 def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
-    """A fresh run, or one that goes on from a state as `_Run.as_dict` gave it."""
+    """A new run, or one continued from a state of `_Run.as_dict`."""
     settings = card.settings
     torch.manual_seed(settings.seed)
     model = D2FNet(settings.arch).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(
-        # One pass over the weights, not a dozen: a fifth of a small network's training on a CPU.
         model.parameters(),
         lr=settings.learning_rate,
         weight_decay=WEIGHT_DECAY,
-        fused=True,
+        fused=True,  # saves a fifth of a small network's training time on a CPU
     )
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=PATIENCE)
     run = _Run(model, optimizer, plateau)
@@ -157,7 +149,7 @@ def _epoch(
     report: ProgressCallback,
 ) -> dict[str, float]:
     settings = frames.settings
-    # Seeds from (seed, epoch) alone: nothing to store, so a resumed run draws what the first would have.
+    # Seeds depend on (seed, epoch) alone, so a resumed run draws as an uninterrupted one.
     seed = np.random.SeedSequence([settings.seed, epoch])
     torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
     order = frames.order(np.random.default_rng(seed), min(1.0, epoch / max(settings.epochs // 2, 1)))
@@ -176,7 +168,7 @@ def _epoch(
         progress = (epoch + i / batches) / settings.epochs
         unit, spread = scales.target, scales.spread
         terms = loss(predicted, batch.target, batch.mask, settings.loss, unit, spread, progress)
-        if i % LOOK == 0:
+        if i % CHECK_EVERY == 0:
             _finite(float(terms.sum.detach()), epoch)
             for k, v in gradient_shares(terms, predicted).items():
                 means[f"share_{k}"].update(v)
@@ -200,7 +192,7 @@ def _finite(value: float, epoch: int) -> None:
 
 
 def cosine(progress: float, warm: float = 0.05) -> float:
-    """Share of the learning rate at a point 0..1 of the run: a linear warm-up, then half a cosine to zero."""
+    """Factor on the learning rate at a point 0..1 of the run: linear warm-up, then half a cosine to zero."""
     if progress < warm:
         return (progress + 1e-3) / (warm + 1e-3)
     return 0.5 * (1 + math.cos(math.pi * (progress - warm) / (1 - warm)))
@@ -215,10 +207,9 @@ def forward(net: Any, batch: Batch, settings: TrainingSettings, scales: Scales) 
 
 @torch.no_grad()
 def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.device) -> dict[str, float]:
-    """R² and RMSE over all tissue cells and components, on the last (most real) source of the input kind.
+    """R² and RMSE over all tissue cells and components, on the input kind's last source, and the force gain.
 
-    And the gain by which the total force is missed there: a price on false force, and noise, teach a
-    network to say less than there is.
+    Noise and the penalty on off-target force make a network underestimate force; the gain corrects that.
     """
     net.eval()
     sums, forces = np.zeros(7), np.zeros(7)
@@ -240,29 +231,29 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
 
 
 def _amount(maps: torch.Tensor, settings: TrainingSettings) -> torch.Tensor:
-    """(B C,) what `total_force` is of: the sum of a density, the peak of an intensity, of (B, C, N, N)."""
+    """(B C,) sum of a density or peak of an intensity, of maps (B, C, N, N), as in `total_force`."""
     flat = maps.flatten(2)
     return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
 
 
 def _gain(forces: NDArray[np.float64], anatomies: int) -> float:
-    """Slope through the origin of true on predicted force, within `_GAINS`; 1 if too few anatomies tell."""
+    """Slope through the origin of true on predicted force, within `_GAINS`; 1 for too few anatomies."""
     pp, tp = forces[4:6]
-    if anatomies < _TELLING or not tp > 0:
+    if anatomies < _GAIN_ANATOMIES or not tp > 0:
         return 1.0
     return min(max(float(tp / pp), _GAINS[0]), _GAINS[1])
 
 
 def moments(true: torch.Tensor, predicted: torch.Tensor) -> NDArray[np.float64]:
-    """`metrics.moments`, summed on the tensors' own device: six numbers come back."""
+    """`metrics.moments`, summed on the tensors' own device."""
     t, p = true.double(), predicted.double()
     sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
     return np.array([t.numel(), *sums.tolist()])
 
 
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
-    """The state to go on from, or None for a fresh start in a fresh folder."""
-    # What a kill left of a first card has a hidden name.
+    """The state to continue from, or None for a new run in a new folder."""
+    # An interrupted write of the first card leaves a hidden file.
     if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
@@ -274,7 +265,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     planned = len(sources(there.settings.input)) > 1 or there.settings.loss == "off-target"
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
-        raise UserError(f"{out}: its schedule was made for {there.settings.epochs} epochs; keep --epochs")
+        raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
     return checkpoint.load_tensors(out / "last.pt") if (out / "last.pt").exists() else None
 
 

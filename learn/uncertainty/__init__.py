@@ -1,1 +1,1 @@
-"""How far off an answer may be, and how strange what it was made from."""
+"""Prediction intervals of forces, and out-of-distribution detection."""

@@ -1,9 +1,8 @@
-"""Split conformal prediction where the exchangeable unit is a sequence and the frames within it are not.
+"""Hierarchical split conformal prediction: units (brains) are exchangeable, the frames within them are not.
 
-Hierarchical conformal prediction: Lee, Barber and Willett, "Distribution-free inference with hierarchical
-data" (arXiv:2306.06342, 2023); the setting is that of Dunn, Wasserman and Ramdas, "Distribution-Free
-Prediction Sets for Two-Layer Hierarchical Models" (JASA 2023). Frames pooled as if each were independent
-cover too little whenever a sequence's errors go together.
+Lee, Barber and Willett, "Distribution-free inference with hierarchical data" (arXiv:2306.06342, 2023), in the
+setting of Dunn, Wasserman and Ramdas, "Distribution-Free Prediction Sets for Two-Layer Hierarchical Models"
+(JASA 2023). Frames pooled as if independent would cover too little, as errors within a sequence correlate.
 """
 
 from __future__ import annotations
@@ -16,37 +15,37 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-LEVELS = (0.9, 0.68)
-"""Shares of frames of a new unit that an interval is to hold."""
+LEVELS = (0.9, 0.68)  # coverage of a new unit's frames
 
 
 def least_units(level: float) -> int:
-    """How many units are needed before any finite factor holds `level`: 9 for 90%, 3 for 68%."""
+    """Number of units needed for a finite quantile at `level`: 9 for 90%, 3 for 68%."""
     return math.ceil(level / (1 - level) - 1e-9)
 
 
 def quantile(scores: Sequence[Floats], level: float) -> float:
-    """What the score of a frame of one more unit stays within, with a chance of `level` at least.
+    """Bound on the score of a frame of a new unit that holds with a probability of at least `level`.
 
-    Every unit weighs 1 / (K + 1), shared by its frames; the rest weighs on infinity, for the unit to come.
+    Every unit weighs 1 / (K + 1), shared by its frames; the remaining weight is at infinity, for the new
+    unit.
 
     Args:
-        scores: of each of K exchangeable units, (n,) each, any n > 0.
+        scores: (n,) of each of K exchangeable units, any n > 0.
         level: between 0 and 1.
 
     Returns:
-        The quantile; infinity where K is under `least_units`.
+        The quantile; infinity if K is under `least_units`.
     """
     return _weighted_quantile(scores, 1 / (len(scores) + 1), level)
 
 
 def share_quantile(values: Sequence[Floats], level: float) -> float:
-    """Plain quantile of what the units hold, (n,) each, every unit weighing alike: an estimate, no bound."""
+    """Quantile of the units' values, (n,) each, with equal weights of the units: an estimate, not a bound."""
     return _weighted_quantile(values, 1.0, level * len(values))
 
 
 def _weighted_quantile(units: Sequence[Floats], weight: float, share: float) -> float:
-    """Up to which value the weights, `weight` a unit, come to `share`; infinity if they don't."""
+    """Value at which the summed weights, `weight` per unit, reach `share`; infinity if they don't."""
     values = np.concatenate(units)
     each = np.concatenate([np.full(len(unit), weight / len(unit)) for unit in units])
     order = np.argsort(values, kind="stable")

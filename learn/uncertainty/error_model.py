@@ -1,4 +1,4 @@
-"""The size that an error is expected to have, from what is known without the truth."""
+"""Expected size of an error, from features that don't need the true force."""
 
 from __future__ import annotations
 
@@ -15,19 +15,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """A log-linear rule. Beyond the features it was fitted on it goes on as at their edge."""
+    """A log-linear model of the error's size, constant beyond the range of the fitted features."""
 
     intercept: FiniteFloat
     slopes: tuple[FiniteFloat, ...]
-    low: tuple[FiniteFloat, ...]
-    """Smallest of each feature that it was fitted on."""
-    high: tuple[FiniteFloat, ...]
-    """Largest."""
-    least: Positive
-    """Below this no error is expected to be, in the unit of the error."""
+    low: tuple[FiniteFloat, ...]  # smallest fitted value of each feature
+    high: tuple[FiniteFloat, ...]  # largest
+    least: Positive  # lower limit of the expected error, in its unit
 
     def predict(self, features: Floats) -> Floats:
-        """(...,) > 0 for features (..., F)."""
+        """Expected errors (...,), > 0, for features (..., F)."""
         clipped = np.clip(features, self.low, self.high)
         return np.asarray(np.maximum(np.exp(self.intercept + clipped @ np.array(self.slopes)), self.least))
 
@@ -38,8 +35,8 @@ def fit_error_model(features: Floats, error: Floats, weight: Floats, least: floa
     Args:
         features: (n, F).
         error: (n,) ≥ 0.
-        weight: (n,) > 0, of each.
-        least: what is added to an error before its logarithm, in its unit; > 0.
+        weight: (n,) > 0.
+        least: > 0, added to an error before its logarithm, in its unit.
     """
     spread = np.maximum(features.std(0), 1e-6)
     wanted, share = np.log(error + least), weight / weight.mean()

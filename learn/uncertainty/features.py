@@ -1,4 +1,4 @@
-"""What is known of a frame without its truth: how much moved, in what way, how surely it was followed."""
+"""Features of a frame that don't need the true force: size and kind of its motion, and its confidence."""
 
 from __future__ import annotations
 
@@ -8,22 +8,18 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MOTION = ("log motion", "divergence", "uniform share", "spread", "confidence", "tissue share")
-DEPTH = ("log depth motion", "confidence of depth", "uniform share of depth")
-"""What a second eye adds."""
-ANSWER = ("log size", "log area")
-"""Of the answer; the scale of an error is predicted from these too."""
+DEPTH = ("log depth motion", "confidence of depth", "uniform share of depth")  # of stereo
+ESTIMATE = ("log size", "log area")  # of the force estimate
 
-FLOOR_MM = 0.005
-"""Added to lengths of motion before their logarithm: under the noise of any flow."""
-RESTING_MM = 0.02
-"""Under this much motion [mm, root mean square] a frame says nothing of its world."""
-_REACH_MM = 10.0  # length that makes a divergence a motion
-_ACROSS = 32  # cells that are looked at, along an edge
-_LOW_SHARE = 0.02  # of the training data's force: below it all forces are alike
+FLOOR_MM = 0.005  # added to motion before its logarithm; under the noise of any flow
+RESTING_MM = 0.02  # root mean square of motion under which a frame is not judged
+_REACH_MM = 10.0  # length by which a divergence is multiplied to a motion
+_ACROSS = 32  # blocks of cells along the grid's edge
+_LOW_SHARE = 0.02  # of the training data's force; smaller forces are not distinguished
 
 
 def motion_names(depth: bool) -> tuple[str, ...]:
-    """Names of `motion_features`, of one eye or two."""
+    """Names of `motion_features`, monocular or with stereo `depth`."""
     return MOTION + DEPTH * depth
 
 
@@ -35,7 +31,7 @@ def motion_features(
 ) -> Floats:
     """Features of each frame, in the order of `motion_names`.
 
-    None needs the stiffness. Speed is not among them: sequences have no rate that a film shares.
+    None needs the stiffness or the frame rate, which differs between sequences and videos.
 
     Args:
         displacement: (T, 2 or 3, N, N) mm.
@@ -48,39 +44,41 @@ def motion_features(
     """
     inside = mask > 0
     shift, weight = _coarse(displacement * inside, inside)
-    # Of a tissue smaller than a block, the blocks that hold most of it.
+    # If the tissue is smaller than a block: the blocks that hold most of it.
     here = weight > (0.5 if (weight > 0.5).any() else 0.99 * weight.max())
     u = np.moveaxis(shift, 1, -1)[:, here].astype(np.float64)
     squared = np.square(u[..., :2]).sum(-1)
     motion = np.sqrt(squared.mean(1))
     stretch = _REACH_MM * _divergence(shift[:, :2], here, extent_mm / weight.shape[0])
-    sure = np.ones((len(u), displacement.shape[1] - 1)) if confidence is None else _mean(confidence, inside)
+    means = np.ones((len(u), displacement.shape[1] - 1))  # of the confidence over the tissue
+    if confidence is not None:
+        means = np.asarray(confidence[..., inside].mean(-1, dtype=np.float64))
     columns = [
         np.log(motion + FLOOR_MM),
         np.log((stretch + FLOOR_MM) / (motion + FLOOR_MM)),
         np.linalg.norm(u[..., :2].mean(1), axis=-1) / (motion + FLOOR_MM),
         np.sqrt(squared).mean(1) / (motion + FLOOR_MM),
-        sure[:, 0],
+        means[:, 0],
         np.full(len(u), inside.mean()),
     ]
     if displacement.shape[1] == 3:
         depth = np.sqrt(np.square(u[..., 2]).mean(1))
         columns += [
             np.log((depth + FLOOR_MM) / (motion + FLOOR_MM)),
-            sure[:, 1],
-            # A breath lifts everything, a tool only what is near.
+            means[:, 1],
+            # Breathing lifts the whole surface, an instrument only the tissue near it.
             np.abs(u[..., 2].mean(1)) / (depth + FLOOR_MM),
         ]
     return np.stack(columns, axis=1)
 
 
 def is_moving(motion: Floats) -> NDArray[np.bool_]:
-    """(T,) whether a frame of `motion_features` (T, F) has moved enough to say anything."""
+    """(T,) whether the motion of frames with `motion_features` (T, F) is above `RESTING_MM`."""
     return np.asarray(motion[:, 0] > np.log(RESTING_MM + FLOOR_MM))
 
 
-def answer_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: float) -> Floats:
-    """Features of each frame's answer, in the order of `ANSWER`, (T, 2).
+def estimate_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: float) -> Floats:
+    """Features of each frame's force estimate, in the order of `ESTIMATE`, (T, 2).
 
     Args:
         size: (T,) of the total force, as a share of the training data's.
@@ -93,7 +91,7 @@ def answer_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: floa
 
 
 def _coarse(values: NDArray[np.float32], inside: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """(T, C, n, n) means over the tissue of blocks of cells, and the share of each that is tissue, (n, n)."""
+    """Means over the tissue of blocks of cells, (T, C, n, n), and each block's share of tissue, (n, n)."""
     block = max(1, len(inside) // _ACROSS)
     n = len(inside) // block
     cut = slice(0, n * block)
@@ -107,15 +105,10 @@ def _coarse(values: NDArray[np.float32], inside: NDArray[np.bool_]) -> tuple[Flo
 
 
 def _divergence(shift: Floats, here: NDArray[np.bool_], pitch_mm: float) -> Floats:
-    """(T,) root mean square of the divergence of (T, 2, n, n), by forward differences within the tissue."""
+    """(T,) root mean square of the divergence of (T, 2, n, n), by forward differences in the tissue."""
     ends = here[:-1, :-1] & here[:-1, 1:] & here[1:, :-1]
     if not ends.any():
         return np.zeros(len(shift))
     across = np.diff(shift[:, 0], axis=2)[:, :-1][:, ends]
     down = np.diff(shift[:, 1], axis=1)[:, :, :-1][:, ends]
     return np.asarray(np.sqrt(np.square((across + down) / pitch_mm).mean(1)))
-
-
-def _mean(confidence: NDArray[np.float32], inside: NDArray[np.bool_]) -> Floats:
-    """(T, C) mean over the tissue."""
-    return np.asarray(confidence[..., inside].mean(-1, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Fixtures of tests that learn: a dataset of phantoms, and its clips."""
+"""Fixtures: a dataset of phantoms, and its clips."""
 
 from __future__ import annotations
 

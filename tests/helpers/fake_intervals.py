@@ -9,9 +9,9 @@ import numpy as np
 
 from learn.checkpoint import read_card, write_card
 from learn.uncertainty.error_model import ErrorModel
-from learn.uncertainty.features import ANSWER, motion_names
+from learn.uncertainty.features import ESTIMATE, motion_names
 from learn.uncertainty.intervals import Intervals, Spread
-from learn.uncertainty.out_of_distribution import OutOfDistribution
+from learn.uncertainty.out_of_distribution import MotionDistribution
 
 FACTORS = {"0.9": 2.0, "0.68": 1.0}
 
@@ -19,25 +19,25 @@ FACTORS = {"0.9": 2.0, "0.68": 1.0}
 def make(
     size: float = 5.0,
     axes: tuple[float, float, float] = (3.0, 4.0, 50.0),
-    usual: float = 1e6,
+    frame_limit: float = 1e6,
     source: str = "recovered",
 ) -> Intervals:
     """Half widths of the 68% interval, per unit stiffness; half of those of the 90% one.
 
-    `usual`: distance, in logarithm of motion from 1 mm, beyond which a frame is of another world.
+    `frame_limit`: distance, in logarithm of motion from 1 mm, beyond which a frame is out of distribution.
     """
-    names = (*motion_names(False), *ANSWER)
+    names = (*motion_names(False), *ESTIMATE)
 
     def spread(half: float, features: int) -> Spread:
         low, high = ((end,) * features for end in (-1e9, 1e9))
         scale = ErrorModel(float(np.log(half)), (0.0,) * features, low, high, 1e-9)
         return Spread(scale, dict(FACTORS))
 
-    count = len(names) - len(ANSWER)
+    count = len(names) - len(ESTIMATE)
     along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
     x, y, z = (spread(half, len(names)) for half in axes)
-    world = OutOfDistribution((0.0,) * count, along, usual)
-    return Intervals(names, 100.0, spread(size, len(names)), (x, y, z), world, source, 19, 19)
+    distribution = MotionDistribution((0.0,) * count, along, frame_limit)
+    return Intervals(names, 100.0, spread(size, len(names)), (x, y, z), distribution, source, 19, 19)
 
 
 def give(folder: Path, intervals: Intervals) -> Path:

@@ -1,4 +1,4 @@
-"""A model folder as training leaves it, of an untrained network with weights that say something."""
+"""A model folder of an untrained network whose random weights predict non-zero forces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from synth.system.config_file import override
 
 
 def write_model(folder: Path, *changes: str) -> Path:
-    """The folder; `changes` as on the command line, e.g. `arch.output=vector`."""
+    """Writes and returns the folder; `changes` as on the command line, e.g. `arch.output=vector`."""
     settings = override(preset("tiny"), ["size=32", "arch.levels=2", *changes])
     torch.manual_seed(0)
     net = D2FNet(settings.arch).eval()

@@ -21,7 +21,7 @@ HERE = Path(__file__).resolve().parent
 
 
 class Silent(Watcher):
-    """A watcher that remembers the attempts."""
+    """A watcher that records the attempts."""
 
     def __init__(self) -> None:
         self.attempts: list[tuple[Attempt, bool]] = []
@@ -49,7 +49,7 @@ def options(work: str, **more: object) -> Options:
 
 
 def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
-    """What a run leaves, made without worker processes."""
+    """Makes the output of a run without worker processes."""
     with claim(root, job) as folder:
         for index in range(job.sequences):
             work(job, index, root, lambda *_: None)
@@ -58,8 +58,8 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
 
 
 def start(root: Path, job: Job, work: str, **environment: str) -> subprocess.Popen[bytes]:
-    """A run in a process of its own, which can be killed."""
-    # A shell that runs tests in its background has them ignore SIGINT, and every child of theirs.
+    """Starts a run in a process of its own, which can be killed."""
+    # Tests in a shell's background ignore SIGINT, and so would their children.
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
@@ -70,12 +70,12 @@ def start(root: Path, job: Job, work: str, **environment: str) -> subprocess.Pop
 
 
 def run_here(root: Path, job: str, work: str) -> None:
-    """What the process of `start` does."""
+    """The run in the process of `start`."""
     run_job(Job.model_validate_json(job), root, options(work), Silent())
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Returns as soon as the condition holds; AssertionError when it never does."""
+    """Waits for a condition. Raises AssertionError after `seconds`."""
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "nothing happened"

@@ -1,4 +1,4 @@
-"""A clip of given motion and force, everything else being plain."""
+"""A clip of given motion and force."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from learn.data.clips import Clip
 def made_clip(
     name: object, moved: NDArray[Any], force: NDArray[Any], mask: NDArray[Any] | None = None
 ) -> Clip:
-    """`moved`: (T, 2, N, N) mm, ideal and recovered alike; `force`: (T, 3) mN; all sure, E 2 kPa."""
+    """`moved`: (T, 2, N, N) mm, ideal and recovered; `force`: (T, 3) mN; full confidence, E 2 kPa."""
     frames, _, n, _ = moved.shape
     moved = moved.astype(np.float32)
     return Clip(

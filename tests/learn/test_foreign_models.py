@@ -1,4 +1,4 @@
-"""Models from strangers and from damaged disks: card and weights are read, or refused in one line."""
+"""Untrusted and damaged models: card and weights are read, or refused with a one-line error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ run = CliRunner().invoke
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model and a store that it answers to."""
+    """A model and a store of its grid."""
     root = tmp_path_factory.mktemp("pristine")
     phantom.write(root, 0, anatomy_seed=1, frames=3)
     fake_model.write_model(root / "model")
@@ -39,7 +39,7 @@ def model(pristine: Path, tmp_path: Path) -> Path:
 
 
 def reseal(folder: Path, *at: str, value: Any) -> None:
-    """Changes a place of the card, with a seal as a stranger would make it."""
+    """Changes a value of the card and computes a valid seal."""
     tree = json.loads((folder / "config.json").read_text())
     block = tree
     for key in at[:-1]:
@@ -50,7 +50,7 @@ def reseal(folder: Path, *at: str, value: Any) -> None:
     (folder / "config.json").write_text(json.dumps(tree))
 
 
-def test_a_card_that_cant_be_right(model: Path) -> None:
+def test_a_card_with_an_invalid_value_is_refused(model: Path) -> None:
     reseal(model, "scales", "displacement_mm", value=0)
     with pytest.raises(UserError, match=r"scales\.displacement_mm"):
         read_card(model)
@@ -79,13 +79,13 @@ def test_a_flipped_bit_of_the_weights_is_found(model: Path) -> None:
 
 
 def test_a_damaged_state_of_training_is_found(model: Path) -> None:
-    """By the archive's own checksums, which PyTorch doesn't look at."""
+    """By the archive's checksums, which PyTorch ignores."""
     state = model / "last.pt"
     checkpoint.save_tensors(state, {"weights": torch.arange(10_000)})
     data = bytearray(state.read_bytes())
     data[len(data) // 2] ^= 64
     state.write_bytes(data)
-    assert torch.load(state, weights_only=True), "PyTorch has come to look at checksums"
+    assert torch.load(state, weights_only=True), "PyTorch now checks them itself"
     with pytest.raises(UserError, match="checksum"):
         load_tensors(state)
 
@@ -111,7 +111,7 @@ def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch
 
 
 class Code:
-    """Runs a command where it is unpickled."""
+    """Runs a command when it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return os.system, ("touch ran",)
@@ -126,7 +126,9 @@ class Code:
     ],
     ids=["code", "bomb", "other names"],
 )
-def test_weights_that_are_none(model: Path, make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_are_no_weights_are_refused(
+    model: Path, make: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(model)
     make(model / "weights.pt")
     reseal(model, "weights_hash", value=checkpoint._hash((model / "weights.pt").read_bytes()))

@@ -1,4 +1,4 @@
-"""TrainingSettings as words: presets changed from a command line."""
+"""Training settings from a command line."""
 
 from __future__ import annotations
 
@@ -9,19 +9,13 @@ from synth.errors import UserError
 from synth.system.config_file import override
 
 
-@pytest.mark.parametrize(
-    ("change", "key"),
-    [
-        ("bacth=3", "'batch'"),
-        ("arch.depth=true", "arch.depth"),
-    ],
-)
-def test_settings_that_cannot_be(change: str, key: str) -> None:
+@pytest.mark.parametrize(("change", "key"), [("bacth=3", "'batch'"), ("arch.depth=true", "arch.depth")])
+def test_invalid_settings_are_refused(change: str, key: str) -> None:
     with pytest.raises(UserError, match=key):
         override(preset("live"), [change])
 
 
-def test_settings_of_a_command_line_stand_anywhere_and_need_a_value() -> None:
+def test_settings_may_stand_anywhere_and_need_a_value() -> None:
     words = ["--epochs", "3", "data", "--seed=1", "loss=mse", "seed=2"]
     assert as_changes(words) == ({"epochs": "3", "seed": "2", "loss": "mse"}, ["data"])
     for broken in (["--compile", "--epochs", "3"], ["data", "--epochs"]):

@@ -1,4 +1,4 @@
-"""Who intervals are fitted on, and that no brain is on two sides."""
+"""The interval part of a split: no brain is on two sides."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def of(brains: Iterable[int], each: int = 2) -> tuple[int, ...]:
     return tuple(b * each + k for b in brains for k in range(each))
 
 
-def test_half_of_the_choosing_brains_are_kept_whole(clips: list[Clip]) -> None:
+def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: list[Clip]) -> None:
     some = many(clips, 40)
     first = Split(of(range(10)), of(range(10, 30)), of(range(30, 40)))
     found = keep_back(some, first, seed=0)
@@ -39,7 +39,7 @@ def test_half_of_the_choosing_brains_are_kept_whole(clips: list[Clip]) -> None:
     assert find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
 
 
-def test_what_a_model_has_met_and_its_test_are_not_taken(clips: list[Clip]) -> None:
+def test_brains_in_the_card_or_in_a_test_are_not_used_for_intervals(clips: list[Clip]) -> None:
     some = many(clips, 30)
     named = name_parts(some, Split(of(range(6)), of(range(6, 10)), of([10, 11])))
     known = ModelCard(preset("tiny"), Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, *named)

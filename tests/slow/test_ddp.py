@@ -28,5 +28,5 @@ def test_two_processes_train_one_model(dataset: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
     assert [json.loads(line)["epoch"] for line in (out / "history.jsonl").read_text().splitlines()] == [1, 2]
     assert load_model(out).card.epoch in (1, 2)
-    # One line of JSON: only the first process speaks.
+    # Only the first process prints its line of JSON.
     assert len([line for line in done.stdout.splitlines() if line.startswith("{")]) == 1

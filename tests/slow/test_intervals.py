@@ -1,4 +1,4 @@
-"""From a dataset to forces with intervals: phantoms of a closed form, a tiny network, brains it never met."""
+"""From a dataset to forces with intervals, with phantoms, a tiny network and brains that are new to it."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trained") / "model"
-    told = run("train", str(dataset), "-o", str(out), "--input", "recovered", "--epochs", "6", *TINY)
-    assert told["intervals"] >= 9
+    result = run("train", str(dataset), "-o", str(out), "--input", "recovered", "--epochs", "6", *TINY)
+    assert result["intervals"] >= 9
     return out
 
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tissue that moves along with all that is near: another mechanics, its forces as before."""
+    """Sequences of other mechanics: the same forces move the tissue in a wider area."""
     folder, usual = tmp_path_factory.mktemp("foreign"), phantom.displacement
 
     def dragged(x: Any, y: Any, force: Any, young: float) -> Any:
@@ -57,7 +57,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_unseen_brains_are_covered_and_another_mechanics_widens(
+def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     model: Path, dataset: Path, foreign: Path
 ) -> None:
     card = read_card(model)
@@ -71,10 +71,10 @@ def test_unseen_brains_are_covered_and_another_mechanics_widens(
     # 27 sequences: a share of 0.9 has a standard error of 0.06 if each held or failed as a whole.
     for name in ("size", "x", "y", "z"):
         assert wide[name]["mean"] > 0.9 - 3 * 0.06, name
-    assert wide["unseen"] < 0.15
-    # What one eye can't see is not said to be small.
+    assert wide["out_of_distribution"] < 0.15
+    # A component that one camera can't measure has an interval too.
     assert wide["width_z_mn"] > 0
     other, _ = run("eval", str(model), str(foreign), "--json")["coverage"]
-    assert other["unseen"] > 0.5
+    assert other["out_of_distribution"] > 0.5
     assert other["width_mn"] > 2 * wide["width_mn"]
     assert other["size"]["mean"] > 0.8

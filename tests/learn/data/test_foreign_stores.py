@@ -1,4 +1,4 @@
-"""Stores and caches from strangers: what is not as it was sealed is not trained on."""
+"""Untrusted stores and caches: data that doesn't match its seal is refused."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def own(dataset: Path, tmp_path: Path) -> Path:
 
 
 def another_flow(path: Path) -> None:
-    """Chunks of another sequence, whose own checksums are right."""
+    """Replaces chunks by those of another sequence, with valid checksums."""
     shutil.rmtree(path / "flow" / "c")
     shutil.copytree(path.with_name("000005.zarr") / "flow" / "c", path / "flow" / "c")
 
@@ -51,7 +51,7 @@ def written(name: str, value: float) -> Callable[[Path], None]:
         (written("traction", float("nan")), "traction"),
     ],
 )
-def test_what_is_not_as_sealed_is_not_trained_on(
+def test_data_that_does_not_match_its_seal_is_not_trained_on(
     own: Path, tmp_path: Path, harm: Callable[[Path], None], key: str
 ) -> None:
     harm(own / "000002.zarr")
@@ -59,7 +59,7 @@ def test_what_is_not_as_sealed_is_not_trained_on(
         load_clips(own, GRID, ("ideal",), cache=tmp_path / "cache")
 
 
-def test_nor_is_it_predicted_on(own: Path, tmp_path: Path) -> None:
+def test_data_that_does_not_match_its_seal_is_not_predicted_on(own: Path, tmp_path: Path) -> None:
     model = fake_model.write_model(tmp_path / "model")
     another_flow(own / "000002.zarr")
     words = ["predict", str(model), str(own / "000002.zarr"), "--input", "ideal", "-o", str(tmp_path / "f")]
@@ -68,7 +68,7 @@ def test_nor_is_it_predicted_on(own: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "f").exists()
 
 
-def test_a_copied_hash_poisons_no_cache(own: Path, tmp_path: Path) -> None:
+def test_a_copied_hash_does_not_fill_the_cache(own: Path, tmp_path: Path) -> None:
     """A store that claims the hash of another is refused, before and after that one is in the cache."""
     cache = tmp_path / "cache"
     load_clips(own, GRID, ("ideal",), cache=cache)
@@ -77,7 +77,7 @@ def test_a_copied_hash_poisons_no_cache(own: Path, tmp_path: Path) -> None:
     for place in (cache, tmp_path / "fresh"):
         with pytest.raises(UserError, match=r"000005\.zarr"):
             load_clips(own, GRID, ("ideal",), cache=place)
-    # All attributes of the other, seals too, over values of its own: the values tell.
+    # All attributes of the other, with seals: only the values differ.
     foreign.write_attributes(own / "000005.zarr", attrs, reseal=False)
     for path in own.glob("00000[!5].zarr"):
         shutil.rmtree(path)

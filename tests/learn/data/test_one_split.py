@@ -1,4 +1,4 @@
-"""One split a dataset: what it says is what is published, fitted, chosen on, scored and calibrated with."""
+"""One split per dataset, used for export, training, validation, scores and intervals."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def divided(*datasets: Path) -> tuple[ModelCard, Split]:
 
 
 def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
-    """The side of every sequence by its index, as each export says it."""
+    """The side of every sequence by its index, in each export."""
     formats = sorted(FORMATS.keys() - {"endonerf"})  # phantoms have no camera
     for to in formats:
         export_dataset(dataset, target / to, to)
@@ -65,8 +65,8 @@ def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
     ranges = json.loads((target / "lerobot/meta/info.json").read_text())["splits"]
     for side, (first, last) in ((side, text.split(":")) for side, text in ranges.items()):
         assert int(last) - int(first) == list(hf.values()).count(side)
-    beside = {to: {int(k): side for k, side in rows} for to, rows in zip(formats, tables, strict=True)}
-    return {"beside " + to: sides for to, sides in beside.items()} | {"hf": hf, "webdataset": shards}
+    listed = {to: {int(k): side for k, side in rows} for to, rows in zip(formats, tables, strict=True)}
+    return {f"split.csv of {to}": sides for to, sides in listed.items()} | {"hf": hf, "webdataset": shards}
 
 
 @pytest.mark.slow
@@ -83,10 +83,10 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     make(own, rng.integers(0, 14, 4).tolist(), first=len(before.sides))
     assert run(synth, ["report", str(own)]).exit_code == 0
     stored = index.read_split(own)
-    assert before.sides.items() <= stored.sides.items(), "growth moves nobody"
+    assert before.sides.items() <= stored.sides.items(), "growth changes no side"
     rows = index.read_index(own).to_pylist()
     on = {row["index"]: stored.sides[row["content_hash"]] for row in rows}
-    # What is published.
+    # Publication.
     assert {row["index"]: row["split"] for row in rows} == on
     assert not split.leaks(rows, stored)
     text = (own / "README.md").read_text()
@@ -100,7 +100,7 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     assert f"test {counts['test']}" in (own / "report.html").read_text()
     for found in exported(own, tmp_path).values():
         assert found == on
-    # What is learnt from.
+    # Training.
     card, _ = divided(own)
     assert card.dataset_splits == [stored.hash]
     sides = {part: {stored.sides[name] for name in names} for part, names in card.split.items()}
@@ -114,7 +114,7 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
 
 
-def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_path: Path) -> None:
+def test_training_sequences_are_not_scored_whatever_another_split_says(tmp_path: Path) -> None:
     own = make(tmp_path / "own", [*range(9)])
     card, _ = divided(own)
     fitted = card.split["fit"][0]
@@ -123,12 +123,12 @@ def test_what_another_split_calls_test_is_not_scored_if_it_was_fitted_on(tmp_pat
     clips = load_clips(own, BASE.grid, ["ideal"])
     with pytest.raises(UserError):
         choose_unseen(clips, own, [card])
-    # A dataset that it never met has no side that it was fitted on.
-    strangers = make(tmp_path / "strangers", [*range(20, 26)], first=30)
-    assert len(choose_unseen(load_clips(strangers, BASE.grid, ["ideal"]), strangers, [card])) == 6
+    # All sequences of a dataset that is new to the model are scored.
+    foreign = make(tmp_path / "foreign", [*range(20, 26)], first=30)
+    assert len(choose_unseen(load_clips(foreign, BASE.grid, ["ideal"]), foreign, [card])) == 6
 
 
-def test_several_datasets_are_divided_as_each_says_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
+def test_several_datasets_keep_their_splits_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
     for draw in range(6):
         rng = np.random.default_rng([36, draw])
         both = [make(tmp_path / f"{draw}-{k}", rng.permutation(12)[:9].tolist(), 20 * k) for k in range(2)]
@@ -142,7 +142,7 @@ def test_several_datasets_are_divided_as_each_says_and_no_brain_is_on_two_sides(
         assert sum(map(len, on)) == len(set.union(*on))
 
 
-def test_openings_that_overlap_are_one_group_and_the_others_are_kept_apart(tmp_path: Path) -> None:
+def test_only_overlapping_openings_are_one_group(tmp_path: Path) -> None:
     at = [(0, 0, 0), (19, 0, 0), (60, 0, 0), (0, 60, 0), (0, 60, 20), (0, 0, 90)]
     names = [f"mesh-5f at {x}, {y}, {z}" for x, y, z in at for _ in range(2)]
     own = make(tmp_path / "own", [1] * 12, opening=names)
@@ -162,7 +162,7 @@ def test_openings_that_overlap_are_one_group_and_the_others_are_kept_apart(tmp_p
 
 
 @pytest.mark.slow
-def test_train_and_eval_keep_to_it(tmp_path: Path) -> None:
+def test_train_and_eval_use_the_split(tmp_path: Path) -> None:
     own = make(tmp_path / "own", [*range(8)])
     words = ["--preset", "tiny", "--epochs", "1", "--json", "size=32", "arch.width=8"]
     done = run(cli.app, ["train", str(own), "-o", str(tmp_path / "model"), *words])

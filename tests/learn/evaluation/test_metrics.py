@@ -1,4 +1,4 @@
-"""Metrics against torchmetrics, and controls that must score what they must."""
+"""Metrics against torchmetrics, and on predictions of known score."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def pairs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_against_torchmetrics(pairs: tuple[np.ndarray, np.ndarray]) -> None:
-    true, said = pairs
-    got = agreement(moments(true[:200], said[:200]) + moments(true[200:], said[200:]))
-    t, p = torch.tensor(true), torch.tensor(said)
+    true, predicted = pairs
+    got = agreement(moments(true[:200], predicted[:200]) + moments(true[200:], predicted[200:]))
+    t, p = torch.tensor(true), torch.tensor(predicted)
     for name, metric in {
         "r2": torchmetrics.R2Score(),
         "mae": torchmetrics.MeanAbsoluteError(),
@@ -38,16 +38,16 @@ def test_against_torchmetrics(pairs: tuple[np.ndarray, np.ndarray]) -> None:
         metric.set_dtype(torch.float64)
         metric.update(p, t)
         assert getattr(got, name) == pytest.approx(float(metric.compute()), rel=1e-6), name
-    expected = 2 * np.cov(true, said, bias=True)[0, 1]
-    expected /= true.var() + said.var() + (true.mean() - said.mean()) ** 2
+    expected = 2 * np.cov(true, predicted, bias=True)[0, 1]
+    expected /= true.var() + predicted.var() + (true.mean() - predicted.mean()) ** 2
     assert got.ccc == pytest.approx(expected)
-    assert got.bias == pytest.approx((said - true).mean())
+    assert got.bias == pytest.approx((predicted - true).mean())
 
 
 def test_contact_centre() -> None:
     map_ = np.zeros((20, 20))
     map_[5:8, 10:13] = 1.0
-    map_[0, 0] = 0.4  # under half the peak: a ghost doesn't drag the centre along
+    map_[0, 0] = 0.4  # under half the peak: a false positive doesn't move the centre
     assert contact_mm(map_, 0.5).tolist() == [5.5, 3.0]
     assert np.isnan(contact_mm(np.zeros((4, 4)), 1.0)).all()
 
@@ -62,41 +62,35 @@ def truth(clip: Clip, output: str) -> np.ndarray:
     return density if output == "vector" else np.linalg.norm(density, axis=1, keepdims=True)
 
 
-def report(clips: list[Clip], said: list[np.ndarray], c: ModelCard) -> EvaluationReport:
-    return EvaluationReport({"known": [score(clip, s, c) for clip, s in zip(clips, said, strict=True)]}, c)
+def summary(clips: list[Clip], output: str, factor: np.ndarray | float) -> dict[str, float]:
+    """Scores of the truth times a factor."""
+    c = card(clips, output)
+    return EvaluationReport(
+        {"known": [score(one, truth(one, output) * factor, c) for one in clips]}, c
+    ).summary()
 
 
 @pytest.mark.parametrize("output", ["vector", "magnitude"])
-def test_the_truth_scores_one_and_no_ghosts(clips: list[Clip], output: str) -> None:
-    c = card(clips, output)
-    got = report(clips, [truth(clip, output) for clip in clips], c).summary()
+def test_scores_of_the_truth_and_of_no_force(clips: list[Clip], output: str) -> None:
+    got = summary(clips, output, 1)
     assert got["map_r2"] == pytest.approx(1, abs=1e-6)
     assert got["force_r2_pooled"] == pytest.approx(1, abs=1e-4)
-    for name in ("map_mae", "ghost", "ghost_relative", "localisation_mm", "force_bias"):
+    for name in ("map_mae", "false_positive", "false_positive_relative", "localisation_mm", "force_bias"):
         assert got[name] == pytest.approx(0, abs=5e-3), name
-
-
-@pytest.mark.parametrize("output", ["vector", "magnitude"])
-def test_saying_nothing_scores_at_most_zero(clips: list[Clip], output: str) -> None:
-    c = card(clips, output)
-    got = report(clips, [0 * truth(clip, output) for clip in clips], c).summary()
+    got = summary(clips, output, 0)
     assert got["map_r2"] <= 0
     assert got["force_r2_pooled"] <= 0
-    assert got["ghost"] == 0
+    assert got["false_positive"] == 0
 
 
-def test_a_mirrored_answer_is_not_forgiven(clips: list[Clip]) -> None:
-    """An answer that is right up to direction: the length's R² can't see it, the components' does."""
-    c = card(clips, "vector")
-    said = [truth(clip, "vector") * np.array([-1, 1, 1], np.float32)[:, None, None] for clip in clips]
-    got = report(clips, said, c).summary()
+def test_mirrored_forces_score_badly_in_the_components_alone(clips: list[Clip]) -> None:
+    got = summary(clips, "vector", np.array([-1, 1, 1], np.float32)[:, None, None])
     assert got["map_r2"] == pytest.approx(1, abs=1e-6)
     assert got["vector_r2"] < 0.7
     assert got["vector_error_mn"] > 0
 
 
-def test_two_jaws_that_cancel_are_held_to_what_each_output_can_say(clips: list[Clip]) -> None:
-    """A grasp's jaws pull against each other: no net force, yet a map of lengths rightly adds them up."""
+def test_opposite_forces_cancel_in_vectors_and_add_up_in_lengths(clips: list[Clip]) -> None:
     density = np.zeros_like(clips[0].density)
     density[3, 0, 10:14, 8:12], density[3, 0, 10:14, 20:24] = 0.01, -0.01
     clip = dataclasses.replace(clips[0], density=density, force=np.zeros_like(clips[0].force))
@@ -107,20 +101,22 @@ def test_two_jaws_that_cancel_are_held_to_what_each_output_can_say(clips: list[C
         assert (got.true_mn[3] > 0.1) == (output == "magnitude")
 
 
-def test_ghosts_are_counted_in_mn_over_a_contact_sized_patch(clips: list[Clip]) -> None:
-    c = card(clips, "magnitude")
-    ghosts = truth(clips[0], "magnitude") + np.float32(5.1 / (np.pi * 16)) * (clips[0].mask > 0)
-    faint = truth(clips[0], "magnitude") + np.float32(4.9 / (np.pi * 16)) * (clips[0].mask > 0)
-    assert score(clips[0], ghosts, c).others["ghost"] == 1
-    assert score(clips[0], faint, c).others["ghost"] < 0.05
-    assert score(clips[0], ghosts, c).others["stray_mn"] > 1
+def test_false_positives_exceed_5_mn_on_a_contact_sized_patch(clips: list[Clip]) -> None:
+    c, true = card(clips, "magnitude"), truth(clips[0], "magnitude")
+    above, below = (
+        score(clips[0], true + np.float32(mn / (np.pi * 16)) * (clips[0].mask > 0), c).others
+        for mn in (5.1, 4.9)
+    )
+    assert above["false_positive"] == 1
+    assert below["false_positive"] < 0.05
+    assert above["off_target_mn"] > 1
 
 
-def test_a_contact_found_a_cell_aside_is_no_ghost_far_away(clips: list[Clip]) -> None:
+def test_a_contact_that_is_one_cell_off_is_no_far_false_positive(clips: list[Clip]) -> None:
     c, clip = card(clips, "magnitude"), clips[2]
-    aside = np.roll(truth(clip, "magnitude"), 1, axis=3)
-    got = score(clip, aside, c)
-    assert got.others["ghost_relative"] > 0
-    assert got.others["ghost_far"] == 0
-    everywhere = aside + np.float32(0.06 * c.scales.target * clip.young_kpa) * (clip.mask > 0)
-    assert score(clip, everywhere, c).others["ghost_far"] == 1
+    shifted = np.roll(truth(clip, "magnitude"), 1, axis=3)
+    got = score(clip, shifted, c)
+    assert got.others["false_positive_relative"] > 0
+    assert got.others["false_positive_far"] == 0
+    everywhere = shifted + np.float32(0.06 * c.scales.target * clip.young_kpa) * (clip.mask > 0)
+    assert score(clip, everywhere, c).others["false_positive_far"] == 1

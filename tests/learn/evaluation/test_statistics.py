@@ -12,7 +12,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_the_interval_holds_the_truth_about_as_often_as_it_says() -> None:
+def test_the_interval_has_its_nominal_coverage() -> None:
     draw = np.random.default_rng(2)
     hits = 0
     for _ in range(200):
@@ -22,7 +22,7 @@ def test_the_interval_holds_the_truth_about_as_often_as_it_says() -> None:
 
 
 @pytest.mark.parametrize("n", [8, 40])
-def test_paired_finds_a_shift_and_does_not_invent_one(n: int) -> None:
+def test_paired_detects_a_shift_only_if_there_is_one(n: int) -> None:
     draw = np.random.default_rng(3)
     a = draw.normal(0, 5, n)
     shifted = paired(a, a - 1 + draw.normal(0, 0.3, n), rng())
@@ -42,23 +42,23 @@ def test_specimens_are_resampled_whole() -> None:
     i = over_groups(values, [*"abcde" * 4], rng())
     assert (i.low, i.high) == (2.0, 2.0)  # every specimen has both
     i = over_groups([1.0] * 16 + [6.0] * 4, [*"aaaabbbbccccddddeeee"], rng())
-    assert (i.low, i.high) == (1.0, 4.0)  # no more than three of five are the odd one, in 19 of 20 draws
+    assert (i.low, i.high) == (1.0, 4.0)  # in 19 of 20 draws at most three of five are the odd specimen
     few = over_groups(values, [*"abcd" * 5], rng())
     assert few.mean == 2
     assert np.isnan([few.low, few.high]).all()
 
 
-def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_whole_sequences() -> None:
+def test_pooled_r2_is_of_all_values_and_its_interval_of_whole_sequences() -> None:
     draw = np.random.default_rng(5)
     true = [draw.normal(size=50) * scale for scale in draw.gamma(2, 1, 20)]
-    said = [t + draw.normal(size=50) * 0.5 for t in true]
-    sums = np.array([moments(t, p) for t, p in zip(true, said, strict=True)])
+    predicted = [t + draw.normal(size=50) * 0.5 for t in true]
+    sums = np.array([moments(t, p) for t, p in zip(true, predicted, strict=True)])
     got = pooled_r2(sums, rng(), draws=8000)
-    t, p = np.concatenate(true), np.concatenate(said)
+    t, p = np.concatenate(true), np.concatenate(predicted)
     assert got.mean == pytest.approx(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
 
     def r2(i: np.ndarray) -> float:
-        t, p = np.concatenate([true[k] for k in i]), np.concatenate([said[k] for k in i])
+        t, p = np.concatenate([true[k] for k in i]), np.concatenate([predicted[k] for k in i])
         return float(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
 
     theirs = stats.bootstrap(
@@ -68,4 +68,4 @@ def test_pooled_r2_is_that_of_everything_together_and_its_interval_that_of_whole
     assert got.high == pytest.approx(theirs.confidence_interval.high, abs=0.02)
     assert np.isnan(pooled_r2(sums[:2], rng()).low)
     still = np.array([moments(np.zeros(4), np.ones(4))] * 4)
-    assert np.isnan(pooled_r2(still, rng()).mean), "no force, nothing to explain"
+    assert np.isnan(pooled_r2(still, rng()).mean), "R² needs force"

@@ -1,4 +1,4 @@
-"""Intervals beside a network's answer: where they are said, and what the card holds of them."""
+"""Prediction intervals of a network's force, and their part of the card."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def flow(size_mm: float) -> NDArray[np.float32]:
     return out
 
 
-def read(
+def estimate(
     folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0, notes: list[str] | None = None
 ) -> FrameForce:
     estimator = ForceEstimator(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
@@ -50,9 +50,9 @@ def sizes(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
-def test_bounds_are_those_of_the_card_in_newtons(vector: Path, young_kpa: float | None) -> None:
+def test_bounds_are_those_of_the_card_in_mn(vector: Path, young_kpa: float | None) -> None:
     notes: list[str] = []
-    found = read(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa, notes=notes)
+    found = estimate(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa, notes=notes)
     force, young = found.force_mn, young_kpa or 1.0
     size = np.linalg.norm(force)
     for level, factor in fake_intervals.FACTORS.items():
@@ -64,48 +64,41 @@ def test_bounds_are_those_of_the_card_in_newtons(vector: Path, young_kpa: float 
     assert notes == []
 
 
-def test_of_a_network_of_sizes_components_are_around_zero(sizes: Path) -> None:
-    band = read(fake_intervals.give(sizes, fake_intervals.make())).bands[LEVEL]
+def test_without_direction_components_are_around_zero(sizes: Path) -> None:
+    band = estimate(fake_intervals.give(sizes, fake_intervals.make())).bands[LEVEL]
     assert band.axes_high[0] == pytest.approx([12, 16, 200])
     assert band.axes_low[0] == pytest.approx([-12, -16, -200])
 
 
-def test_an_unseen_world_is_said_with_its_distance_and_widens(vector: Path) -> None:
-    usual = 0.1
+def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> None:
+    limit = 0.1
     notes: list[str] = []
-    found = read(fake_intervals.give(vector, fake_intervals.make(usual=usual)), notes=notes)
+    found = estimate(fake_intervals.give(vector, fake_intervals.make(frame_limit=limit)), notes=notes)
     assert found.map.motion is not None
     distance = abs(found.map.motion[0])
     # From 1 mm; half of the tissue moved.
     assert distance == pytest.approx(abs(np.log(0.4 * np.sqrt(0.5) + 0.005)), rel=0.03)
     wider = found.bands[0.68].high[0] - np.linalg.norm(found.force_mn)
-    assert wider == pytest.approx(10 * distance / usual)
+    assert wider == pytest.approx(10 * distance / limit)
     assert len(notes) == 1
     assert "log motion (low)" in notes[0]
-    # Stillness is no world.
     at_rest: list[str] = []
-    assert read(vector, 0.0, notes=at_rest).bands
+    assert estimate(vector, 0.0, notes=at_rest).bands
     assert at_rest == []
 
 
 @pytest.mark.parametrize("kind", ["vector", "sizes"])
-def test_the_force_that_is_fitted_on_is_the_one_that_is_read(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
+def test_fitting_and_estimation_use_the_same_force(kind: str, request: pytest.FixtureRequest) -> None:
     folder = request.getfixturevalue(kind)
-    moved, still = read(folder), read(folder, 0.0)
+    moved, still = estimate(folder), estimate(folder, 0.0)
     found = net_force(moved.map.density[None], still.map.density[None], moved.map.kind, moved.map.grid)
     assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("at", "value"),
-    [
-        (("size", "factors", "0.9"), -1.0),
-        (("features",), ["log motion"]),
-    ],
+    ("at", "value"), [(("size", "factors", "0.9"), -1.0), (("features",), ["log motion"])]
 )
-def test_intervals_that_can_not_be_are_refused(vector: Path, at: tuple[str, ...], value: object) -> None:
+def test_invalid_intervals_are_refused(vector: Path, at: tuple[str, ...], value: object) -> None:
     fake_intervals.give(vector, fake_intervals.make())
     file = vector / "config.json"
     tree = json.loads(file.read_text())

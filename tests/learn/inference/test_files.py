@@ -1,4 +1,4 @@
-"""What leaves the room: exported models, forces of files, settings from the command line."""
+"""Exported models, and forces estimated from stores, arrays and videos."""
 
 from __future__ import annotations
 
@@ -43,42 +43,29 @@ def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
     return write_model(tmp_path_factory.mktemp("model"), *request.param)
 
 
-def test_an_exported_model_says_the_same(model: Path, tmp_path: Path) -> None:
-    predictor = load_model(model)
-    file = tmp_path / "net"
-    worst = export(predictor, file)
-    said = predictor.density(
-        examples(predictor.card, 1)[0].numpy(), examples(predictor.card, 1)[1][0, 0].numpy(), 1.0
-    )
-    assert np.abs(said).max() > 0.05 * predictor.card.scales.target, "a silent network proves nothing"
-    assert worst <= 1e-4
-    note = json.loads((tmp_path / "net.json").read_text())
-    assert note["inputs"][:2] == ["displacement", "mask"]
-    assert note["grid"]["pitch_mm"] == 36 / 32
-
-
-def test_the_gain_is_in_every_map(model: Path, tmp_path: Path) -> None:
+def test_an_exported_model_predicts_the_same_force_with_its_gain(
+    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "model"
     shutil.copytree(model, folder)
     write_card(folder, replace(read_card(model), force_gain=1.25))
     plain, gained = load_model(model), load_model(folder)
-    told = examples(plain.card, 1)
-    before, after = (one.density(told[0].numpy(), told[1][0, 0].numpy(), 1.0) for one in (plain, gained))
+    inputs = examples(plain.card, 1)
+    before, after = (one.density(inputs[0].numpy(), inputs[1][0, 0].numpy(), 1.0) for one in (plain, gained))
     np.testing.assert_allclose(after, 1.25 * before, rtol=1e-5)
-    if len(told) == 2:  # the other is told more than `density` here
-        export(gained, tmp_path / "net")
+    assert np.abs(before).max() > 0.05 * plain.card.scales.target, "else the comparison proves nothing"
+    assert export(gained, tmp_path / "net") <= 1e-4
+    note = json.loads((tmp_path / "net.json").read_text())
+    assert note["inputs"][:2] == ["displacement", "mask"]
+    assert note["grid"]["pitch_mm"] == 36 / 32
+    if len(inputs) == 2:
         session = onnxruntime.InferenceSession(str(tmp_path / "net"))
-        named = {asked.name: one.numpy() for asked, one in zip(session.get_inputs(), told, strict=True)}
+        named = {put.name: one.numpy() for put, one in zip(session.get_inputs(), inputs, strict=True)}
         np.testing.assert_allclose(session.run(None, named)[0], after, rtol=1e-3, atol=1e-6)
-
-
-def test_an_unfaithful_export_is_refused_and_removed(
-    model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError):
-        export(load_model(model), tmp_path / "net")
-    assert not list(tmp_path.iterdir())
+        export(gained, tmp_path / "refused")
+    assert not list(tmp_path.glob("refused*"))
 
 
 def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_path: Path) -> None:
@@ -98,14 +85,14 @@ def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_p
         assert done.exit_code == 0, done.output
     before = arrays.read_bytes()
     assert run(app, ["predict", str(model), str(arrays), "-o", str(tmp_path)]).exit_code == 2
-    assert arrays.read_bytes() == before, "what is read is not written over"
+    assert arrays.read_bytes() == before, "the input is not overwritten"
     with np.load(tmp_path / "out/000002.npz") as a, np.load(tmp_path / "out/mine.npz") as b:
         np.testing.assert_array_equal(a["density"], b["density"])
         assert a["force_mn"].shape == (6, 3)
         np.testing.assert_allclose(np.linalg.norm(a["force_mn"], axis=1), a["total_force_mn"], rtol=1e-6)
 
 
-def write_film(file: Path, frames: int = 3) -> None:
+def write_video(file: Path, frames: int = 3) -> None:
     """Texture that slides a pixel a frame to the right, as lossless as H.264 gets."""
     rng = np.random.default_rng(0)
     wide = cv2.GaussianBlur(rng.uniform(60, 200, (48, 80)).astype(np.float32), None, 1.5)
@@ -121,45 +108,45 @@ def write_film(file: Path, frames: int = 3) -> None:
 
 
 def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
-    write_film(tmp_path / "film.mp4")
+    write_video(tmp_path / "video.mp4")
     marked = np.zeros((48, 64), np.uint8)
     marked[8:40, 8:56] = 255
     cv2.imwrite(str(tmp_path / "tissue.png"), marked)
-    args = ["predict", str(model), str(tmp_path / "film.mp4"), "-o", str(tmp_path), "--scale", "0.4"]
+    args = ["predict", str(model), str(tmp_path / "video.mp4"), "-o", str(tmp_path), "--scale", "0.4"]
     done = run(
         app, [*args, "--tissue", str(tmp_path / "tissue.png"), "--flow", "dis", "--young", "1", "--json"]
     )
     assert done.exit_code == 0, done.output
-    with np.load(tmp_path / "film.npz") as found:
+    with np.load(tmp_path / "video.npz") as found:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
         assert found["trusted"].all()
-    footage = Footage(read_video(tmp_path / "film.mp4"), "film", lambda size: marked > 0)
-    seen = [frame.flow for frame in VideoFlow(footage, RecordingFlowSettings("dis", rate_hz=None)).frames()]
-    assert np.abs(seen[0]).max() == 0
-    np.testing.assert_allclose(seen[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
+    footage = Footage(read_video(tmp_path / "video.mp4"), "video", lambda size: marked > 0)
+    flows = [frame.flow for frame in VideoFlow(footage, RecordingFlowSettings("dis", rate_hz=None)).frames()]
+    assert np.abs(flows[0]).max() == 0
+    np.testing.assert_allclose(flows[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 
 
-def test_an_unknown_scale_is_said_and_takes_e_with_it(
+def test_an_unknown_scale_is_reported_and_e_ignored(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_film(tmp_path / "film.mp4", 1)
+    write_video(tmp_path / "video.mp4", 1)
     monkeypatch.chdir(tmp_path)
-    film = ["predict", str(model), "film.mp4", "--flow", "dis"]
-    # A picture of 64 px taken to be 32 mm wide; E is of no use.
-    for name, asked in (("asked", ["--scale", "unknown", "--young", "3"]), ("as", ["--scale", "0.5"])):
-        done = run(app, [*film, *asked, "--out", name])
+    predict = ["predict", str(model), "video.mp4", "--flow", "dis"]
+    # The picture of 64 px is assumed to be 32 mm wide.
+    for name, scale in (("unknown", ["--scale", "unknown", "--young", "3"]), ("stated", ["--scale", "0.5"])):
+        done = run(app, [*predict, *scale, "--out", name])
         assert done.exit_code == 0, done.output
-    unknown, stated = (np.load(Path(name, "film.npz")) for name in ("asked", "as"))
+    unknown, stated = (np.load(Path(name, "video.npz")) for name in ("unknown", "stated"))
     np.testing.assert_array_equal(unknown["total_force_mn"], stated["total_force_mn"])
     assert not unknown["young_known"]
     assert unknown["notes"][0] == UNKNOWN_NOTE
     assert UNKNOWN_NOTE not in stated["notes"]
-    assert run(app, [*film, "--scale", "-1"]).exit_code == 2
+    assert run(app, [*predict, "--scale", "-1"]).exit_code == 2
 
 
 def test_stiffness_from_a_press(clips: list[Clip]) -> None:
-    """A model that is right per unit stiffness finds E, whatever E it starts from."""
+    """With a perfect model per unit stiffness E is found for any typical E."""
     clip = clips[2]
     at_rest = 0.3 * np.abs(clip.density).max() * clip.mask
 
@@ -168,8 +155,8 @@ def test_stiffness_from_a_press(clips: list[Clip]) -> None:
         card = ModelCard(settings, measure_scales(clips, settings), 0.7, {}, {})
 
         def density(self, moved: np.ndarray, mask: object, young: float, sure: object) -> np.ndarray:
-            said = clip.density if moved.any() else 0 * clip.density[: len(moved)]
-            return (said + at_rest) * np.float32(young)  # its answer to no motion is not 0
+            density = clip.density if moved.any() else 0 * clip.density[: len(moved)]
+            return (density + at_rest) * np.float32(young)  # not 0 without motion
 
     def found(force: np.ndarray) -> float:
         return stiffness(Right(), clip.displacement["ideal"], clip.mask, force)  # type: ignore[arg-type]

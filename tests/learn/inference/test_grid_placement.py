@@ -1,4 +1,4 @@
-"""Where the grid lies on a picture that is wider than it."""
+"""Position of the grid on a picture that is wider than it."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     alone = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0).estimate(part).force_mn
     assert force == pytest.approx(alone, rel=0.05, abs=0.02 * float(np.abs(alone).max()))
     middle = predictor(moved, _WIDE, _MM_PER_PX, 1.0).force_mn
-    deaf = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0, "intact")
-    assert np.array_equal(deaf.estimate(part).force_mn, alone)
-    assert [len(one.notes) for one in (estimator, deaf)] == [1, 1]
+    ignoring = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0, "intact")
+    assert np.array_equal(ignoring.estimate(part).force_mn, alone)
+    assert [len(one.notes) for one in (estimator, ignoring)] == [1, 1]
     assert middle is not None
     assert float(np.linalg.norm(middle - found.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))
     assert any("wider than the network's" in note for note in estimator.notes)

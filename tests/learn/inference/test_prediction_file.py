@@ -1,4 +1,4 @@
-"""What `learn predict` leaves behind is documented, and says the same in all of its files."""
+"""Files of `learn predict`: documented fields, equal in all files."""
 
 from __future__ import annotations
 
@@ -62,13 +62,12 @@ def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path
         )
         assert [float(row["force_y_mn"]) for row in rows] == pytest.approx(found["force_mn"][:, 1], rel=1e-5)
         assert [float(row["time_s"]) for row in rows] == pytest.approx(sequence["time"][:], rel=1e-5)
-    film = frames(tmp_path / "000000.force.mp4")
-    assert len(film) == sequence.frames
-    assert film[0].shape[0] > sequence.size[0], "the curve lies below the picture"
+    overlay = frames(tmp_path / "000000.force.mp4")
+    assert len(overlay) == sequence.frames
+    assert overlay[0].shape[0] > sequence.size[0], "the curve lies below the picture"
 
 
-def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
-    """Against the network's own way from the grid to the picture."""
+def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, model: Path) -> None:
     (motion,) = motions(data / "000000.zarr", "ideal")
     predictor = load_model(model)
     found = apply(predictor, motion)
@@ -77,8 +76,7 @@ def test_the_map_lies_where_the_network_saw_it(data: Path, model: Path) -> None:
     cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
     there = prediction_file.on_picture(cells, found, 2, motion.tissue.shape)
     back = view.resample.mean(there, np.ones(motion.tissue.shape, bool))
-    seen = view.mask > 0
-    assert np.abs(back - cells)[seen].max() < 0.1
+    assert np.abs(back - cells)[view.mask > 0].max() < 0.1
     row, column = (np.average(axis, weights=there) for axis in np.indices(there.shape))
     x, y = found["centres_px"][2]
     step = found["pitch_mm"] / found["scale_mm_per_px"]

@@ -8,7 +8,7 @@ from learn.network.d2fnet import BOUNDS, Architecture, D2FNet
 from learn.network.traced import Quick
 
 
-def test_the_papers_network_has_its_size() -> None:
+def test_the_published_network_has_its_size() -> None:
     arch = Architecture(output="magnitude")
     with torch.device("meta"):
         count = parameters(D2FNet(arch))
@@ -36,7 +36,7 @@ def test_shapes_mask_and_bounds(output: str, stem: int, levels: int) -> None:
 
 
 @pytest.mark.parametrize(("output", "stem"), [("magnitude", 1), ("vector", 1), ("magnitude", 4)])
-def test_every_parameter_is_reached_by_the_gradient(output: str, stem: int) -> None:
+def test_every_parameter_has_a_gradient(output: str, stem: int) -> None:
     model = D2FNet(Architecture(width=8, levels=2, stem=stem, output=output))  # type: ignore[arg-type]
     x = torch.randn(2, 5, 32, 32)
     x[:, 3] = 1
@@ -44,7 +44,7 @@ def test_every_parameter_is_reached_by_the_gradient(output: str, stem: int) -> N
     assert not [n for n, p in model.named_parameters() if p.grad is None]
 
 
-def test_the_quick_network_says_the_same_in_any_batch() -> None:
+def test_the_quick_network_is_equal_in_any_batch() -> None:
     torch.manual_seed(0)
     arch = Architecture(width=8, stem=4, levels=2)
     model = D2FNet(arch).eval()
@@ -65,12 +65,12 @@ def test_relative_twice_the_motion_is_twice_the_force(depth: bool) -> None:
     net = D2FNet(arch).eval()
     for head in net.heads.ranges:
         torch.nn.init.normal_(head.weight, std=0.5)
-    told = torch.randn(2, len(arch.channels), 32, 32)
+    x = torch.randn(2, len(arch.channels), 32, 32)
     flags = [3, 5, 7] if depth else [3, 5]
-    told[:, flags] = (torch.rand(2, len(flags), 32, 32) > 0.3).float()
-    twice = told * 2
-    twice[:, flags] = told[:, flags]
+    x[:, flags] = (torch.rand(2, len(flags), 32, 32) > 0.3).float()
+    twice = x * 2
+    twice[:, flags] = x[:, flags]
     with torch.no_grad():
-        one, two = net(told), net(twice)
+        one, two = net(x), net(twice)
     assert one.abs().max() > 0.1
     torch.testing.assert_close(two, 2 * one, rtol=1e-3, atol=1e-4)

@@ -15,65 +15,68 @@ def maps(*values: float) -> torch.Tensor:
 
 MASK = maps(1, 1, 1, 0)
 TRUE = maps(0.0, 0.1, 2.0, 9.0)
-SAID = maps(0.4, 0.0, 1.0, 5.0)
+PREDICTED = maps(0.4, 0.0, 1.0, 5.0)
 # unit 4 → low below 0.2; spread 2. Errors over the spread: 0.2, -0.05, -0.5; the last cell is masked.
 # SSE 0.2925; truth over spread 0, .05, 1: mean 0.35, SST 1.0025 - 3·0.1225 = 0.635
 SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
 
 
 @pytest.mark.parametrize(
-    ("kind", "error", "r2", "ghost"),
+    ("kind", "error", "r2", "off_target"),
     [
         ("mse", SQUARED, 0.0, 0.0),
         ("mse-frame", 0.5 * SQUARED, 0.5 * R2, 0.0),
-        # Three times the price in the first cell alone: low, over-predicted.
+        # Three times the weight in the first cell alone: low, over-predicted.
         ("antighost", 0.7 * (3 * 0.04 + 0.0025 + 0.25) / 3, 0.3 * R2, 0.0),
         # The first cell alone is free (under 0.04).
         ("off-target", 0.5 * SQUARED, 0.5 * R2, 8 * 0.4 / 3 / 2.0),
     ],
 )
-def test_by_hand(kind: Loss, error: float, r2: float, ghost: float) -> None:
-    terms = loss(SAID, TRUE, MASK, kind, unit=4.0, spread=2.0)
-    found = [float(one) for one in (terms.error, terms.r2, terms.background, terms.sum)]
-    assert found == pytest.approx([error, r2, ghost, error + r2 + ghost], rel=1e-5)
-    assert torch.isfinite(loss(SAID, 0 * TRUE, MASK, kind, 4.0, 2.0).sum), "a batch at rest"
+def test_terms_by_hand(kind: Loss, error: float, r2: float, off_target: float) -> None:
+    terms = loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0)
+    found = [float(one) for one in (terms.error, terms.r2, terms.off_target, terms.sum)]
+    assert found == pytest.approx([error, r2, off_target, error + r2 + off_target], rel=1e-5)
+    assert torch.isfinite(loss(PREDICTED, 0 * TRUE, MASK, kind, 4.0, 2.0).sum), "a batch at rest"
 
 
-def test_the_price_of_ghosts_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
-    ghost = [
-        float(loss(SAID, TRUE, MASK, "off-target", 4.0, 2.0, at).background) for at in (0.2, 0.5, 0.75, 1.0)
+def test_the_off_target_penalty_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
+    off_target = [
+        float(loss(PREDICTED, TRUE, MASK, "off-target", 4.0, 2.0, at).off_target)
+        for at in (0.2, 0.5, 0.75, 1.0)
     ]
-    assert ghost == pytest.approx([0, ghost[3] / 2, ghost[3], ghost[3]])
+    assert off_target == pytest.approx([0, off_target[3] / 2, off_target[3], off_target[3]])
 
 
-def test_r2_is_that_of_torchmetrics_and_sees_bias() -> None:
+def test_r2_is_that_of_torchmetrics_and_drops_with_bias() -> None:
     torch.manual_seed(0)
-    true, said = torch.rand(2, 1, 8, 8) * 4, torch.rand(2, 1, 8, 8) * 4
+    true, predicted = torch.rand(2, 1, 8, 8) * 4, torch.rand(2, 1, 8, 8) * 4
     mask = torch.ones(2, 1, 8, 8)
     metric = torchmetrics.R2Score()
-    metric.update(said.flatten(), true.flatten())
-    assert float(1 - unexplained(said, true, mask, 1.0)) == pytest.approx(float(metric.compute()), rel=1e-4)
+    metric.update(predicted.flatten(), true.flatten())
+    assert float(1 - unexplained(predicted, true, mask, 1.0)) == pytest.approx(
+        float(metric.compute()), rel=1e-4
+    )
     assert float(unexplained(true + 1, true, mask, 1.0)) > 0.5
 
 
-def test_r2_frame_by_frame_gives_a_weak_frame_the_weight_of_a_strong_one() -> None:
+def test_r2_by_frame_weighs_weak_and_strong_frames_equally() -> None:
     torch.manual_seed(1)
     true = torch.rand(1, 1, 8, 8)
     pair = torch.cat([4 * true, 2 * true])
     ones = torch.ones(2, 1, 8, 8)
     weak = pair * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1)
     strong = pair * torch.tensor([0.5, 1.0]).view(2, 1, 1, 1)
-    both = [float(unexplained(said, pair, ones, 1.0, by_frame=True)) for said in (weak, strong)]
+    both = [float(unexplained(predicted, pair, ones, 1.0, by_frame=True)) for predicted in (weak, strong)]
     assert both[0] == pytest.approx(both[1], rel=1e-4)
-    whole = [float(unexplained(said, pair, ones, 1.0)) for said in (weak, strong)]
+    whole = [float(unexplained(predicted, pair, ones, 1.0)) for predicted in (weak, strong)]
     assert whole[1] == pytest.approx(4 * whole[0], rel=1e-4)
     alone = [float(unexplained(s[None], p[None], ones[:1], 1.0)) for s, p in zip(weak, pair, strict=True)]
     assert both[0] == pytest.approx(sum(alone) / 2, rel=1e-4)
 
 
 def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
-    said = torch.zeros(1, 3, 1, 2, requires_grad=True)
+    predicted = torch.zeros(1, 3, 1, 2, requires_grad=True)
     true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
-    loss(said, true, ones, "off-target", 4.0, 1.0).sum.backward()
-    assert said.grad is not None
-    assert torch.isfinite(said.grad).all()
+    loss(predicted, true, ones, "off-target", 4.0, 1.0).sum.backward()
+    assert predicted.grad is not None
+    assert torch.isfinite(predicted.grad).all()

@@ -65,7 +65,7 @@ def test_killed_and_resumed_equals_uninterrupted(
 
 
 def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network that can't even come to remember what it is shown is broken; one that is stuck loses 0.9."""
+    """The network overfits six sequences; without learning the loss stays at 0.9."""
     settings = small(epochs=8, batch=4, learning_rate=5e-3)
     settings = replace(settings, arch=replace(settings.arch, dropout=0.0))
     draw = FrameDataset.order
@@ -75,14 +75,16 @@ def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.
     assert losses[-1] < 0.6 < 0.8 < losses[0]
 
 
-def test_only_unseen_sequences_are_scored(clips: list[Clip], split: Split, model: Path) -> None:
+def test_sequences_of_training_brains_are_not_scored(clips: list[Clip], split: Split, model: Path) -> None:
     card = checkpoint.read_card(model)
     assert [c.name for c in unseen(clips, card)] == [clips[i].name for i in split.test]
     copied = dataclasses.replace(clips[split.fit[0]], content_hash="x")
     assert unseen([copied], card) == []
 
 
-def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path, clips: list[Clip]) -> None:
+def test_prediction_from_a_picture_equals_that_on_the_grid(
+    model: Path, dataset: Path, clips: list[Clip]
+) -> None:
     predictor = load_model(model)
     sequence = Dataset(dataset)[4]
     map_ = predictor(
@@ -102,7 +104,7 @@ def test_prediction_on_a_picture_is_that_on_the_grid(model: Path, dataset: Path,
     )
 
 
-def test_the_same_motion_filmed_at_another_resolution_is_the_same_force(model: Path) -> None:
+def test_force_does_not_depend_on_the_resolution(model: Path) -> None:
     predictor = load_model(model)
 
     def force(size: int, scale: float) -> float:
@@ -130,7 +132,7 @@ def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> Non
         train(clips, Split((0, 2), (3,), (1,)), small(), tmp_path / "m")
 
 
-def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force(clips: list[Clip]) -> None:
+def test_surface_motion_is_added_to_half_of_the_frames_without_force(clips: list[Clip]) -> None:
     settings = small(surface_motion_mm=0.5)
     frames = FrameDataset(clips, settings)
     items = [FrameItem(c, t, "ideal") for c in range(len(clips)) for t in range(clips[c].frames)]
@@ -150,13 +152,9 @@ def test_sway_moves_the_whole_surface_of_half_of_the_frames_and_leaves_the_force
 
 @pytest.mark.parametrize(
     ("share", "anatomies", "limits"),
-    [
-        (0.8, 8, (1.0, 1.5)),
-        (0.8, 7, (1.0, 1.0)),
-        (2.0, 8, (0.67, 0.67)),
-    ],
+    [(0.8, 8, (1.0, 1.5)), (0.8, 7, (1.0, 1.0)), (2.0, 8, (0.67, 0.67))],
 )
-def test_what_a_network_says_too_little_of_the_force_is_its_gain(
+def test_the_force_gain_corrects_an_underestimate(
     clips: list[Clip],
     monkeypatch: pytest.MonkeyPatch,
     share: float,
@@ -164,22 +162,22 @@ def test_what_a_network_says_too_little_of_the_force_is_its_gain(
     limits: tuple[float, float],
 ) -> None:
     settings = small()
-    true, said = [], []
+    true, predicted = [], []
 
     def forward(_: object, batch: Batch, *__: object) -> torch.Tensor:
-        """Says more of one frame than of another, twice as much on one side, and junk where no tissue is."""
+        """The truth with errors that vary by frame and by side, and a large force outside the tissue."""
         frames = torch.linspace(0.6, 1.4, len(batch.target))[:, None, None, None]
         side = torch.linspace(1.5, 0.5, settings.size)
-        answer = share * frames * side * batch.target
+        density = share * frames * side * batch.target
         true.extend((batch.target * batch.mask).sum((2, 3)).flatten().tolist())
-        said.extend((answer * batch.mask).sum((2, 3)).flatten().tolist())
-        return answer + 9 * (1 - batch.mask)
+        predicted.extend((density * batch.mask).sum((2, 3)).flatten().tolist())
+        return density + 9 * (1 - batch.mask)
 
     monkeypatch.setattr("learn.training.train.forward", forward)
-    told = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
-    chosen = FrameDataset(told, settings)
+    select = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
+    chosen = FrameDataset(select, settings)
     found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings), torch.device("cpu"))
-    slope = np.dot(true, said) / max(np.dot(said, said), 1e-30)
+    slope = np.dot(true, predicted) / max(np.dot(predicted, predicted), 1e-30)
     assert found["select_gain"] == pytest.approx(np.clip(slope, *limits), rel=1e-6)
     if limits == (1.0, 1.5):
-        assert 1.0 < slope < 1.5, "within the limits nothing else is tested"
+        assert 1.0 < slope < 1.5, "else the limits are tested twice"

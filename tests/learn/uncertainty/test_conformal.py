@@ -1,4 +1,4 @@
-"""Coverage of hierarchical split conformal prediction on data whose truth is a formula."""
+"""Coverage of hierarchical split conformal prediction on drawn scores."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def coverage(
 
 
 @pytest.mark.parametrize(("units", "level"), [(9, 0.9), (12, 0.9), (19, 0.9), (24, 0.68)])
-def test_where_a_unit_errs_as_one_coverage_is_exactly_that_of_ranks(units: int, level: float) -> None:
+def test_coverage_of_constant_units_is_that_of_ranks(units: int, level: float) -> None:
     found, error = coverage(units, 6, 0.0, level, seed=units)
     exact = math.ceil((units + 1) * level - 1e-9) / (units + 1)
     assert exact >= level
@@ -41,7 +41,7 @@ def test_where_a_unit_errs_as_one_coverage_is_exactly_that_of_ranks(units: int, 
 
 
 @pytest.mark.parametrize("own", [0.3, 3.0])
-def test_it_covers_what_it_says_however_frames_go_together(own: float) -> None:
+def test_coverage_does_not_depend_on_the_correlation_within_units(own: float) -> None:
     found, error = coverage(19, 6, own, 0.9, seed=1)
     assert found >= 0.9 - 3 * error
     assert found <= 0.9 + 1 / 20 + 3 * error
@@ -54,8 +54,7 @@ def test_frames_pooled_as_if_independent_cover_too_little() -> None:
     assert held >= 0.9 - 3 * error
 
 
-def test_long_easy_units_do_not_outvote_short_hard_ones() -> None:
-    """Every unit weighs alike: a frame of a new unit, drawn unit first, is what coverage is of."""
+def test_units_weigh_equally_whatever_their_length() -> None:
     rng, held, pooled = np.random.default_rng(3), [], []
     for _ in range(1000):
         hard = rng.random(21) < 0.3

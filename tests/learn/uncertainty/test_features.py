@@ -1,4 +1,4 @@
-"""Features of motions that are formulas, and the distance from clouds of known covariance."""
+"""Features of known motions, and distances in samples of known covariance."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from learn.uncertainty.features import (
-    FLOOR_MM,
-    MOTION,
-    motion_features,
-)
+from learn.uncertainty.features import FLOOR_MM, MOTION, motion_features
 from learn.uncertainty.out_of_distribution import describe_out_of_distribution, fit_distribution
 
 Floats = NDArray[np.float64]
 
 EXTENT_MM = 32.0
+MEAN = np.array([3.0, 1.0, -2.0])
+MIX = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
 
 
 def field(n: int, kind: str) -> NDArray[np.float32]:
@@ -32,7 +30,7 @@ def named(features: Floats) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("n", [32, 256])
-def test_a_picture_that_moves_as_one_does_not_stretch(n: int) -> None:
+def test_uniform_motion_has_no_divergence(n: int) -> None:
     found = named(motion_features(field(n, "moved"), np.ones((n, n), np.float32), None, EXTENT_MM))
     share = 0.5 / (0.5 + FLOOR_MM)
     assert found["log motion"] == pytest.approx(np.log(0.5 + FLOOR_MM), abs=1e-6)
@@ -43,7 +41,7 @@ def test_a_picture_that_moves_as_one_does_not_stretch(n: int) -> None:
 
 
 @pytest.mark.parametrize("n", [32, 256])
-def test_a_stretch_has_the_divergence_it_has(n: int) -> None:
+def test_a_stretch_has_its_divergence(n: int) -> None:
     mask = np.ones((n, n), np.float32)
     mask[: n // 2] = 0
     sure = np.full((1, 1, n, n), 0.25, np.float32)
@@ -58,7 +56,7 @@ def test_a_stretch_has_the_divergence_it_has(n: int) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_tissue_smaller_than_a_block_of_cells_has_features_too() -> None:
+def test_tissue_smaller_than_a_block_of_cells_has_features() -> None:
     mask = np.zeros((256, 256), np.float32)
     mask[100:102, 100:103] = 1
     found = named(motion_features(field(256, "moved"), mask, None, EXTENT_MM))
@@ -68,41 +66,39 @@ def test_a_tissue_smaller_than_a_block_of_cells_has_features_too() -> None:
 
 def cloud(rng: np.random.Generator, sequences: int, frames: int = 10) -> list[Floats]:
     """Moving frames of known middle and covariance."""
-    mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
-    return [np.array([3.0, 1.0, -2.0]) + rng.normal(size=(frames, 3)) @ mix.T for _ in range(sequences)]
+    return [MEAN + rng.normal(size=(frames, 3)) @ MIX.T for _ in range(sequences)]
 
 
 def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
     rng = np.random.default_rng(0)
-    world = fit_distribution(cloud(rng, 1000), cloud(rng, 1000))
-    assert world is not None
-    assert world.usual == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
-    mix = np.array([[1.0, 0.0, 0.0], [0.5, 0.7, 0.0], [-0.2, 0.1, 0.4]])
-    far = np.array([[3.0, 1.0, -2.0]]) + 9 * mix[:, 2]
-    assert world.distance(far)[0] == pytest.approx(9.0, rel=0.03)
-    assert world.widening(far)[0] == pytest.approx(9.0 / world.usual, rel=0.03)
-    assert world.widening(np.array([[3.0, 1.0, -2.0]]))[0] == 1
+    found = fit_distribution(cloud(rng, 1000), cloud(rng, 1000))
+    assert found is not None
+    assert found.frame_limit == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
+    far = MEAN[None] + 9 * MIX[:, 2]
+    assert found.distance(far)[0] == pytest.approx(9.0, rel=0.03)
+    assert found.widening(far)[0] == pytest.approx(9.0 / found.frame_limit, rel=0.03)
+    assert found.widening(MEAN[None])[0] == 1
 
 
-def test_of_recordings_like_those_it_was_calibrated_on_one_in_twenty_is_an_unseen_world() -> None:
+def test_one_in_twenty_recordings_like_the_calibration_is_out_of_distribution() -> None:
     rng = np.random.default_rng(1)
-    world = fit_distribution(cloud(rng, 300), cloud(rng, 300))
-    assert world is not None
-    world = world.calibrated(cloud(rng, 400, frames=6))
-    said = [bool(describe_out_of_distribution(world, "abc", one)) for one in cloud(rng, 2000, frames=6)]
-    assert np.mean(said) == pytest.approx(0.05, abs=0.025)
+    found = fit_distribution(cloud(rng, 300), cloud(rng, 300))
+    assert found is not None
+    found = found.calibrated(cloud(rng, 400, frames=6))
+    flags = [bool(describe_out_of_distribution(found, "abc", one)) for one in cloud(rng, 2000, frames=6)]
+    assert np.mean(flags) == pytest.approx(0.05, abs=0.025)
     # The feature that is far is named, though all three go together.
     off = cloud(rng, 1)[0] + np.array([0.0, 0.0, -9.0])
-    (line,) = describe_out_of_distribution(world, ("one", "two", "three"), off)
+    (line,) = describe_out_of_distribution(found, ("one", "two", "three"), off)
     assert "three (low)" in line
     assert "one (" not in line
 
 
-def test_a_resting_frame_is_of_no_world() -> None:
+def test_frames_at_rest_have_no_distance() -> None:
     rng = np.random.default_rng(2)
-    world = fit_distribution(cloud(rng, 20), cloud(rng, 20))
-    assert world is not None
-    assert world.distance(np.array([[-5.0, 80.0, 80.0]]))[0] == 0
+    found = fit_distribution(cloud(rng, 20), cloud(rng, 20))
+    assert found is not None
+    assert found.distance(np.array([[-5.0, 80.0, 80.0]]))[0] == 0
     resting = [np.full((4, 3), -5.0)]
     assert fit_distribution(resting, cloud(rng, 3)) is None
     assert fit_distribution(cloud(rng, 3), resting) is None
