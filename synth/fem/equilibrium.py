@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 TOLERANCE = 2e-4
 """Force out of balance, as a part of the load, at which a step ends."""
 _HISTORY, _ITERATIONS, _ARMIJO = 8, 200, 1e-4
-_DIRECTIONS = 3  # of loads, up to which states are foretold from all that are known
+_DIRECTIONS = 3  # of loads, up to which a state is extrapolated from all earlier ones
 
 
 _Step = tuple[Floats, Floats, float, Floats]
@@ -30,21 +30,17 @@ class NoEquilibrium(UserError):
 
 
 class InvertedElement(UserError):
-    """The load is past what the mesh can follow: an element is flat or inside out."""
+    """The load is too large for the mesh: an element is flat or inside out."""
 
 
 @dataclass(frozen=True)
 class LoadPath:
     """States of the volume over T loads, for E = 1 kPa."""
 
-    displacement: Floats
-    """(T, N, 3) mm."""
-    jacobian: Floats
-    """(T,) smallest det F, at quadrature points and the elements' corners."""
-    energy: Floats
-    """(T,) mN mm."""
-    residual: Floats
-    """(T,) force out of balance over the load, in the norm of the inverse stiffness; 0 without load."""
+    displacement: Floats  # (T, N, 3) mm
+    jacobian: Floats  # (T,) smallest det F, at quadrature points and the elements' corners
+    energy: Floats  # (T,) mN mm
+    residual: Floats  # (T,) out-of-balance force over the load, in the inverse stiffness's norm; 0 unloaded
 
 
 Step = Callable[[int, Floats, Floats], tuple[Floats, State, float]]
@@ -63,7 +59,7 @@ def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPat
     Raises:
         InvertedElement: names frame, load and element.
         NoEquilibrium: the iteration stalled; names frame and load.
-        NotFinite: a number is none.
+        NotFinite: a displacement or an energy is not finite.
     """
     return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads))
 
@@ -76,15 +72,15 @@ def follow_loads(
     tolerance: float = TOLERANCE,
     substeps: int = 1,
 ) -> LoadPath:
-    """State after state under each load in turn, from rest; refuses what is no deformation or no balance.
+    """States under each load in turn, from rest; rejects inverted, infinite and unbalanced ones.
 
     Args:
         system: the equations.
         loads: (S, N, 3) mN for E = 1 kPa.
         load_parameter: (T,) P = F/(E a^2) of each frame, for messages.
-        step: what finds the state under a load.
+        step: finds the state under one load.
         tolerance: force out of balance that is accepted, as a part of the largest load.
-        substeps: of a frame; the first one has only one.
+        substeps: loads per frame; the first frame has one.
 
     Raises:
         As `solve_path`.
@@ -107,14 +103,14 @@ def follow_loads(
 
 
 class _QuasiStatic:
-    """Equilibrium under a load: one solve of a linear law; else L-BFGS from a prediction by states found."""
+    """Equilibrium under a load: one solve for the linear law; else L-BFGS from an extrapolated start."""
 
     def __init__(self, system: System, loads: Floats) -> None:
         self._system, self._linear = system, _LinearResponse(system)
         peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
         self._peak = float(np.sqrt(np.vdot(peak, peak))) or 1.0
         self._scale = float(np.sqrt(np.vdot(peak, self._linear(peak)))) or 1.0
-        self._bends = _Bends(self._linear)
+        self._nonlinear = _NonlinearExtrapolation(self._linear)
 
     def __call__(self, number: int, load: Floats, last: Floats) -> tuple[Floats, State, float]:
         system = self._system
@@ -122,13 +118,14 @@ class _QuasiStatic:
             u = self._linear(load)
             state = system.state(u)
             return u, state, float(np.linalg.norm(on_free(system, load - state.force)) / self._peak)
-        u, state, norm = minimise_energy(system, load, self._bends.guess(load), TOLERANCE * self._scale, last)
-        self._bends.learn(load, u)
+        start = self._nonlinear.predict(load)
+        u, state, norm = minimise_energy(system, load, start, TOLERANCE * self._scale, last)
+        self._nonlinear.add(load, u)
         return u, state, norm / self._scale
 
 
 class _LinearResponse:
-    """Linear displacement under loads that are mostly mixtures of few: one solve for each new direction."""
+    """Linear displacement under loads that span few directions: one solve for each new direction."""
 
     def __init__(self, system: System) -> None:
         self._system = system
@@ -136,7 +133,7 @@ class _LinearResponse:
         self._responses: list[Floats] = []
 
     def shares(self, load: Floats) -> Floats:
-        """Of each direction so far in a load, (K,)."""
+        """Components (K,) of a load along the directions so far."""
         return np.array([float(np.vdot(direction, load)) for direction in self._directions])
 
     def __call__(self, load: Floats) -> Floats:
@@ -156,25 +153,22 @@ class _LinearResponse:
         return u + left * response
 
 
-class _Bends:
-    """States under loads that mix a few directions: what they add to the linear response, by least squares.
-
-    What is added is taken as of second and third degree in the directions' shares.
-    """
+class _NonlinearExtrapolation:
+    """Prediction of states under loads that span few directions: their deviation from the linear response as
+    a polynomial of second and third degree in the loads' components, by least squares."""
 
     def __init__(self, linear: _LinearResponse) -> None:
         self._linear = linear
         self._shares: list[Floats] = []
         self._added: list[Floats] = []
 
-    def learn(self, load: Floats, u: Floats) -> None:
-        """Keeps the state u (N, 3) mm under a load (N, 3) mN."""
+    def add(self, load: Floats, u: Floats) -> None:
+        """Stores the state u (N, 3) mm under a load (N, 3) mN."""
         straight = self._linear(load)
         self._shares.append(self._linear.shares(load))
         self._added.append(u - straight)
 
-    def guess(self, load: Floats) -> Floats:
-        """The state under a load."""
+    def predict(self, load: Floats) -> Floats:
         u = self._linear(load)
         shares = self._linear.shares(load)
         known = np.zeros((len(self._shares) + 1, len(shares)))
@@ -198,7 +192,7 @@ class _Bends:
 
 
 def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> float:
-    """Smallest det F; refuses displacements u (N, 3) mm that are no deformation.
+    """Smallest det F of displacements u (N, 3) mm.
 
     Raises:
         NotFinite, InvertedElement
@@ -226,11 +220,11 @@ def minimise_energy(
         system: the equations.
         load: (N, 3) mN.
         start: (N, 3) mm.
-        safe: (N, 3) mm, a state of finite energy, for when the guess `start` has none.
         tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
+        safe: (N, 3) mm, a state of finite energy, used where `start` has none.
 
     Returns:
-        Displacement, its state and the residual's norm; the caller judges it.
+        Displacement, its state and the residual's norm, which may exceed the tolerance.
     """
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
@@ -273,13 +267,8 @@ def minimise_energy(
 
 
 def _two_loop_recursion(gradient: Floats, preconditioned: Floats, history: list[_Step]) -> Floats:
-    """The inverse Hessian on the gradient (Nocedal & Wright, algorithm 7.4), the rest stiffness as its seed.
-
-    Args:
-        gradient: (N, 3) mN.
-        preconditioned: (N, 3) mm, the inverse rest stiffness on it.
-        history: the latest steps.
-    """
+    """The inverse Hessian times the gradient (Nocedal & Wright, algorithm 7.4), with the rest stiffness as
+    its seed; `preconditioned` (N, 3) mm is the inverse rest stiffness times the gradient (N, 3) mN."""
     q, r, alphas = gradient.copy(), preconditioned.copy(), []
     for s, y, curvature, solved in reversed(history):
         alpha = float(np.vdot(s, q)) / curvature
@@ -292,7 +281,7 @@ def _two_loop_recursion(gradient: Floats, preconditioned: Floats, history: list[
 
 
 def on_free(system: System, force: Floats) -> Floats:
-    """The force (N, 3) mN without what the walls take."""
+    """The force (N, 3) mN at free degrees of freedom, 0 at fixed ones."""
     out = np.zeros(force.size)
     out[system.free] = force.ravel()[system.free]
     return out.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Laws of other packages in the place of our compiled ones: checked once, then asked at every point."""
+"""Material laws of other packages: checked once, then evaluated at every quadrature point."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
     """As `laws.stress`, of a plug-in: energy (n,) and stress (n, 3, 3) at gradients F - I, in place.
 
     Raises:
-        UserError: the law is not what it must be; see `check_law`.
+        UserError: as `check_law`.
     """
     law, label = checked(name)
-    with np.errstate(all="ignore"), as_user_error(label):  # where it has no value it says so, below
+    with np.errstate(all="ignore"), as_user_error(label):  # undefined values are handled below
         found, first = map(np.asarray, law.stress(strain + np.eye(3), mu, lam))
     if found.shape != energy.shape or first.shape != out.shape:
         raise UserError(f"{label}: stress gives {found.shape}, {first.shape}, not {out.shape}")
@@ -35,7 +35,7 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
 
 @cache
 def checked(name: str) -> tuple[Law, str]:
-    """The law of that name, once it has passed `check_law`, and what messages call it."""
+    """The law of that name after `check_law`, and its label in messages."""
     law, label = load_law(name), LAWS.label(name)
     with as_user_error(label):
         check_law(law)
@@ -43,11 +43,11 @@ def checked(name: str) -> tuple[Law, str]:
 
 
 def check_law(law: Law) -> None:
-    """Refuses a law whose answers would be wrong without a sign.
+    """Rejects a law that would give wrong results silently.
 
     Raises:
-        UserError: wrong shapes; at rest not Hooke's; a stress that is not the slope of the energy; a turn of
-            the whole that changes the energy; lambda that does not act as lambda/2 (log J)^2.
+        UserError: wrong shapes; not Hooke's law near rest; a stress that is not the derivative of the energy;
+            an energy that changes under a rotation; a lambda that does not act as lambda/2 (log J)^2.
     """
     mu, lam = lame(1.0, 0.4)
     rng = np.random.default_rng(0)
@@ -57,20 +57,20 @@ def check_law(law: Law) -> None:
         raise UserError(f"stress must give (n,) and (n, 3, 3), not {energy.shape}, {first.shape}")
     way = rng.normal(size=(8, 3, 3))
     up, down = (law.stress(f + sign * _STEP * way, mu, lam)[0] for sign in (1, -1))
-    _agree((up - down) / (2 * _STEP), np.einsum("nij,nij->n", first, way), "is not the slope of its energy")
+    _agree((up - down) / (2 * _STEP), np.einsum("nij,nij->n", first, way), "is not its energy's derivative")
     still = np.eye(3)[None]
     _agree(law.stress(still, mu, lam)[1], np.zeros((1, 3, 3)), "is not zero at rest")
     small = 1e-6 * (way + way.transpose(0, 2, 1))
     hooke = 2 * mu * small + lam * np.trace(small, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    _agree(law.stress(np.eye(3) + small, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's near rest")
+    _agree(law.stress(np.eye(3) + small, mu, lam)[1] / 1e-6, hooke / 1e-6, "is not Hooke's law near rest")
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
-    _agree(law.stress(turn @ f, mu, lam)[0], energy, "depends on how the whole is turned")
+    _agree(law.stress(turn @ f, mu, lam)[0], energy, "changes under a rotation of the whole")
     more = law.stress(f, mu, lam + 1.0)[0] - energy
-    _agree(more, 0.5 * np.log(np.linalg.det(f)) ** 2, "takes lambda otherwise than as lambda/2 (log J)^2")
+    _agree(more, 0.5 * np.log(np.linalg.det(f)) ** 2, "does not depend on lambda as lambda/2 (log J)^2 does")
 
 
 def _agree(found: Floats, expected: Floats, fault: str) -> None:
     size = float(np.abs(expected).max()) or 1.0
-    if not np.abs(found - expected).max() <= _CLOSE * size:  # NaN is none either
+    if not np.abs(found - expected).max() <= _CLOSE * size:  # NaN fails as well
         raise UserError(f"its stress {fault}")

@@ -19,7 +19,7 @@ from synth.system.jit import compiled
 Floats = NDArray[np.float64]
 
 NUMBER = {"linear": 0, "corotational": 1, "neo-hookean": 2}
-"""What the compiled loops call each law."""
+"""Number of each law in the compiled loops."""
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -36,7 +36,7 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
         strain: (n, 3, 3) displacement gradient F - I.
         mu, lam: kPa.
         out: (n, 3, 3) kPa, overwritten by P = d(energy)/dF.
-        energy: (n,) kPa, overwritten; infinite where the law has no value.
+        energy: (n,) kPa, overwritten; infinite where the law is undefined.
 
     Returns:
         The smallest J.
@@ -63,7 +63,7 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
 def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: Floats) -> float:
     """Adds lam/2 times the square of each element's mean swelling, in place.
 
-    Swelling is what a law squares in its own last term: tr e, tr(R'F - I) or log J.
+    Swelling is the quantity that a law's lambda term squares: tr e, tr(R'F - I) or log J.
 
     Args:
         law, strain: as in `stress`, Q points an element in turn.
@@ -72,7 +72,7 @@ def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: F
         out: (M * Q, 3, 3) kPa, added to.
 
     Returns:
-        Energy, mN mm; infinite where the law has no value.
+        Energy, mN mm; infinite where the law is undefined.
     """
     elements, points = weight.shape
     slope = np.empty((points, 3, 3))
@@ -99,7 +99,7 @@ def swellings(law: int, strain: Floats, value: Floats, slope: Floats) -> None:
 
 @compiled
 def _swelling(law: int, h: Floats, slope: Floats) -> float:
-    """Of one displacement gradient; `slope` becomes its derivative. Infinite where a law has no value."""
+    """Swelling at one displacement gradient; `slope` receives its derivative. Infinite where undefined."""
     f = h.copy()
     for i in range(3):
         f[i, i] += 1
@@ -126,7 +126,7 @@ def _swelling(law: int, h: Floats, slope: Floats) -> float:
 
 @compiled
 def least_determinant(strain: Floats) -> tuple[float, int]:
-    """Smallest det F of (n, 3, 3) displacement gradients F - I, and which one has it."""
+    """Smallest det F of (n, 3, 3) displacement gradients F - I, and its index."""
     least, where = np.inf, 0
     f = np.empty((3, 3))
     for n in range(len(strain)):
@@ -210,8 +210,7 @@ def _cofactor(f: Floats, c: Floats) -> None:
 def _rotation(f: Floats, r: Floats) -> None:
     """Rotation of the polar decomposition, by Newton's iteration (Higham, SIAM J. Sci. Stat. Comp. 7, 1986).
 
-    An inside-out F has no nearest rotation that way: there the iteration ends at a reflection, which is as
-    good as any, since the frame is refused for its determinant.
+    For an inside-out F it ends at a reflection; no harm, since the frame is rejected for its determinant.
     """
     c = np.empty((3, 3))
     r[:] = f

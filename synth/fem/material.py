@@ -1,4 +1,4 @@
-"""The tissue: how stiff, how compressible, and what load it takes."""
+"""Material of the tissue and of the membrane on it."""
 
 from __future__ import annotations
 
@@ -11,34 +11,26 @@ from synth.fem.system import System, assemble
 
 @dataclass(frozen=True)
 class Pia:
-    """What is drawn for an intact membrane."""
+    """An intact membrane (the pia), as drawn for one sequence."""
 
-    young_kpa: float
-    """Young's modulus at small strain."""
+    young_kpa: float  # Young's modulus at small strain
     thickness_mm: float
-    stretch: float
-    """At rest."""
+    stretch: float  # pre-stretch, at rest
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """What is drawn for the tissue of one sequence."""
+    """Tissue of one sequence, as drawn."""
 
-    young_kpa: float
-    """Young's modulus E."""
-    poisson: float
-    """Poisson's ratio."""
-    law: str
-    """Material law, a key of `laws.NUMBER` or a plug-in's name."""
-    why: str = "asked for"
-    """Why this law."""
-    membrane: Pia | None = None
-    """The membrane on the surface; None where it is stripped."""
-    skull: str = "bonded"
-    """`bonded` or `slip`."""
+    young_kpa: float  # Young's modulus E
+    poisson: float  # Poisson's ratio
+    law: str  # material law, a key of `laws.NUMBER` or a plug-in's name
+    why: str = "set by the job"  # reason for this law
+    membrane: Pia | None = None  # on the surface; None where it is removed
+    skull: str = "bonded"  # `bonded` or `slip`
 
     def equations(self, tets: Tets, law: str | None = None) -> System:
-        """The equations of a volume of it, of its own law or another."""
+        """The equations of a volume of this tissue, by its own law or another."""
         return assemble(tets, law or self.law, self.poisson, self.sheet)
 
     @property

@@ -9,9 +9,9 @@ at small strain S/3 (e:e + (tr e)^2). A sheet so thin wrinkles rather than bear 
 relaxed energy (Pipkin, IMA J. Appl. Math. 36, 1986): where the smaller principal stretch falls below that of
 uniaxial tension, S/6 (c + 2/sqrt(c) - 3) of the larger squared stretch c, and 0 where that is below 1.
 
-At rest it is stretched already, as in a living head; the pressure inside holds that up, as a load that stays
-what it is. Measured: without a stretch at rest the sheet is slack one way and stiff the other, and the solver
-takes several times as long; one that bears compression buckles.
+At rest it is pre-stretched, as in a living head; the pressure inside balances that as a constant load.
+Measured: without pre-stretch the sheet is slack one way and stiff the other, and the solver takes several
+times as long; a sheet that resists compression buckles.
 """
 
 from __future__ import annotations
@@ -34,36 +34,25 @@ _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 
 @dataclass(frozen=True)
 class MembraneSheet:
-    """A membrane as it is given, on tissue of E = 1 kPa."""
+    """Parameters of a membrane, on tissue of E = 1 kPa."""
 
-    stiffness: float
-    """mN/mm: thickness times Young's modulus."""
-    stretch: float
-    """At rest, the same every way; above 1."""
+    stiffness: float  # mN/mm: thickness times Young's modulus
+    stretch: float  # pre-stretch at rest, the same in every direction; above 1
 
 
 @dataclass(frozen=True)
 class Membrane:
-    """F faces of the surface, Q quadrature points and n nodes each."""
+    """A membrane on F faces of the surface, with Q quadrature points and n nodes each."""
 
-    faces: NDArray[np.int32]
-    """(F, n) nodes."""
-    slope: Floats
-    """(F, Q, n, 2) 1/mm, of the shape functions along the two rest tangents."""
-    tangent: Floats
-    """(F, Q, 3, 2) orthonormal tangents at rest."""
-    weight: Floats
-    """(F, Q) mm^2 at rest."""
-    stiffness: float
-    """mN/mm: thickness times Young's modulus."""
-    linear: bool
-    """For small strain, bearing compression: what fits a volume of the linear law."""
-    square: float
-    """Squared stretch at rest."""
-    balance: Floats
-    """(N, 3) mN that it pulls with at rest, and that the pressure inside holds up."""
-    stored: float
-    """mN mm in it at rest."""
+    faces: NDArray[np.int32]  # (F, n) nodes
+    slope: Floats  # (F, Q, n, 2) 1/mm, of the shape functions along the two rest tangents
+    tangent: Floats  # (F, Q, 3, 2) orthonormal tangents at rest
+    weight: Floats  # (F, Q) mm^2 at rest
+    stiffness: float  # mN/mm: thickness times Young's modulus
+    linear: bool  # small strain, with resistance to compression: goes with a volume of the linear law
+    square: float  # squared stretch at rest
+    balance: Floats  # (N, 3) mN: its force at rest, which the pressure inside balances
+    stored: float  # mN mm, its energy at rest
 
     def pull(self, u: Floats, out: Floats) -> float:
         """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm; both are 0 at rest."""
@@ -111,7 +100,7 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     Args:
         tets: the volume.
         sheet: its stiffness and stretch.
-        linear: for small strain, whatever the stretch at rest.
+        linear: small strain, without the pre-stretch.
     """
     faces = boundary(tets.cells)
     faces = faces[~tets.fixed[faces].all(axis=1)]

@@ -1,10 +1,10 @@
-"""Time: inertia with damping, and tissue that relaxes, step by step.
+"""Dynamics: inertia with damping, and relaxation of the tissue, step by step.
 
-Both turn a step into equilibrium with other springs under another load, so that the quasi-static solver and
-one factorisation serve here too. Inertia: backward Euler, M a + d M v + f(u) = load, as in Heraoui et al.
+Both turn a step into an equilibrium with other springs under another load, so that the quasi-static solver
+and one factorisation serve here too. Inertia: backward Euler, M a + d M v + f(u) = load, as in Heraoui et al.
 Relaxation: quasi-linear viscoelasticity (Fung), its stress a Prony series over the elastic one, stepped by
 the recurrence of Taylor, Pister & Goudreau (Int. J. Numer. Meth. Eng. 2, 1970), exact for stress that changes
-evenly in a step. Since nodal forces are linear in stress, the history is kept as nodal forces.
+linearly in a step. Since nodal forces are linear in stress, the history is stored as nodal forces.
 """
 
 from __future__ import annotations
@@ -27,18 +27,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Clock:
-    """What time does to the tissue."""
+    """Time steps, inertia and relaxation."""
 
-    step_s: float
-    """Between two loads."""
-    substeps: int = 1
-    """Steps of the solver between two loads."""
-    mass_kg: float = 0.0
-    """Of the whole brain; 0 leaves inertia out."""
-    damping: float = 0.0
-    """1/s, by mass."""
-    relaxation: tuple[tuple[float, float], ...] = ()
-    """Prony terms: the part of the stiffness that is lost, and its time [s]."""
+    step_s: float  # s, between two loads
+    substeps: int = 1  # solver steps between two loads
+    mass_kg: float = 0.0  # of the whole brain; 0: no inertia
+    damping: float = 0.0  # 1/s, mass-proportional
+    relaxation: tuple[tuple[float, float], ...] = ()  # Prony terms: lost part of the stiffness, time [s]
 
     @property
     def dt(self) -> float:
@@ -47,7 +42,7 @@ class Clock:
 
     @property
     def prony_terms(self) -> list[tuple[float, float, float]]:
-        """Of each Prony term, its part, what is left of it after a step, and the same in the mean of it."""
+        """Of each Prony term: its part of the stiffness, its decay over a step, that decay's mean."""
         return [
             (part, float(np.exp(-self.dt / tau)), float(tau / self.dt * -np.expm1(-self.dt / tau)))
             for part, tau in self.relaxation
@@ -55,23 +50,23 @@ class Clock:
 
     @property
     def relative_stiffness(self) -> float:
-        """Stiffness to a change within a step, as a part of that to a sudden load."""
+        """Stiffness to a change within a step, relative to that to a sudden load."""
         terms = self.prony_terms
         return 1 - sum(part for part, _, _ in terms) + sum(part * mean for part, _, mean in terms)
 
     @property
     def inertia_spring(self) -> float:
-        """Backward Euler's mass and damping as a spring, 1/s^2; 0 without inertia."""
+        """Mass and damping of backward Euler as a spring, 1/s^2; 0 without inertia."""
         return (1 / self.dt**2 + self.damping / self.dt) if self.mass_kg else 0.0
 
     def inertia_target(self, u: Floats, before: Floats) -> Floats:
-        """Where that spring has no force (N, 3) mm, after two states of a step's distance."""
+        """Displacement (N, 3) mm at which that spring is free of force, from the last two states."""
         momentum = (2 * u - before) / self.dt**2 + self.damping / self.dt * u
         return np.asarray(momentum / self.inertia_spring)
 
 
 class _PronyHistory:
-    """What relaxing tissue keeps of its past, as nodal forces."""
+    """History of relaxing tissue, as nodal forces."""
 
     def __init__(self, clock: Clock) -> None:
         self._terms = clock.prony_terms
@@ -79,14 +74,14 @@ class _PronyHistory:
         self._history: list[Floats] = []
 
     def add_to(self, load: Floats) -> Floats:
-        """A step's load (N, 3) mN with the past in it."""
+        """A step's load (N, 3) mN plus the forces of the history."""
         if self._elastic is not None:
             for (part, decay, mean), past in zip(self._terms, self._history, strict=True):
                 load = load - decay * past + part * mean * self._elastic
         return load
 
     def update(self, now: Floats) -> None:
-        """Takes up the elastic forces (N, 3) mN at a step's end."""
+        """Advances the history by the elastic forces (N, 3) mN at a step's end."""
         if self._elastic is None:
             self._elastic, self._history = np.zeros_like(now), [np.zeros_like(now) for _ in self._terms]
         for k, (part, decay, mean) in enumerate(self._terms):
@@ -97,14 +92,14 @@ class _PronyHistory:
 def march_in_time(
     tets: Tets, tissue: Tissue, loads: Floats, load_parameter: Floats, clock: Clock
 ) -> LoadPath:
-    """Motion from rest under loads at even times; between them they change evenly.
+    """Motion from rest under loads at equal time steps, interpolated linearly between them.
 
     Args:
         tets: the mesh.
         tissue: its stiffness is that to a sudden load; a membrane relaxes as the tissue under it does.
         loads: (T, N, 3) mN for E = 1 kPa.
         load_parameter: (T,) P = F/(E a^2) of each, for messages.
-        clock: time.
+        clock: time steps, inertia and relaxation.
 
     Raises:
         As `equilibrium.solve_path`.
@@ -140,7 +135,7 @@ def march_in_time(
 
 
 def nodal_mass(tets: Tets, mass_kg: float) -> Floats:
-    """(N,) kg, spread evenly over the volume; within an element as the diagonal of its consistent mass.
+    """Mass (N,) kg of the nodes, even over the volume; in an element by its consistent mass's diagonal.
 
     Hinton, Rock & Zienkiewicz, Earthq. Eng. Struct. Dyn. 4, 1976.
     """

@@ -1,8 +1,8 @@
-"""Heart and breath: the exposed surface rises and falls by a pressure from below.
+"""Pulse of heart and breath: a pressure from below raises and lowers the exposed surface.
 
-In tissue that hardly changes its volume, a pressure inside is the same as a pull of that size on what the
-skull leaves open. So the pulse is a load on the opening, scaled to the motion that is asked for; it is no
-tool's, and no part of any label.
+In tissue that hardly changes its volume, a pressure inside equals a pull of that size on the part that the
+skull leaves open. So the pulse is a load on the opening, scaled to the requested motion; it belongs to no
+instrument and to no label.
 """
 
 from __future__ import annotations
@@ -20,36 +20,33 @@ from synth.geometry.triangles import Shape
 Floats = NDArray[np.float64]
 
 HEART_HZ, BREATH_HZ = (1.0, 1.7), (0.2, 0.35)
-"""Beats and breaths a second, of an adult at rest: 60 to 102 and 12 to 21 a minute. On the exposed brain
-their peaks lie at 1 and 0.2 Hz (Faria et al., Med. Phys. 41, 2014)."""
+"""Heart and breathing rate of an adult at rest: 60 to 102 and 12 to 21 a minute. On the exposed brain their
+peaks lie at 1 and 0.2 Hz (Faria et al., Med. Phys. 41, 2014)."""
 
 _SECOND = 0.4  # share of twice the heart's rate: a steep rise and a slow fall
-_PEAK_TO_PEAK = 2.4293  # what that wave spans
-_MIDDLE = 0.25  # part of the opening's radius over which its motion is meant
+_PEAK_TO_PEAK = 2.4293  # of that wave
+_MIDDLE = 0.25  # part of the opening's radius over which its motion is averaged
 
 
 @dataclass(frozen=True)
 class Pulse:
-    """What is drawn for one sequence."""
+    """Amplitudes, rates and phases of the pulse in one sequence."""
 
-    heart_mm: float
-    """How far the middle of the opening moves with the heart, peak to peak."""
+    heart_mm: float  # motion of the middle of the opening with the heart, peak to peak
     heart_hz: float
-    heart_rad: float
-    """Phase in frame 0."""
-    breath_mm: float
-    """As `heart_mm`, with the breath."""
+    heart_rad: float  # phase in frame 0
+    breath_mm: float  # likewise with the breath
     breath_hz: float
     breath_rad: float
 
     def height(self, time: Floats) -> Floats:
-        """How far the middle of the opening is above where it is in frame 0, mm, at (T,) s from there."""
+        """Height (T,) mm of the opening's middle over its place in frame 0, at times (T,) s from frame 0."""
         heart, breath = (
             rad + 2 * np.pi * hz * np.append(0.0, time)
             for rad, hz in ((self.heart_rad, self.heart_hz), (self.breath_rad, self.breath_hz))
         )
-        beat = (np.sin(heart) + _SECOND * np.sin(2 * heart)) / _PEAK_TO_PEAK
-        above = self.heart_mm * beat + 0.5 * self.breath_mm * np.sin(breath)
+        wave = (np.sin(heart) + _SECOND * np.sin(2 * heart)) / _PEAK_TO_PEAK
+        above = self.heart_mm * wave + 0.5 * self.breath_mm * np.sin(breath)
         return np.asarray(above[1:] - above[0])
 
 
@@ -59,8 +56,8 @@ def lift(system: System, embedding: Embedding, surface: Shape, opening_mm: float
     Args:
         system: the volume.
         embedding: the surface on it.
-        surface: faces counter-clockwise seen from outside.
-        opening_mm: radius of the craniotomy; beyond it the pressure falls to none over the rim.
+        surface: faces counter-clockwise from outside.
+        opening_mm: radius of the craniotomy; beyond it the pressure falls to 0 over the rim.
     """
     vertices, faces = surface
     corner = vertices[faces]

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.fem import surface_embedding, tool_gesture
-from synth.fem.equilibrium import InvertedElement, LoadPath, solve_path
+from synth.fem.equilibrium import InvertedElement, solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
-from synth.fem.surface_embedding import Embedding
 from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
@@ -26,8 +25,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-_STEP_S = 0.03  # of dynamics, at most
-_DAMPING = 2.0  # by mass, 1/s
+_STEP_S = 0.03  # longest time step of dynamics
+_DAMPING = 2.0  # mass-proportional, 1/s
 _DENSITY_KG_M3 = 1040.0  # of grey and white matter (Barber et al., Acta Neurol. Scand. 46, 1970)
 
 
@@ -35,38 +34,24 @@ _DENSITY_KG_M3 = 1040.0  # of grey and white matter (Barber et al., Acta Neurol.
 class Deformation:
     """The surface, its loads and the instruments over T frames, in world axes. Frame 0 is at rest."""
 
-    rest: Floats
-    """(V, 3) mm."""
-    faces: Ints
-    """(F, 3)."""
-    displacement: Floats
-    """(T, V, 3) mm."""
-    traction: Floats
-    """(T, V, 3) kPa on the surface at rest, linear on its faces."""
-    area: Floats
-    """(V,) mm^2 at rest: sum(area * traction) is the force."""
-    force: Floats
-    """(T, 3) mN on the tissue."""
-    time: Floats
-    """(T,) s."""
-    by_instrument: Floats
-    """(T, I, 3) mN, the part of each of the I instruments in it."""
-    tip: Floats
-    """(T, 2 I, 3) mm, the instruments' tips, two each."""
-    shaft: Floats
-    """(T, 2 I, 3) unit vectors from tip to hand."""
-    min_jacobian: Floats
-    """(T,) smallest det F in the volume, at quadrature points and corners."""
-    energy: Floats
-    """(T,) mN mm stored."""
-    residual: Floats
-    """(T,) force out of balance as a part of the load, both in the norm of the inverse stiffness."""
-    pulse_work: Floats
-    """(T,) mN mm, half of traction times what the pulse alone moves it by; see `tool_work`."""
+    rest: Floats  # (V, 3) mm
+    faces: Ints  # (F, 3)
+    displacement: Floats  # (T, V, 3) mm
+    traction: Floats  # (T, V, 3) kPa on the surface at rest, linear on its faces
+    area: Floats  # (V,) mm^2 at rest: sum(area * traction) is the force
+    force: Floats  # (T, 3) mN on the tissue
+    time: Floats  # (T,) s
+    by_instrument: Floats  # (T, I, 3) mN, the part of each of the I instruments in it
+    tip: Floats  # (T, 2 I, 3) mm, the instruments' tips, two each
+    shaft: Floats  # (T, 2 I, 3) unit vectors from tip to hand
+    min_jacobian: Floats  # (T,) smallest det F in the volume, at quadrature points and corners
+    energy: Floats  # (T,) mN mm stored
+    residual: Floats  # (T,) force out of balance over the load, in the norm of the inverse stiffness
+    pulse_work: Floats  # (T,) mN mm, half of traction times the motion by the pulse alone, see `tool_work`
 
     @property
     def tool_work(self) -> Floats:
-        """(T,) mN mm, half of traction times the motion that is the tools'.
+        """(T,) mN mm, half of traction times the motion by the instruments alone.
 
         Under the linear law, and without a pulse, it is the energy stored.
         """
@@ -86,14 +71,14 @@ def deform(
     opening_mm: float = schema.CraniotomySection().radius_mm,
     motions: Sequence[ToolMotion] = (),
 ) -> Deformation:
-    """Moves a brain as gestures ask.
+    """Deforms a brain by the gestures of its instruments.
 
     Args:
         fem: the job's section.
         tissue: stiffness and law.
-        gestures: one an instrument, all at the same time.
+        gestures: one per instrument, all at the same time.
         tets: the volume.
-        surface: the fine surface on it, faces counter-clockwise seen from outside.
+        surface: the fine surface on it, faces counter-clockwise from outside.
         frames: T >= 2.
         fps: 1/s.
         pulse: of heart and breath; no part of force and traction.
@@ -103,7 +88,7 @@ def deform(
     Raises:
         UserError: the load is past the law's range, or the contact is not on the surface.
         InvertedElement: names frame, load and element.
-        NotFinite: a number is none.
+        NotFinite: a displacement or an energy is not finite.
     """
     for gesture in gestures:
         check_load(tissue.law, gesture.load, f"fem.load: {gesture.load:g} is")
@@ -114,7 +99,7 @@ def deform(
     traction = np.sum(
         [tool_gesture.tractions(g, moved, surface.vertices, area) for g, moved in tools], axis=0
     )
-    # One load per kPa of E; displacement depends on no more than that.
+    # Loads for E = 1 kPa: displacement depends on force over stiffness alone.
     loads = np.stack([embedding.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
     load_parameter = np.max([gesture.load * moved.load for gesture, moved in tools], axis=0)
     system, pulse_work = tissue.equations(tets), np.zeros(frames)
@@ -127,21 +112,6 @@ def deform(
         path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
     else:
         path = solve_path(system, loads, load_parameter)
-    return _on_surface(path, tissue, tools, traction, area, embedding, surface, time, pulse_work)
-
-
-def _on_surface(
-    path: LoadPath,
-    tissue: Tissue,
-    tools: Sequence[tuple[Gesture, ToolMotion]],
-    traction: Floats,
-    area: Floats,
-    embedding: Embedding,
-    surface: Shape,
-    time: Floats,
-    pulse_work: Floats,
-) -> Deformation:
-    """What states of the volume are on the surface, and the instruments on it."""
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     poses = [tool_gesture.pose(g, moved, surface, surface.vertices + displacement) for g, moved in tools]
     forces = [np.outer(m.load, np.sum([c.force_mn for c in g.contacts], axis=0)) for g, m in tools]
@@ -164,7 +134,7 @@ def _on_surface(
 
 
 def clock(fem: schema.FemSection, fps: float, tets: Tets) -> Clock:
-    """Steps no longer than `_STEP_S`, a whole number of them a frame."""
+    """The job's time steps: no longer than `_STEP_S`, a whole number per frame."""
     if fem.time != "dynamic":
         return Clock(1 / fps, relaxation=fem.relaxation)
     substeps = int(np.ceil(1 / fps / _STEP_S - 1e-9))

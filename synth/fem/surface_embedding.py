@@ -1,12 +1,12 @@
-"""The fine surface on the volume mesh: it rides on the nearest place of it, and its loads go back there.
+"""The fine surface attached to the volume mesh: vertices follow its nearest point and load it.
 
-What stands out of the mesh (vessels, or the gap between a smooth surface and flat faces) is carried by a
-rigid motion: the displacement u(p) of the nearest place p, and the rotation there for the rest of the way,
+A vertex x outside the mesh (on a vessel, or in the gap between a smooth surface and flat faces) moves rigidly
+with the nearest point p of the mesh:
 
     u(x) = u(p) + w(p) x (x - p),    w = 1/2 curl u.
 
-The whole gradient would carry strain as well, and its transpose would turn every force out there into a pair
-of opposed forces on one element, without bound as elements get smaller.
+The full gradient would transfer strain as well, and its transpose would turn a force at x into a pair of
+opposed forces on one element, without bound as elements get smaller.
 """
 
 from __future__ import annotations
@@ -25,24 +25,19 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-_EVEN_MM = 2.0  # over which rotation is averaged
+_EVEN_MM = 2.0  # length over which rotation is averaged
 
 
 @dataclass(frozen=True, eq=False)
 class Embedding:
-    """V points of a surface on a volume of N nodes. `gather` is the transpose of `move`: work is kept, and
-    since `move` holds every rigid motion, so are force and moment."""
+    """V points of a surface on a volume of N nodes. `gather` is the transpose of `move`, so work is
+    conserved, and since `move` reproduces every rigid motion, so are force and moment."""
 
-    value: sp.csr_array
-    """(V, N) shape functions at the nearest places."""
-    corner: sp.csr_array
-    """(V, K) where the nearest places are between the K corners of outer faces."""
-    mean: Floats
-    """(K, K) what averages the rotation at those corners."""
-    spin: sp.csr_array
-    """(3 K, 3 N) half the displacement's curl at those corners."""
-    arm: Floats
-    """(V, 3) mm from the nearest place."""
+    value: sp.csr_array  # (V, N) shape functions at the nearest points of the mesh
+    corner: sp.csr_array  # (V, K) barycentrics of the nearest points between the K corners of outer faces
+    mean: Floats  # (K, K) filter that averages the rotation at those corners
+    spin: sp.csr_array  # (3 K, 3 N) half the displacement's curl at those corners
+    arm: Floats  # (V, 3) mm from the nearest point
 
     def move(self, u: Floats) -> Floats:
         """Displacement (V, 3, ...) mm of the points, from the nodes' (N, 3, ...) mm."""
@@ -67,7 +62,7 @@ class Embedding:
 
 
 def embed(tets: Tets, vertices: Floats) -> Embedding:
-    """Puts the vertices (V, 3) mm of a surface where they ride: on the nearest outer face of a volume."""
+    """Attaches the vertices (V, 3) mm of a surface to the nearest outer faces of a volume."""
     owner, off = outer_faces(tets.cells)
     faces = FACES[off]
     nodes = tets.cells[owner[:, None], faces]
@@ -97,14 +92,14 @@ def _sparse(values: Floats, columns: Ints, width: int) -> sp.csr_array:
 
 
 def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]:
-    """What averages values at the corners of faces (F, 3, 3) mm over `_EVEN_MM`, however small the faces.
+    """A filter that averages values at corners of faces over `_EVEN_MM`, however small the faces.
 
     Helmholtz' filter (1 - l^2 Laplacian)^-1 (Lazarov & Sigmund, Int. J. Numer. Meth. Eng. 86, 2011): rows sum
     to 1.
 
     Args:
         corner: (F, 3, 3) mm.
-        local: (F, 3) which of the K corners they are.
+        local: (F, 3) their indices among the K corners.
         count: K.
 
     Returns:
@@ -121,14 +116,14 @@ def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]
 
 
 def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats) -> sp.csr_array:
-    """Half the curl at K corners of faces, (3 K, 3 N) 1/mm: the mean of the faces' elements there.
+    """Half the curl at K corners of faces, (3 K, 3 N) 1/mm: the mean over the faces' elements there.
 
     Args:
         tets: the volume.
         owner: (F,) the faces' elements.
-        faces: (F, 3) which of their corners.
-        local: (F, 3) which of the K corners.
-        share: (F, 3) of each element in its corner's mean.
+        faces: (F, 3) indices of their corners in the element.
+        local: (F, 3) indices of their corners among the K.
+        share: (F, 3) weight of each element in its corner's mean.
     """
     gradient = gradients(tets.points[tets.cells[owner]], np.eye(4))[0]  # (F, 4, n, 3)
     gradient = 0.5 * share[:, :, None, None] * np.take_along_axis(gradient, faces[:, :, None, None], axis=1)
@@ -145,12 +140,12 @@ def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Of vectors along axis 1."""
+    """Cross product of vectors along axis 1."""
     return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
-    """A third of the area of the faces round each vertex, (V,) mm^2."""
+    """A third of the area of the faces around each vertex, (V,) mm^2."""
     corner = vertices[faces]
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     return np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices)).astype(np.float64)
@@ -158,7 +153,7 @@ def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
 
 @compiled
 def _nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
-    """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the place."""
+    """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the nearest point."""
     count = len(corner)
     low, high = np.empty((count, 3)), np.empty((count, 3))
     for t in range(count):
@@ -191,7 +186,7 @@ def _nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
 
 @compiled
 def _on_triangle(a: Floats, b: Floats, c: Floats, x: Floats, w: Floats) -> float:
-    """Squared distance of x from a triangle; `w` becomes the nearest place's barycentrics.
+    """Squared distance of x from a triangle; `w` receives the nearest point's barycentrics.
 
     By the regions of the corners, sides and face (Ericson, Real-Time Collision Detection, 5.1.5).
     """

@@ -28,29 +28,24 @@ from synth.fem.mesh.tetrahedra import Tets
 
 Floats = NDArray[np.float64]
 
-_FLATTEST = (
-    0.01  # mean ratio; measured: a sliver of 0.002 under a contact alone costs a quarter of the answer
-)
+_FLATTEST = 0.01  # mean ratio; measured: one sliver of 0.002 under a contact takes a quarter of the motion
 _STEP = 1e-5  # of a displacement gradient, for differences
 
 POINTWISE = 1.0
-"""Of mu: how much of lambda still acts at every point where the rest acts on elements' means (Nagtegaal,
-Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974; this much steadies them). Chosen on discs on the
-half-space at nu 0.49, where radial motion beside a press is then a quarter off, at 1,600 to 5,000 tetrahedra;
-with all of lambda at points it is off by twice its own size, with none of it by 60% (`python -m
-evidence.fem.half_space`). docs/results/fem has it on a block it was not chosen on."""
+"""Part of lambda, in units of mu, that acts at quadrature points; the remainder acts on elements' means,
+against locking (Nagtegaal, Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974). Chosen on discs pressed
+into a half-space at nu 0.49: radial motion next to the disc is off by a quarter at 1,600 to 5,000 tetrahedra;
+with all of lambda at points by twice its own size, with none by 60% (`python -m evidence.fem.half_space`).
+docs/results/fem checks it on a block that was not used for this choice."""
 
 
 @dataclass(frozen=True)
 class State:
-    """What a displacement does to the tissue, for E = 1 kPa."""
+    """Energy, forces and smallest Jacobian of a displacement, for E = 1 kPa."""
 
-    energy: float
-    """mN mm, stored in tissue, membrane and springs."""
-    force: Floats
-    """(N, 3) mN that the tissue, its membrane and its springs put up."""
-    jacobian: float
-    """Smallest det F at the quadrature points."""
+    energy: float  # mN mm, stored in tissue, membrane and springs
+    force: Floats  # (N, 3) mN of resistance by tissue, membrane and springs
+    jacobian: float  # smallest det F at the quadrature points
 
 
 @dataclass(frozen=True)
@@ -60,22 +55,14 @@ class System:
     mesh: Quadrature
     law: str
     poisson: float
-    free: NDArray[np.int64]
-    """(D,) degrees of freedom that can move."""
-    hold: sp.csr_array
-    """(N, N) mN/mm."""
-    stiffness: sp.csr_array
-    """(3N, 3N) mN/mm at rest, springs and membrane included."""
-    factor: SuperLU
-    """Of the free part of it."""
-    corners: Quadrature
-    """The same mesh seen at the corners of its elements."""
-    membrane: Membrane | None = None
-    """On its surface."""
-    averaged: float = 0.0
-    """The part of lambda that acts on each element's mean swelling, kPa; see `POINTWISE`."""
-    slip: sp.csr_array | None = None
-    """(3N, 3N) mN/mm, as in `Tets`."""
+    free: NDArray[np.int64]  # (D,) degrees of freedom that can move
+    hold: sp.csr_array  # (N, N) mN/mm, as in `Tets`
+    stiffness: sp.csr_array  # (3N, 3N) mN/mm at rest, springs and membrane included
+    factor: SuperLU  # of the free part of `stiffness`
+    corners: Quadrature  # the same mesh with the elements' corners as points
+    membrane: Membrane | None = None  # on its surface
+    averaged: float = 0.0  # kPa, the part of lambda that acts on elements' mean swelling, see `POINTWISE`
+    slip: sp.csr_array | None = None  # (3N, 3N) mN/mm, as in `Tets`
 
     def solve(self, force: Floats) -> Floats:
         """Displacement of the linear law, (N, 3) mm, under (N, 3) mN; of K loads at once, (N, 3, K) each."""
@@ -124,7 +111,7 @@ class System:
         return strain
 
     def _stress(self, strain: Floats, pressure: Floats | None) -> Floats:
-        """(n, 3, 3) kPa; `pressure` (n,) kPa acts on the swelling, held as it is."""
+        """Stress (n, 3, 3) kPa; `pressure` (n,) kPa on the swelling is constant."""
         first, density = np.empty_like(strain), np.empty(len(strain))
         self._law(strain, first, density)
         if pressure is not None:
@@ -133,14 +120,14 @@ class System:
         return first
 
     def _law(self, strain: Floats, stress_kpa: Floats, density: Floats) -> float:
-        """The law, but for what acts on elements' means, in place; returns the smallest det F."""
+        """The law without its part on elements' means, in place; returns the smallest det F."""
         mu, lam = lame(1.0, self.poisson)
         own = self.law in NUMBER
         law = partial(stress, NUMBER[self.law]) if own else partial(foreign_law.stress, self.law)
         return float(law(strain, mu, lam - self.averaged, stress_kpa, density))
 
     def springs(self, u: Floats) -> Floats:
-        """What the springs put up at (N, 3) mm, (N, 3) mN."""
+        """Force (N, 3) mN of the springs at (N, 3) mm."""
         pull = self.hold @ u
         return np.asarray(pull if self.slip is None else pull + (self.slip @ u.ravel()).reshape(u.shape))
 
@@ -200,7 +187,7 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
 
 
 def average(mesh: Quadrature, law: str, strain: Floats, lam: float) -> tuple[Floats, Floats]:
-    """What `lam`, kPa, on each element's mean swelling adds to the stiffness at (M * Q, 3, 3).
+    """Contribution of `lam` kPa on each element's mean swelling to the stiffness at strains (M * Q, 3, 3).
 
     Returns:
         (M, n, 3) for `stiffness`, and the pressure (M * Q,) kPa that multiplies the second derivative.
@@ -223,11 +210,11 @@ def hooke(young: float, poisson: float) -> Floats:
 
 
 def _swelling(law: str) -> int:
-    """The law whose measure of swelling an element's mean is taken of; plug-ins' is log J."""
+    """Number of the law that defines the swelling; of a plug-in it is log J, as of neo-Hookean tissue."""
     return NUMBER.get(law, NUMBER["neo-hookean"])
 
 
 def _springs(hold: sp.csr_array, slip: sp.csr_array | None) -> sp.csr_array:
-    """The same springs in all three directions, and those along the normal."""
-    whole = sp.kron(hold, sp.eye_array(3), format="csr")
+    """Stiffness of springs in all three directions plus those along the normal."""
+    whole = sp.kron(hold, np.eye(3), format="csr")
     return whole if slip is None else whole + slip

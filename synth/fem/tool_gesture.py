@@ -1,4 +1,4 @@
-"""The gesture: what an instrument does to the tissue, and where it is in every frame."""
+"""Gestures: the load of an instrument on the tissue, and its pose in every frame."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from synth.geometry.triangles import Shape
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_PINCH = 0.5  # a grasp's tips press towards each other with this part of their pull
-FRICTION = 0.4  # a sliding tip drags with this part of its push
-_OVERLAP = 0.6  # centres at least this part of both radii apart: the pressures' sum peaks 10% above one's
-_BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # room an instrument needs at its tip, growing up the shaft
+_PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
+FRICTION = 0.4  # drag of a sliding tip, as a part of its push
+_OVERLAP = 0.6  # least distance of contacts over their radii's sum: together they peak at 1.1 of one's peak
+_BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # clearance at a tip, its growth up the shaft, its largest
 _LENGTH_MM, _STEPS = 110.0, 23
 
 
@@ -24,55 +24,39 @@ _LENGTH_MM, _STEPS = 110.0, 23
 class ToolContact:
     """One place where a tip loads the tissue."""
 
-    point_mm: tuple[float, float]
-    """World x, y of its centre at rest."""
-    force_mn: tuple[float, float, float]
-    """Force on the tissue at full load, world axes."""
+    point_mm: tuple[float, float]  # world x, y of its centre at rest
+    force_mn: tuple[float, float, float]  # force on the tissue at full load, world axes
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """What one instrument does in a sequence."""
+    """Gesture of one instrument in a sequence."""
 
-    kind: str
-    """`pull`, `push`, `slide`, `grasp`, `retract` or `tap`."""
-    contacts: tuple[ToolContact, ...]
-    """A grasp has two, the others one."""
-    footprint_mm: float
-    """Radius a of every contact."""
-    load: float
-    """Peak P = F/(E a^2) of a contact."""
-    point_mm: tuple[float, float]
-    """World x, y of the middle of the contacts at rest."""
-    direction: tuple[float, float, float]
-    """Unit vector in world axes: which way the tissue is loaded as a whole."""
-    force_mn: float
-    """Peak of the whole force."""
-    path_mm: tuple[float, float]
-    """World x, y that a slide covers; else 0."""
-    azimuth_deg: float
-    """Which side the hand is on, counter-clockwise from world x."""
-    elevation_deg: float
-    """Angle of the instrument above the surface."""
-    spread_mm: float
-    """Distance between the two tips."""
-    hover_mm: float
-    """How far the tips are from the tissue in the rest frame."""
-    taps: int
-    """How often the load comes and goes."""
-    timing: tuple[float, float, float, float]
-    """Parts of the sequence: touch, full load, load begins to fall, release."""
+    kind: str  # `pull`, `push`, `slide`, `grasp`, `retract` or `tap`
+    contacts: tuple[ToolContact, ...]  # A grasp has two, the others one
+    footprint_mm: float  # radius a of every contact
+    load: float  # peak P = F/(E a^2) of a contact
+    point_mm: tuple[float, float]  # world x, y of the middle of the contacts at rest
+    direction: tuple[float, float, float]  # unit vector of the whole load, world axes
+    force_mn: float  # peak of the whole force
+    path_mm: tuple[float, float]  # world x, y that a slide covers; else 0
+    azimuth_deg: float  # side of the hand, counter-clockwise from world x
+    elevation_deg: float  # angle of the instrument above the surface
+    spread_mm: float  # distance between the two tips
+    hover_mm: float  # distance of the tips from the tissue in the rest frame
+    taps: int  # number of times that the load comes and goes
+    timing: tuple[float, float, float, float]  # touch, full load, start of its fall, release: sequence parts
 
     @property
     def reach_mm(self) -> float:
-        """How far from the opening's middle it loads the tissue."""
+        """Largest distance of loaded tissue from the opening's middle."""
         start = np.array([c.point_mm for c in self.contacts])
         ends = np.concatenate([start, start + np.asarray(self.path_mm)])
         return float(np.hypot(*ends.T).max()) + self.footprint_mm
 
     @property
     def focus(self) -> tuple[tuple[float, float, float], ...]:
-        """Where the mesh should be finest: x, y and radius of what is loaded, mm."""
+        """Places where the mesh should be finest: x, y and radius of the contacts, mm."""
         stops = (0.0, 0.5, 1.0) if any(self.path_mm) else (0.0,)
         (dx, dy), radius = self.path_mm, self.footprint_mm
         places = [(contact.point_mm, s) for contact in self.contacts for s in stops]
@@ -100,7 +84,7 @@ class ToolMotion:
 def grip(
     kind: str, point: Floats, direction: Floats, spread_mm: float, azimuth_deg: float
 ) -> tuple[Floats, Floats]:
-    """Where the tips of an instrument load the tissue and which way: one contact, or a grasp's two.
+    """Contact points and load directions of an instrument's tips: one, or two of a grasp.
 
     Args:
         kind: of the gesture.
@@ -122,7 +106,7 @@ def grip(
 
 
 def clearance(one: Gesture, other: Gesture) -> float:
-    """How far apart two gestures are beyond what they need, mm: their contacts and their shafts."""
+    """Distance of two gestures' contacts and shafts beyond the clearance they need, mm."""
     here, there = np.array(one.focus), np.array(other.focus)
     apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
     contacts = (apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min()
@@ -134,7 +118,7 @@ def clearance(one: Gesture, other: Gesture) -> float:
 
 
 def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
-    """When the load comes and goes, and where to."""
+    """The gesture's own motion over T frames."""
     t = np.linspace(0, 1, frames)
     touch, full, fall, leave = gesture.timing
     if gesture.taps > 1:
@@ -204,7 +188,7 @@ def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) 
 
 
 def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
-    """Where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
+    """Points where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
 
     Raises:
         UserError: beyond the edge of the surface.
@@ -223,10 +207,10 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
 
 
 def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) -> tuple[Floats, Floats]:
-    """Where the instrument is: its tips rest on the tissue while they load it.
+    """Pose of the instrument: its tips rest on the tissue while they load it.
 
     Args:
-        gesture, motion: what it does.
+        gesture, motion: of the instrument.
         surface: at rest.
         moved: (T, V, 3) mm, its vertices over time.
 
@@ -245,7 +229,7 @@ def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) ->
 
 
 def _aside(spread_mm: float, azimuth_deg: float) -> Floats:
-    """From the middle of the tips to the second one, (2,) mm."""
+    """Vector (2,) mm from the middle of the tips to the second one."""
     across = np.radians(azimuth_deg + 90)
     return np.asarray(0.5 * spread_mm * np.array([np.cos(across), np.sin(across)]))
 

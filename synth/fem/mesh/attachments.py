@@ -1,4 +1,4 @@
-"""Where tissue is held inside: the falx, the tentorium, an adhesion, as springs in a ball or a sheet."""
+"""Attachments inside the tissue (falx, tentorium, an adhesion) as springs in a ball or a sheet."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from synth.job import schema
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_FIRM_PER_MM = 2.0  # traction per displacement as a multiple of E, as the skull's
+_FIRM_PER_MM = 2.0  # traction per displacement, in E per mm, as of the skull
 
 _FINE = 9
 _GRID = np.array([i for i in product(range(_FINE), repeat=4) if sum(i) == _FINE - 1], np.float64)
 _SAMPLES = (_GRID + 0.25) / _FINE
-"""(165, 4) even barycentric places: a sheet may be much thinner than the elements that it passes."""
+"""(165, 4) evenly spaced barycentric points: a sheet may be much thinner than the elements it crosses."""
 
 
 def springs(points: Floats, cells: Ints, attachments: Sequence[schema.AttachmentSection]) -> sp.csr_array:
@@ -60,7 +60,7 @@ def springs(points: Floats, cells: Ints, attachments: Sequence[schema.Attachment
 
 
 def within(attachment: schema.AttachmentSection, at: Floats) -> NDArray[np.bool_]:
-    """Which of the places (..., 3) mm an attachment holds, (...)."""
+    """Mask (...) of the points (..., 3) mm that an attachment holds."""
     away = at - np.asarray(attachment.point)
     inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm
     if attachment.normal is not None:

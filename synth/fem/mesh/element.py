@@ -1,4 +1,4 @@
-"""Quadratic tetrahedra: shape functions, quadrature, and what the volume integrals need of a mesh."""
+"""Quadratic tetrahedra: shape functions and quadrature for the volume integrals."""
 
 from __future__ import annotations
 
@@ -93,25 +93,21 @@ def quality(corners: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Quadrature:
-    """The mesh as volume integrals see it: M elements, Q points each, n nodes each."""
+    """A mesh's quadrature: M elements with Q points and n nodes each."""
 
-    cells: NDArray[np.int32]
-    """(M, n) nodes."""
-    slope: Floats
-    """(M, Q, n, 3) gradients of the shape functions at the points, 1/mm."""
-    weight: Floats
-    """(M, Q) mm^3."""
-    nodes: int
-    """N, number of nodes."""
+    cells: NDArray[np.int32]  # (M, n) nodes
+    slope: Floats  # (M, Q, n, 3) gradients of the shape functions at the points, 1/mm
+    weight: Floats  # (M, Q) mm^3
+    nodes: int  # N, number of nodes
 
 
 def quadrature(points: Floats, cells: Ints, at: Floats = TET_POINTS) -> Quadrature:
-    """Prepares a mesh.
+    """The quadrature of a mesh.
 
     Args:
         points: (N, 3) mm, all nodes; sides may be curved.
         cells: (M, 10).
-        at: (Q, 4) barycentric places in every element, of equal weight.
+        at: (Q, 4) barycentric points in every element, of equal weight.
     """
     gradient, determinant = gradients(points[cells], at)
     return Quadrature(
@@ -134,9 +130,9 @@ def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
 
 
 def _mapping(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
-    """Derivatives by three local coordinates, of the shape functions (Q, 10, 3) and of place (M, Q, 3, 3)."""
+    """Derivatives by three local coordinates: of shape functions (Q, 10, 3) and of position (M, Q, 3, 3)."""
     local = shape_slope(bary)
-    local = local[..., 1:] - local[..., :1]  # the first coordinate is what the others leave of 1
+    local = local[..., 1:] - local[..., :1]  # the first coordinate is 1 less the others
     flat = np.ascontiguousarray(local.transpose(0, 2, 1).reshape(-1, local.shape[1]))
     return local, (flat @ nodes).reshape(len(nodes), len(bary), 3, 3)
 

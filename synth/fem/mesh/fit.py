@@ -1,7 +1,7 @@
-"""Corners on a surface make faces that are chords of it: moved so that faces lie on it in the mean.
+"""Moves the corners of a boundary so that its faces, rather than its corners, lie on the surface on average.
 
-Least squares of the height between face and surface over all faces. A mesh of chords loses a convex body's
-volume; since constants are among what is fitted, to first order the fitted one loses none.
+Least squares of the height between face and surface over all faces. A mesh with its corners on a convex body
+loses volume; since constants are among the fitted functions, the fitted mesh loses none to first order.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from synth.fem.mesh.lattice_stuffing import halve
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_REACH, _STEPS, _HALVINGS = 0.5, 6, 6  # of a face's longest side: how far the surface is looked for
-_FARTHEST = 0.5  # of a corner's shortest side: how far it moves
-_PASSES = 2  # the second finds what the first could not reach
-_SOUND = 0.1  # mean ratio below which no tetrahedron is brought
+_REACH, _STEPS, _HALVINGS = 0.5, 6, 6  # search distance in a face's longest sides, steps of it, bisections
+_FARTHEST = 0.5  # largest shift of a corner, as a part of its shortest side
+_PASSES = 2  # the second reaches surfaces beyond the first one's search distance
+_SOUND = 0.1  # least mean ratio of a moved tetrahedron
 
 
 def fit(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], Floats]) -> Floats:
@@ -33,11 +33,11 @@ def fit(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], Flo
     Args:
         points: (N, 3) mm.
         cells: (M, 4), positively oriented.
-        faces: (F, 3) of the boundary, counter-clockwise seen from outside.
+        faces: (F, 3) of the boundary, counter-clockwise from outside.
         inside: positive inside and negative outside, at (n, 3) mm.
 
     Returns:
-        (N, 3) mm. No tetrahedron gets worse than a mean ratio of 0.1, unless it was.
+        (N, 3) mm. No tetrahedron falls below a mean ratio of 0.1, unless it was below before.
     """
     for _ in range(_PASSES):
         points = _once(points, cells, faces, inside)
@@ -62,16 +62,17 @@ def _once(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], F
     value = TRI_POINTS[None] * tilt[:, None, :]
     matrix = np.einsum("fq,fqi,fqj->fij", weight, value, value)
     whole = scatter(matrix, local, len(used)).tocsc()
-    whole = whole + 1e-6 * float(whole.diagonal().mean()) * sp.eye_array(len(used), format="csc")
-    asked = np.bincount(local.ravel(), np.einsum("fq,fqi,fq->fi", weight, value, height).ravel(), len(used))
+    slight = np.full(len(used), 1e-6 * float(whole.diagonal().mean()))  # regularises
+    whole = whole + sp.diags_array(slight, format="csc")
+    target = np.bincount(local.ravel(), np.einsum("fq,fqi,fq->fi", weight, value, height).ravel(), len(used))
     shortest = np.full(len(used), np.inf)
     np.minimum.at(shortest, local, sides.min(axis=1)[:, None])
-    step = np.clip(spsolve(whole, asked), -_FARTHEST * shortest, _FARTHEST * shortest)
+    step = np.clip(spsolve(whole, target), -_FARTHEST * shortest, _FARTHEST * shortest)
     return _moved(points, cells, used, step[:, None] * out)
 
 
 def _moved(points: Floats, cells: Ints, used: Ints, step: Floats) -> Floats:
-    """Takes the step, or as much of it at each corner as leaves its tetrahedra sound."""
+    """Moves the corners by the step, or by as much of it as the quality of their tetrahedra allows."""
     least = np.minimum(_SOUND, quality(points[cells]))
     share = np.zeros(len(points))
     share[used] = 1.0
@@ -87,7 +88,7 @@ def _moved(points: Floats, cells: Ints, used: Ints, step: Floats) -> Floats:
 
 
 def _heights(at: Floats, normal: Floats, longest: Floats, inside: Callable[[Floats], Floats]) -> Floats:
-    """Way along the normal (F, 3) from (F, Q, 3) to the surface, (F, Q) mm; `longest`: (F,) sides, mm."""
+    """Distance (F, Q) mm along normals (F, 3) from points (F, Q, 3) to the surface; `longest`: (F,) mm."""
     faces, count = at.shape[:2]
     start, way = at.reshape(-1, 3), np.repeat(normal * longest[:, None] * _REACH, count, axis=0)
     begins = inside(start) > 0

@@ -1,4 +1,4 @@
-"""Tetrahedra inside a surface, by stuffing a graded lattice: deterministic, whatever the surface is like.
+"""Tetrahedra inside any surface, by isosurface stuffing of a graded lattice; deterministic.
 
 After Labelle & Shewchuk, "Isosurface stuffing" (ACM Trans. Graph. 26, 2007): lattice corners close to the
 surface move onto it, tetrahedra that still cross it are cut. Their lattice is an octree's, ours Kuhn's.
@@ -19,12 +19,12 @@ from synth.fem.mesh.refine import edges_of
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_SNAP = 0.3  # of an edge: how far a corner may move; less leaves flat pieces, more flattens neighbours
+_SNAP = 0.3  # largest shift of a corner, in edges; less leaves flat pieces, more flattens neighbours
 _HALVINGS = 14
 
 
 def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tuple[Floats, Ints]:
-    """Keeps what of a lattice is inside.
+    """Cuts a lattice along a surface; the part inside remains.
 
     Args:
         points: (N, 3) mm, lattice corners.
@@ -35,14 +35,13 @@ def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tu
         Points and cells of the largest connected part, positively oriented; none if nothing is inside.
     """
     points, value = points.copy(), np.where(inside(points) > 0, 1, -1)
-    kept = (value[cells] > 0).any(axis=1)
-    cells = cells[kept]
+    cells = cells[(value[cells] > 0).any(axis=1)]
     pairs, _ = edges_of(cells)
     pairs = pairs[value[pairs[:, 0]] != value[pairs[:, 1]]]
     where = _crossing(points, pairs, value, inside)
     _snap(points, value, pairs, where)
 
-    # The edges that are still cut get a corner each.
+    # A new corner on each edge that is still cut.
     cut = value[pairs[:, 0]] * value[pairs[:, 1]] < 0
     pairs = pairs[cut]
     where = _crossing(points, pairs, value, inside)
@@ -59,7 +58,7 @@ def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tu
 
 
 def _crossing(points: Floats, pairs: Ints, value: Ints, inside: Callable[[Floats], Floats]) -> Floats:
-    """Where each edge passes the surface, (E,) from 0 at its first corner to 1."""
+    """Crossing of each edge with the surface, (E,) from 0 at its first corner to 1."""
     first, side = points[pairs[:, 0]], points[pairs[:, 1]] - points[pairs[:, 0]]
     ends = np.zeros(len(pairs)), np.ones(len(pairs))
     return halve(inside, first, side, value[pairs[:, 0]] > 0, *ends, _HALVINGS)
@@ -74,9 +73,9 @@ def halve(
     high: Floats,
     times: int,
 ) -> Floats:
-    """Where `start` + share times `way`, (n, 3) mm each, passes the surface: share (n,), by halving.
+    """Crossing of `start` + share * `way`, (n, 3) mm each, with the surface: share (n,), by bisection.
 
-    It is between `low` and `high` (n,); `begins`: (n,) whether it is inside at `low`.
+    It lies between `low` and `high` (n,); `begins`: (n,) whether `low` is inside.
     """
     for _ in range(times):
         middle = 0.5 * (low + high)
@@ -120,14 +119,14 @@ def _pieces(cell: Ints, value: Ints, corner: dict[tuple[int, int], int]) -> list
 
 
 def _pyramid(base: list[int], top: int) -> list[list[int]]:
-    """Two tetrahedra; the base is halved from its lowest corner, as its other side's will be."""
+    """Two tetrahedra; the base is halved from its lowest corner, as in the neighbour behind it."""
     k = base.index(min(base))
     a, b, c, d = base[k:] + base[:k]
     return [[a, b, c, top], [a, c, d, top]]
 
 
 def _prism(ends: list[list[int]]) -> list[list[int]]:
-    """Three tetrahedra; every quadrilateral is halved from its lowest corner, as its neighbour's will be."""
+    """Three tetrahedra; every quadrilateral is halved from its lowest corner, as in its neighbour."""
     if min(ends[1]) < min(ends[0]):
         ends = ends[::-1]
     k = ends[0].index(min(ends[0]))
@@ -137,7 +136,7 @@ def _prism(ends: list[list[int]]) -> list[list[int]]:
 
 
 def _sound(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
-    """Turned the right way, without flat ones, the largest connected part, only the corners in use."""
+    """The largest connected part of the cells, positively oriented, without flat cells and unused corners."""
     if len(cells) == 0:
         return np.zeros((0, 3)), np.zeros((0, 4), np.int64)
     corner = points[cells]

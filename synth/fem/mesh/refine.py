@@ -19,7 +19,7 @@ EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
 def refine(points: Floats, cells: Ints, size: Callable[[Floats], Floats], target: int) -> tuple[Floats, Ints]:
-    """Bisects until there are about `target` tetrahedra, shaped after `size`.
+    """Bisects until there are about `target` tetrahedra, graded by `size`.
 
     Args:
         points: (N, 3) mm.
@@ -32,7 +32,7 @@ def refine(points: Floats, cells: Ints, size: Callable[[Floats], Floats], target
     """
     while len(cells) < target:
         need = longest(points, cells) / size(points[cells].mean(axis=1))
-        # Marking the worst alone keeps the grading even; a handful at a time would take hundreds of rounds.
+        # Marking only the worst keeps the grading even; a handful at a time would take hundreds of rounds.
         allowance = max(1, (target - len(cells)) // 6)
         worst = np.flatnonzero(need >= 0.8 * need.max())
         worst = worst[np.argsort(-need[worst], kind="stable")][:allowance]
@@ -50,7 +50,7 @@ def edges_of(cells: Ints) -> tuple[Ints, Ints]:
     """The mesh's edges, once each.
 
     Returns:
-        (E, 2) sorted corner pairs, and (M, 6) which of them are each tetrahedron's, in the order of `EDGES`.
+        (E, 2) sorted corner pairs, and (M, 6) each tetrahedron's indices into them, in the order of `EDGES`.
     """
     pairs = np.sort(cells[:, EDGES].reshape(-1, 2), axis=1)
     key = pairs[:, 0] * (int(cells.max()) + 1) + pairs[:, 1]
@@ -59,7 +59,7 @@ def edges_of(cells: Ints) -> tuple[Ints, Ints]:
 
 
 def bisect(points: Floats, cells: Ints, chosen: Ints) -> tuple[Floats, Ints]:
-    """Halves chosen tetrahedra at their longest edges, and as many others as conformity asks for.
+    """Halves chosen tetrahedra at their longest edges, and as many others as conformity requires.
 
     Args:
         points: (N, 3) mm.

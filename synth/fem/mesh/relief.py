@@ -1,7 +1,7 @@
-"""The upper boundary of a block follows gyri and sulci, as well as its faces can.
+"""Shapes the upper boundary of a block after gyri and sulci, as far as its faces allow.
 
-The heights of its nodes are those whose faces lie on the surface in the mean (least squares over the faces):
-what is thinner than a face averages out, not hit or missed by a corner. Faces are curved.
+Its nodes' heights are a least-squares fit of the curved faces to the surface, so that details smaller than a
+face are averaged rather than hit or missed by a corner.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ Ints = NDArray[np.int64]
 Field = Callable[[Floats], Floats]
 """Height (n,) mm at (n, 2) mm."""
 
-_FADE_MM = 3.0  # over which the map passes into what lies round it
+_FADE_MM = 3.0  # width over which the map passes into the field around it
 _LATTICE = 7
 _PLACES = (
     np.array([(i, j, _LATTICE - 1 - i - j) for i in range(_LATTICE) for j in range(_LATTICE - i)]) + 1 / 3
 ) / _LATTICE
-"""(28, 3) even barycentric places on a face."""
+"""(28, 3) evenly spaced barycentric points on a face."""
 _SOUND, _UNBENT = 0.1, 0.3  # least mean ratio, and least Jacobian of a curved element over its straight one's
 _TURNS = 24
 
@@ -37,10 +37,8 @@ _TURNS = 24
 class HeightMap:
     """Heights over a square round the opening's centre."""
 
-    height: Floats
-    """(n, n) mm, at a grid whose corners are those of the square; rows go with y, columns with x."""
-    extent_mm: float
-    """Side of the square."""
+    height: Floats  # (n, n) mm, on a grid from corner to corner of the square; rows go with y, columns with x
+    extent_mm: float  # side of the square
 
     def over(self, ground: Field) -> Field:
         """The map within its inner circle, passing into another field beyond."""
@@ -63,8 +61,8 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
         points: (N, 3) mm, z from -depth to 0; midsides in the middle of their sides.
         cells: (M, 10).
         faces: (F, 6) of the upper side.
-        ground: smooth; the box is bent after it as a whole.
-        height: what the upper side is to be; where elements would get bad, it is only partly.
+        ground: smooth; the whole box is bent after it.
+        height: of the upper side; followed only in part where elements would become too flat.
 
     Returns:
         (N, 3) mm. Sides are straight but for those on the upper side.
@@ -98,7 +96,7 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
 
 
 def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Floats]:
-    """The nodes of faces and the heights (K,) mm of them that fit (F, 28) mm at `_PLACES` best."""
+    """Nodes (K,) of faces, and their heights (K,) mm by least squares on heights (F, 28) mm at `_PLACES`."""
     corner = points[faces[:, :3], :2]
     side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = 0.5 * np.abs(side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0])
@@ -107,5 +105,5 @@ def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Flo
     used, at = np.unique(faces, return_inverse=True)
     at = at.reshape(faces.shape)
     matrix = scatter(local, at, len(used)).tocsc()
-    asked = np.bincount(at.ravel(), np.einsum("f,qi,fq->fi", area, value, wanted).ravel(), len(used))
-    return used, np.asarray(spsolve(matrix, asked))
+    target = np.bincount(at.ravel(), np.einsum("f,qi,fq->fi", area, value, wanted).ravel(), len(used))
+    return used, np.asarray(spsolve(matrix, target))

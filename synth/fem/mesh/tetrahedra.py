@@ -1,4 +1,4 @@
-"""The volume mesh: graded tetrahedra of a block or of a user's brain, and where the skull holds them."""
+"""The volume mesh: graded tetrahedra of a block or of a user's brain, and the skull's hold on them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,11 @@ BLOCK_MM = 100.0, 100.0, 60.0
 """Width, height, depth of a procedural block; below 70 mm the fixed walls would take 10-16% of the peak."""
 RIM_MM = 3.0
 """Width over which the skull's hold on the brain grows from none in the opening to firm."""
-_FIRM_PER_MM = (
-    2.0  # skull and dura as springs of this times E a mm: 10 times stiffer than the tissue under a contact
-)
-_EVEN = 0.5  # under a contact elements are of one size up to this part of its radius
-_DEPTH = 1.5  # strain fades faster downwards than sideways: depth counts so much more than distance
+_FIRM_PER_MM = 2.0  # springs of skull and dura, in E per mm: 10 times stiffer than the tissue under a contact
+_EVEN = 0.5  # part of a contact's radius under which elements have one size
+_DEPTH = 1.5  # weight of depth against distance: strain fades faster downwards than sideways
 _ALL_MM = 25.0  # lattice this near to the opening is refined inside and outside alike
-_FLAT = 0.8  # the dome is round up to this part of its radius, level beyond (under the skull)
+_FLAT = 0.8  # part of the dome's radius up to which it is round; level beyond (under the skull)
 _KUHN = np.array([[0, 1, 3, 7], [0, 5, 1, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 6, 4, 7]])
 """Six tetrahedra of a cube with corners numbered x + 2y + 4z, round its diagonal."""
 
@@ -49,16 +47,11 @@ _MIDSIDES = np.array([[7, 8, 9], [6, 5, 9], [4, 6, 8], [5, 4, 7]])
 class Tets:
     """A meshed brain, in world axes."""
 
-    points: Floats
-    """(N, 3) mm: corners first, then nodes on the edges, in their middle but for curved ones."""
-    cells: Ints
-    """(M, 10), positively oriented; midsides in the order of `refine.EDGES`."""
-    fixed: NDArray[np.bool_]
-    """(N,) nodes that cannot move: the walls a block is cut out at."""
-    hold: sp.csr_array
-    """(N, N) mm, for E = 1 kPa: springs of the skull on the surface round the opening, and of attachments."""
-    slip: sp.csr_array | None = None
-    """(3N, 3N) mm: springs along the surface's normal alone, where tissue slips along the skull."""
+    points: Floats  # (N, 3) mm: corners first, then nodes on the edges, in their middle but for curved ones
+    cells: Ints  # (M, 10), positively oriented; midsides in the order of `refine.EDGES`
+    fixed: NDArray[np.bool_]  # (N,) nodes that cannot move: the walls a block is cut out at
+    hold: sp.csr_array  # (N, N) mm, for E = 1 kPa: springs of the skull and of attachments
+    slip: sp.csr_array | None = None  # (3N, 3N) mm: springs along the normal alone, where tissue slips
 
 
 def block(
@@ -70,14 +63,14 @@ def block(
     slips: bool = False,
     size_mm: tuple[float, float, float] = BLOCK_MM,
 ) -> Tets:
-    """A domed block, fixed at its sides and bottom, held by the skull round the opening.
+    """A domed block, fixed at its sides and bottom, held by the skull around the opening.
 
     Args:
         anatomy: dome_mm, craniotomy and attachments are used.
         tets: number of tetrahedra to aim for.
-        focus: where the load will be; finest there. Empty: finest in the whole opening.
-        height: of the surface over the opening and its rim. Empty: the bare dome.
-        slips: tissue slips along the skull round the opening, rather than being bonded to it.
+        focus: contacts, under which the mesh is finest. Empty: finest in the whole opening.
+        height: of the surface over the opening and its rim. None: the bare dome.
+        slips: tissue slips along the skull around the opening, rather than being bonded to it.
         size_mm: width, height, depth.
 
     Raises:
@@ -149,7 +142,7 @@ def with_midsides(points: Floats, cells: Ints) -> tuple[Floats, Ints]:
 
 
 def boundary(cells: Ints) -> Ints:
-    """Faces with one tetrahedron, counter-clockwise seen from outside.
+    """Faces with one tetrahedron, counter-clockwise from outside.
 
     (F, 3) corners of cells (M, 4); of cells (M, 10) also midsides 01, 02, 12, (F, 6).
     """
@@ -159,7 +152,7 @@ def boundary(cells: Ints) -> Ints:
 
 
 def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
-    """Of the faces with one tetrahedron: which (F,), and the corner of it that is off the face (F,)."""
+    """Of the faces with one tetrahedron: that tetrahedron (F,), and its corner that is off the face (F,)."""
     key = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])
@@ -167,11 +160,12 @@ def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
 
 
 def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], Floats]:
-    """Wanted size: even under the contacts (or the opening), growing with the distance from them.
+    """Wanted size: constant under the contacts (or the opening), growing with the distance from them.
 
-    Measured: in proportion to the distance gives the smallest error in the opening, 3 times smaller under a
-    contact than under the whole opening. Even over half the contact's radius, where most of the pressure is,
-    and depth counting 1.5 times give the smallest error under a nonlinear law with the relief.
+    Measured: growth in proportion to the distance gives the smallest error in the opening; a focus under the
+    contact gives a third of the error of one under the whole opening. A constant size over half the contact's
+    radius, where most of the pressure is, and depth counting 1.5 times give the smallest error under a
+    nonlinear law with the relief.
     """
 
     def size(at: Floats) -> Floats:
@@ -208,13 +202,13 @@ def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
 
 
 def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
-    """Graded tetrahedra inside a surface: about as many as wanted, after a few tries."""
+    """Graded tetrahedra inside a surface, about as many as wanted after up to four tries."""
     turns = winding.prepare(*brain.shape)
     low, high = brain.shape.vertices.min(axis=0), brain.shape.vertices.max(axis=0)
     size = 1.1 * (high - low)
 
     def wanted(at: Floats) -> Floats:
-        """Nothing is gained by refining what lies well outside."""
+        """The grading, coarser well outside the surface, where refining gains nothing."""
         outside = turns(at) < 0.01
         far = np.linalg.norm(at, axis=1) > _ALL_MM
         return np.asarray(grading(at) * np.where(outside & far, 4.0, 1.0))
@@ -253,11 +247,11 @@ def _finished(
 def _springs(
     points: Floats, faces: Ints, at: schema.CraniotomySection, slips: bool
 ) -> tuple[sp.csr_array, sp.csr_array | None]:
-    """The skull: springs on the surface that grow, over the rim's width, from none in the opening to firm.
+    """The skull's springs on the surface, which grow over the rim's width from none in the opening to firm.
 
     Returns:
-        (N, N) mm of those that hold every way, and (3N, 3N) of those along the normal alone. Deep below,
-        where nerves and vessels tether the brain, all hold every way.
+        (N, N) mm of those that hold in every direction, and (3N, 3N) mm of those along the normal alone. Deep
+        below, where nerves and vessels tether the brain, all hold in every direction.
     """
     corner = points[faces[:, :3]]
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -265,7 +259,7 @@ def _springs(
     place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
     out = np.hypot(place[..., 0], place[..., 1]) - at.radius_mm
     firm = np.clip(out / RIM_MM, 0, 1)
-    # Deep below, it is the far side of the brain, which no opening bares.
+    # Deep below lies the far side of the brain, which no opening exposes.
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1
     value = face_shape(TRI_POINTS)

@@ -17,25 +17,19 @@ from synth.system.jit import compiled
 Floats = NDArray[np.float64]
 
 _LEAF = 24
-_FAR = 2.5  # cluster radii from which a dipole will do: the error stays below 0.01 of a turn
+_FAR = 2.5  # cluster radii from which a dipole is accurate: the error stays below 0.01 of a turn
 
 
 @dataclass(frozen=True)
 class Winding:
-    """A surface prepared for asking: 1 inside, 0 outside, between the two near a hole."""
+    """Winding number of a surface: 1 inside, 0 outside, between the two near a hole."""
 
-    corner: Floats
-    """(F, 3, 3) mm, faces in the order of their clusters."""
-    start: NDArray[np.int64]
-    """(C + 1,) where each cluster's faces begin."""
-    centre: Floats
-    """(C, 3) mm."""
-    radius: Floats
-    """(C,) mm."""
-    moment: Floats
-    """(C, 3) mm^2, area times normal."""
-    sign: float
-    """-1 for a surface whose faces look inwards."""
+    corner: Floats  # (F, 3, 3) mm, faces in the order of their clusters
+    start: NDArray[np.int64]  # (C + 1,) where each cluster's faces begin
+    centre: Floats  # (C, 3) mm
+    radius: Floats  # (C,) mm
+    moment: Floats  # (C, 3) mm^2, area times normal
+    sign: float  # -1 for a surface whose faces look inwards
 
     def __call__(self, at: Floats) -> Floats:
         """Winding number at (n, 3) mm, (n,)."""
@@ -46,7 +40,7 @@ class Winding:
 
 
 def prepare(vertices: Floats, faces: NDArray[np.integer]) -> Winding:
-    """Sorts the faces of a surface, (V, 3) mm and (F, 3), into clusters."""
+    """The winding number of a surface, (V, 3) mm and (F, 3): sorts its faces into clusters."""
     corner = vertices[faces]
     middle = corner.mean(axis=1)
     parts, clusters = [np.arange(len(faces))], []
@@ -102,7 +96,7 @@ def _number(
 
 @compiled
 def _solid_angle(t: Floats, x: float, y: float, z: float) -> float:
-    """Of a triangle seen from a point (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 1983)."""
+    """Solid angle of a triangle at a point (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 1983)."""
     ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
     bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
     cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
