@@ -68,7 +68,7 @@ def main(root: Path, sequences: int) -> None:
                 pial_absorbance=0.2 * case.appearance.pial_absorbance,
                 sensor=replace(case.appearance.sensor, exposure=0.8 * case.appearance.sensor.exposure),
             )
-            case = replace(case, look=look, sway=Arc(rng.uniform(4, 10)))
+            case = replace(case, look=look, camera_motion=Arc(rng.uniform(4, 10)))
             motion = stir(radius_mm=rng.uniform(1, 2), turns=rng.choice([-1.0, 1.0]), frames=FRAMES)
             # Mechanics, pictures, truth and recovered flow follow; the store is sealed as any other.
             scene = synth.simulate(job, k, case=case, motions=[motion])

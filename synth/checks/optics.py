@@ -71,8 +71,8 @@ def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
     """World to camera axes in every frame, (T, 4, 4) mm: as stored, else as the scenario moves the camera."""
     if "camera" in sequence.fields:
         return np.asarray(sequence["camera"][:])
-    sway = sequence.attrs["scenario"].get("sway")
-    views = [CameraMotion(**sway).at(at_rest, float(t)) if sway else at_rest for t in time]
+    moves = sequence.attrs["scenario"].get("camera_motion")
+    views = [CameraMotion(**moves).at(at_rest, float(t)) if moves else at_rest for t in time]
     return np.stack([view.pose for view in views])
 
 

@@ -1,6 +1,6 @@
 """Instruments as meshes that follow tips and shafts: forceps of two kinds, dissector, suction, spatula.
 
-Sizes in mm are those of common neurosurgical instruments, by eye: no maker's drawing stands behind them.
+Sizes in mm are those of common neurosurgical instruments, chosen by eye, not from drawings.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _AROUND = 40
 _LENGTH_MM = 110.0
 _COAT_MM = 11.0  # from the tip
 
-_CLIMB_MM, _REACH_MM = 0.30, 0.40  # how far fluid climbs at a tip, and over what distance that falls off
+_CLIMB_MM, _REACH_MM = 0.30, 0.40  # height to which fluid climbs at a tip, and distance of its fall-off
 
-# What a hand would take for each gesture, and how often.
+# Instruments that suit each gesture, and their shares.
 _HABITS: dict[str, tuple[tuple[Kind, ...], tuple[float, ...]]] = {
     "pull": (("forceps", "bayonet"), (0.5, 0.5)),
     "grasp": (("forceps", "bayonet"), (0.5, 0.5)),
@@ -38,12 +38,10 @@ _COATED = 0.4  # share of instruments whose end is coated black, against stickin
 
 @dataclass(frozen=True)
 class Part:
-    """A swept bar in its own axes: the tip at the origin, z towards the hand, flat across x."""
+    """A swept bar in its own axes: tip at the origin, z towards the hand, flat across x."""
 
-    profile: Floats
-    """(V, 3) mm."""
-    side: int
-    """Which of its instrument's two tips it follows, 1 and -1; 0: their middle."""
+    profile: Floats  # (V, 3) mm
+    side: int  # tip of the instrument that it follows: 1, -1; 0: their middle
 
 
 @dataclass(frozen=True)
@@ -51,12 +49,9 @@ class InstrumentMesh:
     """All instruments of a scene as one mesh."""
 
     kinds: tuple[Kind, ...]
-    parts: tuple[tuple[Part, ...], ...]
-    """The parts of each."""
-    faces: npt.NDArray[np.int32]
-    """(F, 3) over all parts."""
-    coat: npt.NDArray[np.float32]
-    """(V,) 0 bare steel to 1 under a black coating."""
+    parts: tuple[tuple[Part, ...], ...]  # the parts of each
+    faces: npt.NDArray[np.int32]  # (F, 3) over all parts
+    coat: npt.NDArray[np.float32]  # (V,) 0 bare steel to 1 under a black coating
 
 
 def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
@@ -69,12 +64,12 @@ def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...
 
 
 def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
-    """Whether the end of each is coated black."""
+    """Whether the end of each instrument is coated black."""
     return tuple(bool(drawn) for drawn in rng.random(len(kinds)) < _COATED)
 
 
 def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
-    """The mesh of some instruments, perhaps none, to be placed by `pose`; the `coated` have black ends."""
+    """The mesh of any number of instruments, to be placed by `pose`; the `coated` ones have black ends."""
     parts = tuple(_SHAPES[kind][0]() for kind in kinds)
     faces, coat, total = [np.zeros((0, 3), np.int32)], [np.zeros(0)], 0
     for own, ends in zip(parts, coated, strict=True):
@@ -97,14 +92,14 @@ def pose(instrument: InstrumentMesh, tips: Floats, shafts: Floats) -> Floats:
 
     Args:
         instrument: n instruments.
-        tips: (2n, 3) mm, two an instrument; one with a single tip is in the middle of its two.
+        tips: (2n, 3) mm, two per instrument; a single-tipped one is placed in their middle.
         shafts: (2n, 3), from tip to hand.
 
     Raises:
-        UserError: another number of tips than two an instrument.
+        UserError: the number of tips is not two per instrument.
     """
     if instrument.parts and len(tips) != 2 * len(instrument.parts):
-        raise UserError(f"{len(tips)} tips for {len(instrument.parts)} instruments; two each are needed")
+        raise UserError(f"{len(tips)} tips for {len(instrument.parts)} instruments; give two for each")
     placed = [np.zeros((0, 3))]
     for k, parts in enumerate(instrument.parts):
         ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
@@ -119,7 +114,7 @@ def pose(instrument: InstrumentMesh, tips: Floats, shafts: Floats) -> Floats:
 
 
 def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
-    """Height (V,) mm that the wet film of a surface (V, 3) mm climbs at tips (2n, 3) mm that touch it."""
+    """Height (V,) mm of the wet film on a surface (V, 3) mm around tips (2n, 3) mm that touch it."""
     height = np.zeros(len(surface))
     for k, kind in enumerate(instrument.kinds):
         ends = tips[2 * k : 2 * k + 2]
@@ -130,7 +125,7 @@ def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:
-    """Rows x, y, z of an orthonormal frame: z along the shaft, x as near to `across` as it can be."""
+    """Rows x, y, z of an orthonormal frame: z along the shaft, x as near to `across` as possible."""
     z = shaft / np.linalg.norm(shaft)
     for level in (None, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]):
         side = across if level is None else np.cross(z, level)
@@ -142,7 +137,7 @@ def _axes(shaft: Floats, across: Floats) -> Floats:
 
 
 def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
-    """Rings (V, 3): half axes `thick` and `wide`, shifted by `bow` along x; power 1 round, less squarer."""
+    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
     angle = np.linspace(0, 2 * np.pi, _AROUND + 1)
     c, w = np.cos(angle), np.sin(angle)
     x = np.sign(c) * np.abs(c) ** power
@@ -152,7 +147,7 @@ def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) ->
 
 
 def _along(rings: int) -> Floats:
-    """Where rings stand along an instrument (rings,) mm: closer together at its tip."""
+    """Positions (rings,) mm of rings along an instrument, closer together at its tip."""
     return np.asarray((np.linspace(0, 1, rings) ** 1.6) * _LENGTH_MM)
 
 
@@ -167,7 +162,7 @@ def _forceps() -> tuple[Part, ...]:
 
 
 def _bayonet() -> tuple[Part, ...]:
-    """Forceps bent twice, so that the hand is out of the lens's way."""
+    """Forceps bent twice, which keeps the hand out of view."""
     s = _along(96)
     step = np.clip((s - 24.0) / 14.0, 0, 1)
     return _tines(13.0 * step**2 * (3 - 2 * step))
@@ -199,7 +194,7 @@ def _dissector() -> tuple[Part, ...]:
 
 
 def _suction() -> tuple[Part, ...]:
-    """A tube, open at its end; beyond a bend it widens."""
+    """A tube, open at its end, bent and wider towards the hand."""
     outside = 0.12 + _along(84)
     inside = np.array([8.0, 3.0, 1.0, 0.3, 0.05])
     s = np.concatenate([inside, outside])
@@ -225,4 +220,4 @@ _SHAPES: dict[Kind, tuple[Callable[[], tuple[Part, ...]], float]] = {
     "suction": (_suction, 1.2),
     "spatula": (_spatula, 3.0),
 }
-"""Parts of each, and half the width [mm] of what touches tissue."""
+"""Parts of each kind, and half the width [mm] of its contact with tissue."""

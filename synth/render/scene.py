@@ -1,4 +1,4 @@
-"""The renderer of one surface under the microscope, moved frame by frame: pictures and their truth."""
+"""The renderer of one moving surface under the microscope: pictures and their ground truth."""
 
 from __future__ import annotations
 
@@ -28,32 +28,27 @@ Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
-_MIRRORED_PX = 48  # of the wound that steel mirrors: its finish shows no more
-_SATIN = 0.10  # share of light that steel's finish scatters evenly
-_DULL = 0.8  # a retractor's finish, between steel (0) and black (1): it must not dazzle
-_AMBIENT = 0.05  # of the lamps' light comes from everywhere
-_GLARE = 0.35  # specular radiance, as a share of full scale, that hides what is under it
+_MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
+_SATIN = 0.10  # share of light that steel's finish scatters diffusely
+_DULL = 0.8  # finish of a retractor, between steel (0) and black (1), against glare
+_AMBIENT = 0.05  # share of the lamps' light that comes from all directions
+_GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
 
 
 @dataclass(frozen=True)
 class SceneState:
-    """Where everything is at one time."""
+    """State of the scene at one time."""
 
-    vertices: Floats
-    """(V, 3) mm, the surface."""
-    tips: Floats
-    """(2n, 3) mm, two for each of n instruments: where its tines end."""
-    shafts: Floats
-    """(2n, 3) unit vectors from tip to hand."""
-    camera: Camera | None = None
-    """The microscope, if it is not where it was at rest; with the same lens."""
-    power: float = 1.0
-    """Of the lamps, against the rest frame's."""
+    vertices: Floats  # (V, 3) mm, the surface
+    tips: Floats  # (2n, 3) mm, two for each of n instruments: ends of its tines
+    shafts: Floats  # (2n, 3) unit vectors from tip to hand
+    camera: Camera | None = None  # the microscope, if not in its pose at rest; with the same lens
+    power: float = 1.0  # of the lamps, relative to the rest frame
 
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame and its truth. What the job does not ask for (`store.extra`) is None."""
+    """One frame and its ground truth. Fields that are not in the job's `store.extra` are None."""
 
     rgb: npt.NDArray[np.uint8]
     """(H, W, 3) sRGB."""
@@ -62,13 +57,13 @@ class RenderedFrame:
     flow: Map
     """(H, W, 2) px from the rest frame to this one, at rest pixels; 0 off the tissue."""
     visible: Mask
-    """(H, W) the rest pixel's material point is seen in this frame."""
+    """(H, W) whether the rest pixel's material point is visible in this frame."""
     depth: Map
     """(H, W) mm along the optical axis; 0 where there is nothing."""
     tool: Mask
     """(H, W) this frame's pixels."""
     glare: Mask
-    """(H, W) this frame's pixels: a highlight outshines the tissue."""
+    """(H, W) this frame's pixels: a specular highlight hides the tissue."""
     flow_next: Map | None = None
     """(H, W, 2) px from this frame to the next, at this frame's pixels; 0 off the tissue."""
     normals: Map | None = None
@@ -80,20 +75,20 @@ class RenderedFrame:
     visible_right: Mask | None = None
     depth_right: Map | None = None
     motion: Map | None = None
-    """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a second lens."""
+    """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a right camera."""
     tool_right: Mask | None = None
-    """(H, W) the second lens's pixels of this frame; with one."""
+    """(H, W) this frame's pixels of the right camera; with one."""
 
 
 class Renderer:
-    """One scene. Every frame is a function of its arguments alone.
+    """Renderer of one scene. Every frame depends on its arguments alone.
 
     Args:
         surface: the cortex at rest.
         appearance: its appearance.
         camera: the microscope at rest.
         job: render settings, opening and photograph.
-        gestures: kind of each instrument's gesture; an instrument that suits it is shown.
+        gestures: kind of each instrument's gesture, for which a suitable instrument is shown.
 
     Raises:
         UserError: the variant cannot run here, or the photograph cannot be read.
@@ -107,7 +102,7 @@ class Renderer:
         job: Job,
         gestures: Sequence[str] = ("pull",),
     ) -> None:
-        forget()  # of a renderer before this one
+        forget()  # earlier renderers
         self.variant = pick(job.render.variant)
         self.surface, self.camera = surface, camera
         self._appearance, self._render, self._extra = appearance, job.render, job.store.extra
@@ -122,14 +117,14 @@ class Renderer:
         hand = np.random.default_rng([appearance.rim_seed, 2])
         kinds = instrument.choose(gestures if job.render.tool else (), hand)
         self._tool = instrument.build(kinds, instrument.finish(kinds, hand))
-        """Without a vertex where the job shows no instruments."""
+        """Empty where the job shows no instruments."""
         self._blade = self._retractor()
         rest = Shape(surface.vertices, surface.faces)
         self._static = joined(self._rim.shape, self._blade)
-        """Rim and scenery, which never move."""
+        """Rim and retractor, which never move."""
         self.rest = truth.trace_rest(camera, rest, self._static)
         self.right: Camera | None = None
-        """The second lens at rest, where the job has one."""
+        """The right camera at rest, if the job has one."""
         self._right_rest: RestFrame | None = None
         if job.render.stereo_mm:
             self.right = right_camera(camera, job.render.stereo_mm)
@@ -137,7 +132,7 @@ class Renderer:
         self.lamps = light.lamps(camera, appearance.light)
         dull = np.full(len(self._blade.vertices), _DULL, np.float32)
         self._coating = np.concatenate([self._tool.coat, dull])
-        """(V,) of `_steel`: 1 where it is coated black, and between where it is dull."""
+        """(V,) of `_steel`: 0 polished, 1 coated black, in between dull."""
         self._theatre = self._surroundings()
         self._stage: Stage | None = None
 
@@ -148,42 +143,42 @@ class Renderer:
         shutter: Sequence[SceneState] = (),
         after: SceneState | None = None,
     ) -> RenderedFrame:
-        """Picture and truth of one frame.
+        """Picture and ground truth of one frame.
 
         Args:
-            state: the scene at the frame's time, which its truth is of.
+            state: the scene at the frame's time, for the ground truth.
             seed: of light paths and sensor noise.
-            shutter: states while the shutter is open, whose light adds up in the picture; `state` if none.
+            shutter: states while the shutter is open, over which the picture averages; `state` if none.
             after: the next frame's state, for the flow to it.
         """
         camera = state.camera or self.camera
         radiance, radiance_right = self._gathered(shutter or (state,), seed)
         shapes = (Shape(state.vertices, self.surface.faces), self._static, self._posed(state))
-        seen = truth.trace_frame(camera, self.rest, *shapes)
+        own = truth.trace_frame(camera, self.rest, *shapes)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
             extra["flow_next"] = truth.forward_flow(
-                seen.hits, self.surface.faces, there.vertices, there.camera or self.camera
+                own.hits, self.surface.faces, there.vertices, there.camera or self.camera
             )
         if "normals" in self._extra:
-            extra["normals"] = truth.normal_map(camera, seen.hits, shapes)
+            extra["normals"] = truth.normal_map(camera, own.hits, shapes)
         if "blur" in self._extra:
-            extra["blur"] = blur_radius(camera, seen.depth)
+            extra["blur"] = blur_radius(camera, own.depth)
         if self._right_rest is not None:
             lens = right_camera(camera, self._render.stereo_mm)
             other = truth.trace_frame(lens, self._right_rest, *shapes)
             picture = self.develop(radiance_right, seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
-            extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": seen.motion}
+            extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
         return RenderedFrame(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
-            flow=seen.flow,
-            visible=seen.visible,
-            depth=seen.depth,
-            tool=seen.tool,
-            glare=self._glare(radiance, seen, state),
+            flow=own.flow,
+            visible=own.visible,
+            depth=own.depth,
+            tool=own.tool,
+            glare=self._glare(radiance, own.hits, state),
             **extra,
         )
 
@@ -191,10 +186,10 @@ class Renderer:
         """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
 
         Raises:
-            ValueError: the job has no second lens.
+            ValueError: the job has no right camera.
         """
         if self.right is None:
-            raise ValueError("there is no second lens")
+            raise ValueError("the job is monocular")
         width, height = self.camera.size
         depth = self.rest.points[:, 2].reshape(height, width)
         shift = self.right.K[0, 2] - self.camera.K[0, 2]
@@ -211,7 +206,7 @@ class Renderer:
         return Stage(self.variant, self.camera, self._bodies(state), self.lamps, spp, integrator)
 
     def move(self, stage: Stage, state: SceneState) -> None:
-        """Puts everything in a stage where it is in another state."""
+        """Moves a stage to another state."""
         stage.move("cortex", state.vertices, film=self._film(state))
         if self._tool.parts:
             steel = self._steel(state)
@@ -228,7 +223,7 @@ class Renderer:
         return instrument.film(self._tool, state.tips, state.vertices)
 
     def _gathered(self, states: Sequence[SceneState], seed: int) -> tuple[Map, Map]:
-        """Mean light of some states in the lens and in the second one; zeros where there is none."""
+        """Mean radiance over some states in the camera and in the right one, which is 0 if there is none."""
         left: list[Map] = []
         right: list[Map] = []
         for k, state in enumerate(states):
@@ -240,8 +235,8 @@ class Renderer:
                 self.move(self._stage, state)
             left.append(power * self._expose(self._stage, camera, seed + 7919 * k))
             if self.right is not None:
-                second = right_camera(camera, self._render.stereo_mm)
-                right.append(power * self._expose(self._stage, second, seed + 1 + 7919 * k))
+                other = right_camera(camera, self._render.stereo_mm)
+                right.append(power * self._expose(self._stage, other, seed + 1 + 7919 * k))
         return (
             np.asarray(np.mean(left, axis=0), np.float32),
             np.asarray(np.mean(right or np.zeros_like(left), axis=0), np.float32),
@@ -252,12 +247,12 @@ class Renderer:
         return stage.render(seed % 2**32, camera) * spot[..., None]
 
     def _bodies(self, state: SceneState) -> dict[str, Body]:
-        """Everything in the scene with its material."""
+        """All bodies of the scene with their materials."""
         surface, appearance = self.surface, self._appearance
         pixels = texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
         frame = rim.paint(self._rim, appearance, pixels)
         ambient = _AMBIENT * appearance.light.power * light.blackbody(appearance.light.kelvin)
-        wet = Wet(self._coat, appearance.roughness, appearance.dry_roughness, ambient, appearance.film_index)
+        wet = Wet(self._coat, appearance.roughness, appearance.dry_roughness, ambient, appearance.fluid_index)
         dura = Wet(frame, _RIM_ROUGHNESS, _RIM_DRY, ambient)
         bodies = {
             "cortex": Body(state.vertices, surface.faces, surface.uv, wet, self._film(state)),
@@ -271,9 +266,9 @@ class Renderer:
         return bodies
 
     def _retractor(self) -> Shape:
-        """The blade over the rim; without one, where there is no instrument either, a face that nobody sees.
+        """The blade over the rim; if there is no instrument either, an invisible face.
 
-        One mesh of steel, and never without a face: scenes with a retractor and without share their kernel.
+        A scene always has a mesh of steel with a face: with or without a retractor kernels are the same.
         """
         if "retractor" in self._appearance.scenery:
             points = np.concatenate([self.surface.vertices, self._rim.shape.vertices])
@@ -289,8 +284,8 @@ class Renderer:
         return joined(self._posed(state), self._blade)
 
     def _surroundings(self) -> reflection.Theatre:
-        """What steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
-        extent = self.surface.chart.extent_mm  # its plan to within the finish
+        """Surroundings that steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
+        extent = self.surface.chart.extent_mm  # close enough to the projection for the finish
         small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
         axis = noise.centres(_MIRRORED_PX, extent)
         inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
@@ -304,12 +299,12 @@ class Renderer:
     def _mirrored(self, steel: Shape) -> Floats:
         return reflection.glow(steel, self._coating, self.camera.centre, self._theatre)
 
-    def _glare(self, radiance: Map, seen: truth.FrameTruth, state: SceneState) -> Mask:
-        """Tissue whose radiance exceeds what its diffuse part could send."""
+    def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
+        """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""
         height, width = radiance.shape[:2]
         faces = self.surface.faces
-        on = (seen.hits.face >= 0) & (seen.hits.face < len(faces))
-        face, bary = seen.hits.face[on], seen.hits.bary[on]
+        on = (hits.face >= 0) & (hits.face < len(faces))
+        face, bary = hits.face[on], hits.bary[on]
         uv = truth.blend(faces, face, bary, self.surface.uv)
         albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
         light_in = truth.blend(faces, face, bary, state.power * self._irradiance(state.vertices))
@@ -330,13 +325,13 @@ class Renderer:
 
 
 def _mean(colour: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Mean (N,) of colours (N, 3), in their type: over so short an axis NumPy's takes ten times as long."""
+    """Mean (N,) of colours (N, 3), in their type; over so short an axis `np.mean` takes ten times as long."""
     return np.asarray((colour[:, 0] + colour[:, 1] + colour[:, 2]) / colour.dtype.type(3))
 
 
 @vectorised
 def _add_light(vertices: Floats, normal: Floats, lamp: Floats, intensity: Floats, total: Floats) -> None:
-    """Adds a lamp's radiance of a white diffuser at vertices to `total` (V, 3); in NumPy's order of sums."""
+    """Adds a white diffuser's radiance by a lamp at vertices to `total` (V, 3), in NumPy's order of sums."""
     for n in range(len(vertices)):
         x, y, z = lamp[0] - vertices[n, 0], lamp[1] - vertices[n, 1], lamp[2] - vertices[n, 2]
         distance = np.sqrt(x * x + y * y + z * z)

@@ -1,7 +1,7 @@
-"""Ground truth by centre rays of our own, in double precision: what each pixel sees, and where that goes.
+"""Ground truth by centre rays in double precision: the surface point in each pixel, and its motion.
 
-The renderer has no part in this: triangles are cast here against the very rays of `camera`, so every label is
-the same on every variant, exact at folds and edges, and in the pixels of the recorded (distorted) picture.
+Independent of the renderer: triangles are intersected with the rays of `camera`, so that labels are the same
+on every variant, exact at folds and edges, and in the pixels of the recorded (distorted) picture.
 Intersection: T. Moeller, B. Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
 """
 
@@ -23,76 +23,56 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 
-_HIDDEN_MM = 1e-3  # nearer to the lens than a point by more than this hides it
+_HIDDEN_MM = 1e-3  # a surface that is nearer than a point by more than this hides it
 _NEAR_MM = 1.0
-# Triangles bow a little under distortion, small ones less: how far outside their corners to look for them.
+# Distortion bends triangles, small ones less: margin around their corners in which rays are tested.
 _PAD_PX = 1.5
 _LEAST_PAD_PX, _PAD_SHARE = 0.25, 1 / 16
-_SURELY = 2e-10  # share of a triangle: further outside, no rounding brings a ray back onto it
+_SURELY = 2e-10  # share of a triangle by which a ray surely misses, whatever the rounding
 
 
 @dataclass(frozen=True)
 class Hits:
-    """First surface along each ray."""
+    """First intersection along each ray."""
 
-    face: Indices
-    """(N,) index of the triangle; -1 where there is none."""
-    bary: Floats
-    """(N, 3) weights of its corners; 0 where there is none."""
-    along: Floats
-    """(N,) distance in units of the ray's direction; inf where there is none."""
+    face: Indices  # (N,) index of the triangle; -1 where there is none
+    bary: Floats  # (N, 3) weights of its corners; 0 where there is none
+    along: Floats  # (N,) distance in units of the ray's direction; inf where there is none
 
 
 @dataclass(frozen=True)
 class RestFrame:
-    """Truth of the rest frame."""
+    """Ground truth of the rest frame."""
 
-    tissue: Mask
-    """(H, W): brain, in the opening."""
-    area: npt.NDArray[np.float32]
-    """(H, W) mm2: rest surface that the pixel sees; 0 off the tissue."""
-    scale_mm_per_px: float
-    """At the craniotomy's centre."""
-    face: Indices
-    """(H, W) triangle of the fine surface; -1 off the tissue."""
-    bary: Floats
-    """(H, W, 3)."""
-    directions: Floats
-    """(H*W, 3) of the pixels' centre rays, camera axes, unit z: the lens's own, wherever the camera goes."""
-    points: Floats
-    """(H*W, 3) mm of what the pixels see, camera axes; 0 off the tissue."""
+    tissue: Mask  # (H, W): brain in the opening
+    area: npt.NDArray[np.float32]  # (H, W) mm2 of rest surface in the pixel; 0 off the tissue
+    scale_mm_per_px: float  # at the craniotomy's centre
+    face: Indices  # (H, W) triangle of the fine surface; -1 off the tissue
+    bary: Floats  # (H, W, 3)
+    directions: Floats  # (H*W, 3) of the pixels' centre rays, camera axes, unit z; the same for any pose
+    points: Floats  # (H*W, 3) mm of the tissue at the pixels, camera axes; 0 off the tissue
 
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Truth of one frame, at the rest frame's pixels (material points) or at the frame's own."""
+    """Ground truth of one frame, at the rest frame's pixels (material points) or at the frame's own."""
 
-    flow: npt.NDArray[np.float32]
-    """(H, W, 2) px, rest pixels; 0 off the tissue."""
-    motion: npt.NDArray[np.float32]
-    """(H, W, 3) mm, rest pixels, from the rest frame's camera axes to this one's; 0 off the tissue."""
-    visible: Mask
-    """(H, W), rest pixels: the point is in the picture and nothing hides it."""
-    depth: npt.NDArray[np.float32]
-    """(H, W) mm along the optical axis, this frame's pixels; 0 where there is nothing."""
-    tool: Mask
-    """(H, W), this frame's pixels."""
-    hits: Hits
-    """This frame's pixels, over tissue, rim and tool, in this order."""
+    flow: npt.NDArray[np.float32]  # (H, W, 2) px, rest pixels; 0 off the tissue
+    motion: npt.NDArray[np.float32]  # (H, W, 3) mm, rest pixels, each frame's camera axes; 0 off the tissue
+    visible: Mask  # (H, W), rest pixels: the point is in the picture and not hidden
+    depth: npt.NDArray[np.float32]  # (H, W) mm along the optical axis, this frame's pixels; 0 for none
+    tool: Mask  # (H, W), this frame's pixels
+    hits: Hits  # this frame's pixels, over tissue, rim and tool, in this order
 
 
 @dataclass(frozen=True)
 class ProjectedScene:
-    """A scene as one camera sees it."""
+    """A scene projected by one camera."""
 
-    points: Floats
-    """(V, 3) mm, camera axes; NaN behind the lens or at it, so that faces keep their numbers."""
-    flat: Floats
-    """(V, 2) px."""
-    faces: Indices
-    """(F, 3)."""
-    size: tuple[int, int]
-    """Width, height [px]."""
+    points: Floats  # (V, 3) mm, camera axes; NaN at the lens or behind it, which drops their faces
+    flat: Floats  # (V, 2) px
+    faces: Indices  # (F, 3)
+    size: tuple[int, int]  # width, height [px]
 
     @classmethod
     def of(cls, camera: Camera, scene: Shape) -> ProjectedScene:
@@ -101,10 +81,10 @@ class ProjectedScene:
         return cls(points, cameras.to_pixels(camera, points), scene.faces, camera.size)
 
     def cast(self, pixels: Floats | None, directions: Floats) -> Hits:
-        """First triangle that each ray from the lens meets.
+        """First intersections of rays from the lens.
 
         Args:
-            pixels: (N, 2) px where the rays pierce the picture; those outside it meet nothing. None: all
+            pixels: (N, 2) px of the rays in the picture; those outside have no intersection. None: all
                 pixels' centres, row by row.
             directions: (N, 3) in camera axes, of any length, each through its pixel.
         """
@@ -118,7 +98,7 @@ class ProjectedScene:
 
 
 def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
-    """Truth of the rest frame: the fine surface at rest, and what frames the opening."""
+    """Ground truth of the rest frame, from the fine surface at rest and the rim with its scenery."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = cameras.rays(camera, pixels)
@@ -138,21 +118,20 @@ def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
 
 
 def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, tool: Shape) -> FrameTruth:
-    """Truth of one frame.
+    """Ground truth of one frame.
 
     Args:
         camera: the camera of this frame, with the lens of the rest frame.
-        rest: truth of the rest frame.
+        rest: of the rest frame.
         surface: the fine surface in this frame.
-        rim: what frames the opening.
+        rim: with its scenery.
         tool: the instruments in this frame.
     """
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     scene = ProjectedScene.of(camera, joined(surface, rim, tool))
     hits = scene.cast(None, rest.directions)
-    seen = hits.face >= 0
-    depth = np.where(seen, hits.along, 0.0)  # directions have unit z
+    depth = np.where(hits.face >= 0, hits.along, 0.0)  # directions have unit z
 
     on = rest.tissue.ravel()
     carried = blend(surface.faces, rest.face.ravel()[on], rest.bary.reshape(-1, 3)[on], surface.vertices)
@@ -172,7 +151,7 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, too
 
 
 def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt.NDArray[np.float32]:
-    """Flow (H, W, 2) px of what each pixel of one frame sees to another frame; 0 off the tissue.
+    """Flow (H, W, 2) px from each pixel of one frame to another frame; 0 off the tissue.
 
     Args:
         hits: of the first frame's pixels, the surface's faces first.
@@ -186,9 +165,9 @@ def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -
 
 
 def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArray[np.float32]:
-    """Smoothed unit normals (H, W, 3), camera axes, of what each pixel sees; 0 where there is nothing.
+    """Smoothed unit normals (H, W, 3), camera axes, at each pixel; 0 where there is nothing.
 
-    `shapes`: those that `hits` are of, in their order.
+    `shapes`: of `hits`, in their order.
     """
     vertex = np.concatenate([normals(shape) for shape in shapes]) @ camera.rotation.T
     on = hits.face >= 0
@@ -197,13 +176,13 @@ def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArr
 
 
 def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
-    """A quantity of the fine surface's vertices (V, C) at rest pixels (H, W, C); 0 off the tissue."""
+    """A quantity of vertices (V, C) of the fine surface at rest pixels (H, W, C); 0 off the tissue."""
     values = blend(faces, rest.face.ravel(), rest.bary.reshape(-1, 3), nodal)
     return values.reshape(*rest.face.shape, -1).astype(np.float32)
 
 
 def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.floating]) -> Floats:
-    """A quantity of vertices (V, C) at points of triangles: which (N,), weights (N, 3).
+    """A quantity of vertices (V, C) at points on triangles: indices (N,), weights (N, 3).
 
     0 where `face` is negative or beyond `faces`.
     """
@@ -219,7 +198,7 @@ def _picture(on: Mask, values: npt.NDArray[Any], camera: Camera, kind: type = np
 
 
 def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, along: Floats) -> Floats:
-    """Area (M,) mm2 of the faces' planes that each pixel in `on` covers, from how the rays spread over it."""
+    """Area (M,) mm2 of the faces' planes in each pixel of `on`, from the spread of its rays."""
     width, height = camera.size
     grid = cameras.pixel_grid((width + 1, height + 1)) - 0.5
     corner = cameras.rays(camera, grid).reshape(height + 1, width + 1, 3)
@@ -235,7 +214,7 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
 
 
 def _sort_loop(pixels, width, height):  # type: ignore[no-untyped-def]
-    """Rays sorted by the pixel they pierce: order (M,) and where each pixel's rays start (H*W + 1,)."""
+    """Rays sorted by their pixel: order (M,) and each pixel's start in it (H*W + 1,)."""
     key = np.full(len(pixels), -1, np.int64)
     start = np.zeros(width * height + 1, np.int64)
     for n in range(len(pixels)):
@@ -268,14 +247,14 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
         # Written so that a corner behind the lens (NaN) drops the face.
         if not (right >= 0 and bottom >= 0 and left <= width - 1 and top <= height - 1):
             continue
-        if np.isnan(flat[a, 0] + flat[b, 0] + flat[c, 0]):  # min and max pass over some
+        if np.isnan(flat[a, 0] + flat[b, 0] + flat[c, 0]):  # min and max ignore some NaN
             continue
         x0, x1 = int(max(np.ceil(left), 0)), int(min(np.floor(right), width - 1))
         y0, y1 = int(max(np.ceil(top), 0)), int(min(np.floor(bottom), height - 1))
         a0, a1, a2 = points[a]
         e0, e1, e2 = points[b, 0] - a0, points[b, 1] - a1, points[b, 2] - a2
         g0, g1, g2 = points[c, 0] - a0, points[c, 1] - a1, points[c, 2] - a2
-        # With the ray's origin at the lens, everything but the direction is the triangle's own.
+        # With the rays' origin at the lens, all terms but the direction depend on the triangle alone.
         n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
         offset = n0 * a0 + n1 * a1 + n2 * a2
         q0, q1, q2 = g1 * a2 - g2 * a1, g2 * a0 - g0 * a2, g0 * a1 - g1 * a0
@@ -285,8 +264,8 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
                 i = order[k]
                 d0, d1, d2 = directions[i, 0], directions[i, 1], directions[i, 2]
                 facing = n0 * d0 + n1 * d1 + n2 * d2
-                # A hair over the edge still counts: rays through shared edges must not slip between faces.
-                # Most rays miss by far more, which is seen without a division, and in one branch.
+                # A small tolerance at edges: rays must not slip between faces that share one.
+                # Most rays miss by far more, which one branch without a division detects.
                 across, down = q0 * d0 + q1 * d1 + q2 * d2, r0 * d0 + r1 * d1 + r2 * d2
                 side = 1.0 if facing >= 0.0 else -1.0
                 hair = _SURELY * abs(facing)

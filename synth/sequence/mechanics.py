@@ -1,4 +1,4 @@
-"""The mechanics of one sequence: its cortex and the volume under it, loaded and moved."""
+"""Mechanics of one sequence: its cortex and the volume under it, loaded and deformed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from synth.sequence.scenario import Scenario
 
 
 def build(job: Job, case: Scenario) -> tuple[CortexSurface, Tets]:
-    """The fine surface of a scenario and the volume under it, finest where its contacts are."""
+    """The fine surface of a scenario and the volume under it, meshed finest under its contacts."""
     surface, brain = cortex(job, case)
     focus = [place for gesture in case.gestures for place in gesture.focus]
     mesh, slips = (job.fem.tets, focus), case.tissue.skull == "slip"
@@ -36,10 +36,7 @@ def build(job: Job, case: Scenario) -> tuple[CortexSurface, Tets]:
 
 
 def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
-    """The fine surface of a scenario, and the user's brain that it is a part of, if it is.
-
-    They are cached, so their arrays are read-only.
-    """
+    """A scenario's fine surface, and the user's brain that it is part of, if any; cached, hence read-only."""
     written = job.anatomy.mesh.stat() if job.anatomy.mesh and job.anatomy.mesh.is_file() else None
     return _cortex(
         job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
@@ -48,7 +45,7 @@ def cortex(job: Job, case: Scenario) -> tuple[CortexSurface, Brain | None]:
 
 @lru_cache(maxsize=4)
 def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
-    """As `cortex`; `written` tells a mesh from one that replaced it."""
+    """As `cortex`; `written` (time and size of the file) distinguishes a mesh from one that replaced it."""
     brain = None
     if section.mesh is not None:
         brain = load_brain(section.mesh, section.craniotomy, section.attachments, section.fill_holes)
@@ -62,7 +59,7 @@ def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[C
 def move(
     job: Job, case: Scenario, surface: CortexSurface, tets: Tets, motions: Sequence[ToolMotion] = ()
 ) -> Deformation:
-    """The scenario's gestures, carried out on that surface and volume; `motions` as in `solver.deform`."""
+    """Deformation by the scenario's gestures on that surface and volume; `motions` as in `solver.deform`."""
     return solver.deform(
         job.fem,
         case.tissue,
@@ -91,7 +88,7 @@ def describe(job: Job, case: Scenario, motion: Deformation, rotation: NDArray[np
         }
     return special | {
         "law": case.tissue.law,
-        # Whether the tools' forces alone say what is stored.
+        # Whether the work of the instruments equals the stored energy.
         "elastic": timeless and case.pulse is None,
         "min_jacobian": motion.min_jacobian.tolist(),
         "energy_mn_mm": motion.energy.tolist(),

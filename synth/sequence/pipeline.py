@@ -1,4 +1,4 @@
-"""One sequence from job to sealed store: where fem, render and flow meet, through plain arrays."""
+"""One sequence from job to sealed store: connects fem, render and flow through plain arrays."""
 
 from __future__ import annotations
 
@@ -22,22 +22,21 @@ from synth.render.camera import video_link
 from synth.render.camera.camera import Camera
 from synth.sequence import mechanics, scenario
 from synth.sequence.published_labels import Published
-from synth.sequence.scenario import Scenario
 from synth.sequence.scene import Scene, simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
-# Fields that the renderer gives by frame, and of a second lens; those of `store.extra` are attributes of its
-# `RenderedFrame` as well, but for the published method's.
+# Fields of a `RenderedFrame`, for one camera and for two; those of `store.extra` are its attributes as well,
+# except for the published method's.
 _RENDERED = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
-_LENSES = (("rgb", "tool"), ("rgb_right", "tool_right"))
-"""What each lens sees of a frame: picture and instruments."""
+_CAMERAS = (("rgb", "tool"), ("rgb_right", "tool_right"))
+"""Fields of each camera: picture and instruments."""
 
 
 @dataclass(frozen=True)
 class _Task:
-    """A sequence that is being rendered: what all stages share."""
+    """A sequence in rendering, as shared by all stages."""
 
     scene: Scene
     writer: Writer
@@ -51,12 +50,10 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Video:
-    """What one lens records."""
+    """Video of one camera."""
 
-    rgb: NDArray[np.uint8]
-    """(T, H, W, 3)."""
-    tools: NDArray[np.bool_]
-    """(T, H, W) pixels of the instruments."""
+    rgb: NDArray[np.uint8]  # (T, H, W, 3)
+    tools: NDArray[np.bool_]  # (T, H, W) pixels of the instruments
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:
@@ -66,13 +63,13 @@ def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -
         job: the dataset's job, paths resolved.
         index: which sequence, 0 <= index < job.sequences.
         folder: the dataset; the store is `NNNNNN.zarr.part` until it is sealed.
-        report: told of progress, stage by stage.
+        report: called with progress, stage by stage.
 
     Returns:
         The sealed store's path.
 
     Raises:
-        UserError: the job cannot be carried out (surface, load, inverted element), in one line.
+        UserError: the job cannot be carried out (surface, load, inverted element).
     """
     watch = Stopwatch()
     return write_scene(simulate(job, index, report, watch), folder, report, watch)
@@ -107,7 +104,7 @@ def write_scene(
 
 
 def _render_frames(task: _Task) -> list[_Video]:
-    """Renders every frame and writes its fields, but for what a codec must see whole; a video a lens."""
+    """Renders every frame and writes its fields, except videos that a codec follows; a video per camera."""
     job, scene, writer = task.job, task.scene, task.writer
     width, height = job.render.size
     labels = None
@@ -120,8 +117,8 @@ def _render_frames(task: _Task) -> list[_Video]:
         if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
     ]
     shape = (job.frames, height, width)
-    lenses = _LENSES if writer.wants("rgb_right") else _LENSES[:1]
-    videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in lenses]
+    cameras = _CAMERAS if writer.wants("rgb_right") else _CAMERAS[:1]
+    videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in cameras]
     poses = np.empty((job.frames, 4, 4))
     for t in range(job.frames):
         task.report("render", t, job.frames)
@@ -132,7 +129,7 @@ def _render_frames(task: _Task) -> list[_Video]:
             for name in names:
                 writer.put_frame(name, t, made[name] if name in made else getattr(frame, name))
             writer.put_frame("traction", t, frame.traction)
-        for video, (rgb, tool) in zip(videos, lenses, strict=True):
+        for video, (rgb, tool) in zip(videos, cameras, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
         poses[t] = frame.camera.pose
     with task.watch.stage("store"):
@@ -141,23 +138,23 @@ def _render_frames(task: _Task) -> list[_Video]:
 
 
 def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
-    """Writes the videos as the job's codec leaves them, and returns them so."""
+    """Writes and returns the videos after the job's codec."""
     with task.watch.stage("store"):
         coded = [video_link.recorded(video.rgb, task.job.sensor, task.job.fps) for video in videos]
-        for rgb, (name, _) in zip(coded, _LENSES, strict=False):
+        for rgb, (name, _) in zip(coded, _CAMERAS, strict=False):
             task.writer.put(name, rgb)
     return [replace(video, rgb=rgb) for video, rgb in zip(videos, coded, strict=True)]
 
 
 def _coded(job: Job) -> bool:
-    """Whether video goes through a codec, which sees all of it at once."""
+    """Whether video passes through a codec, which needs all frames at once."""
     return job.sensor.bitrate_mbps is not None
 
 
 def _recover_flow(task: _Task, video: _Video) -> Track:
-    """Follows the video with the job's estimator and writes what it finds.
+    """Recovers flow with the job's estimator and writes it.
 
-    It has what a real pipeline has: the tool's outline, and glare as the picture shows it.
+    As in a real pipeline, its inputs are pictures and instrument masks; glare is detected in the pictures.
     """
     job, writer = task.job, task.writer
     task.report("flow", 0, job.frames)
@@ -172,11 +169,11 @@ def _recover_flow(task: _Task, video: _Video) -> Track:
 
 
 def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> None:
-    """Adds the right eye to the left one's flow and writes motion in three dimensions, frame by frame."""
+    """Recovers motion in three dimensions from the left camera's flow and both videos, and writes it."""
     job, writer, scene = task.job, task.writer, task.scene
     lens = scene.renderer.right
     if lens is None:
-        raise ValueError("there is no second lens")
+        raise ValueError("the job is monocular")
     blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
@@ -187,30 +184,33 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
             size=job.render.size,
         )
         still = stereo.still_frames(flow.flow, scene.tissue)
-        eyes = left.rgb[:still], right.rgb[:still]
-        tracker = stereo.StereoTracker(pair, *eyes, blocked[0][0], blocked[1][0], scene.tissue)
+        rest = left.rgb[:still], right.rgb[:still]
+        tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], scene.tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
         with task.watch.stage("stereo"):
-            seen = flow.flow[t], flow.confidence[t]
             if t == 0:
                 moved = stereo.Moved.nothing(scene.tissue.shape)
             else:
-                eyes = left.rgb[t], right.rgb[t]
-                moved = tracker.step(*eyes, blocked[0][t], blocked[1][t], *seen)
+                now = left.rgb[t], right.rgb[t], blocked[0][t], blocked[1][t]
+                moved = tracker.step(*now, flow.flow[t], flow.confidence[t])
         with task.watch.stage("store"):
             writer.put_frame("motion_recovered", t, moved.motion)
             writer.put_frame("motion_deviation", t, moved.deviation)
 
 
 def _seal(task: _Task) -> Path:
-    """Seals the store with what was drawn and measured as its attributes; returns its path."""
+    """Seals the store with its attributes; returns its path."""
     scene = task.scene
     case, view = scene.scenario, scene.view
+    extra: dict[str, Any] = {}
+    if (opening := identity.identify_opening(task.job, case.index)) is not None:
+        extra["opening_id"] = opening  # of a user's brain
+    if (right := scene.renderer.right) is not None:
+        extra["right"] = {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}
     return task.writer.seal(
         scenario=case.as_dict(),
         anatomy_id=identity.identify_anatomy(task.job, case.relief.seed),
-        **_opening(task.job, case),
         **_lens(view),
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
@@ -218,22 +218,10 @@ def _seal(task: _Task) -> Path:
         mechanics=mechanics.describe(task.job, case, scene.motion, view.rotation),
         variant=scene.renderer.variant,
         timings=task.watch.report(),
-        **_second_lens(task),
+        **extra,
     )
 
 
-def _opening(job: Job, case: Scenario) -> dict[str, Any]:
-    """The attribute `opening_id` of a sequence on a user's brain."""
-    named = identity.identify_opening(job, case.index)
-    return {} if named is None else {"opening_id": named}
-
-
-def _second_lens(task: _Task) -> dict[str, Any]:
-    """The attribute `right` of a stereo sequence: the second lens at rest."""
-    right = task.scene.renderer.right
-    return {} if right is None else {"right": {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}}
-
-
 def _lens(camera: Camera) -> dict[str, Any]:
-    """Attributes of a lens: what it is, and its pose at rest."""
+    """Attributes of a camera at rest: intrinsics and pose."""
     return {name: getattr(camera, name).tolist() for name in ("K", "distortion", "rotation", "translation")}

@@ -1,9 +1,9 @@
-"""The published method's labels, noise and all, beside the truth: to train in its regime and compare.
+"""Labels as in the published method, with its noise, stored next to the ground truth for comparison.
 
 After D3MIA/SOFA-NeuroSim-Recorder (`simlib/recorders.py`, `modify_frames_with_noise.py`), whose points are a
-mesh's vertices and here are the pixels of tissue. First stage, with a job's `labels: published`: every force
-label gets normal noise. Second stage: in a share of the frames, points away from the contact get a
-displacement of their own and the label 0.
+mesh's vertices and here are the pixels of tissue. First stage, with a job's `labels: published`: normal noise
+on every force label. Second stage: in a share of the frames, points away from the contact get a random
+displacement and the label 0.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Force = NDArray[np.float64]
 
-_FORCE_SHARE = 0.02  # of a label: deviation of the first stage's noise
-_FRAMES = 0.3  # of them: what the second stage disturbs
-_POINTS = 0.05  # of the tissue's pixels in such a frame
-_RANGE = 0.05  # of the frame's range of displacement: the largest that a disturbed point gets
-_ENDS, _MOST_FRAMES = 10, 50  # a tenth of the sequence, at most 50 frames, is left alone at either end
+_FORCE_SHARE = 0.02  # standard deviation of the first stage's noise, as a share of a label
+_FRAMES = 0.3  # share of the frames that the second stage disturbs
+_POINTS = 0.05  # share of the tissue's pixels disturbed in such a frame
+_RANGE = 0.05  # largest disturbance, as a share of the frame's range of displacement
+_ENDS, _MOST_FRAMES = 10, 50  # a tenth of the sequence, at most 50 frames, stays undisturbed at either end
 _NEAR, _LEAST_REACH = 1.5, 0.05  # the contact's surroundings: 1.5 times its reach, at least 5% of the picture
 _LOW = 30  # percentile of force below which a point may be disturbed
 
@@ -52,7 +52,7 @@ def with_noise(label: Force, tissue: Mask, share: float, rng: np.random.Generato
 
 
 def noisy_frames(frames: int, rng: np.random.Generator) -> Mask:
-    """Second stage: which frames it disturbs, (T,)."""
+    """Mask (T,) of the frames that the second stage disturbs."""
     ends = min(_MOST_FRAMES, frames // _ENDS)
     candidates = np.arange(ends, frames - ends)
     count = min(int(frames * _FRAMES), len(candidates))
@@ -62,17 +62,7 @@ def noisy_frames(frames: int, rng: np.random.Generator) -> Mask:
 
 
 def disturbed(flow: Map, label: Force, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Force]:
-    """Second stage, in one frame.
-
-    Args:
-        flow: (H, W, 2) px.
-        label: (H, W) mN.
-        tissue: (H, W).
-        rng: of this sequence's labels.
-
-    Returns:
-        Flow and label with some points disturbed.
-    """
+    """Second stage, in one frame: flow (H, W, 2) px and label (H, W) mN with some points disturbed."""
     flow, label = flow.copy(), label.copy()
     place = np.argwhere(tissue)
     force = label[tissue]
@@ -94,19 +84,16 @@ def disturbed(flow: Map, label: Force, tissue: Mask, rng: np.random.Generator) -
 
 @dataclass(frozen=True)
 class Published:
-    """Both stages for one sequence; frames are asked for in order."""
+    """Both stages for one sequence; frames must be processed in order."""
 
-    share: float
-    """Deviation of the first stage's noise over the label."""
-    tissue: Mask
-    """(H, W)."""
-    chosen: Mask
-    """(T,) frames that the second stage disturbs."""
+    share: float  # standard deviation of the first stage's noise over the label
+    tissue: Mask  # (H, W)
+    chosen: Mask  # (T,) frames that the second stage disturbs
     rng: np.random.Generator
 
     @classmethod
     def begin(cls, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
-        """Draws which frames will be disturbed; `labels` is the job's, `tissue` (H, W)."""
+        """Draws the frames to disturb; `labels` is the job's key, `tissue` (H, W)."""
         share = _FORCE_SHARE if labels == "published" else 0.0
         return cls(share, tissue, noisy_frames(frames, rng), rng)
 
@@ -114,9 +101,9 @@ class Published:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.
 
         Args:
-            t: the frame; 0, the rest frame, has no noise: what is measured is measured from it.
-            flow: (H, W, 2) px, the truth.
-            traction: (H, W, 3) kPa, the truth.
+            t: the frame; the rest frame, 0, has no noise, as all motion is measured from it.
+            flow: (H, W, 2) px, ground truth.
+            traction: (H, W, 3) kPa, ground truth.
             force_mn: (3,) total force.
         """
         label = intensity(traction, float(np.linalg.norm(force_mn)))

@@ -1,4 +1,4 @@
-"""What one sequence is: every number drawn for it, a function of (job, index) only."""
+"""Scenario of one sequence: every number drawn for it, a function of (job, index) only."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from synth.render.anatomy.surface import Relief
 from synth.render.appearance.appearance import Appearance
 from synth.render.appearance.family import FAMILIES, Colour
 from synth.render.appearance.light import Lighting, balance
-from synth.render.camera.camera import CameraView, place, seen_radius
+from synth.render.camera.camera import CameraView, place, visible_radius
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
@@ -33,23 +33,23 @@ Range = tuple[float, float]
 
 # First element of the spawn key.
 _ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _LOOK, _VIEW, _NOISE, _FURTHER, _LABELS, _SWAY, _PULSE = range(9)
+_TISSUE, _GESTURE, _APPEARANCE, _VIEW, _NOISE, _FURTHER, _LABELS, _CAMERA_MOTION, _PULSE = range(9)
 
 _STRETCH = 1.01, 1.03
-"""How far a membrane is stretched at rest. Not from a measurement: its pull then balances a pressure of 3-350
-Pa (at most 2.6 mmHg) under a dome of 70 mm radius, which a living head has."""
-_RAMP = 0.25, 0.35  # time in which the load grows to its peak, as a part of the sequence
-_TRIES, _ROUNDS = 400, 8  # of a gesture until it has room, and of all of `fem.instrument_list`
+"""Pre-stretch of a membrane. Not measured: its tension then balances a pressure of 3-350 Pa (at most 2.6
+mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
+_RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
+_TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
-_POWER = 0.95, 1.1  # illumination, against one that just fills the sensor with white
+_POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
 _SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One sequence before anything is computed. JSON-ready through `as_dict`."""
+    """One sequence as drawn, before any computation. `as_dict` is ready for JSON."""
 
     index: int
     """Position in the dataset."""
@@ -59,18 +59,18 @@ class Scenario:
     """Shape and vessels of the anatomy, with its own seed."""
     tissue: Tissue
     gesture: Gesture
-    """What the first instrument does."""
+    """Gesture of the first instrument."""
     further: tuple[Gesture, ...]
-    """What the other instruments do at the same time."""
+    """Gestures of the other instruments, at the same time."""
     appearance: Appearance
     view: CameraView
-    sway: CameraMotion
+    camera_motion: CameraMotion
     pulse: Pulse | None
-    """None where only tools move the tissue."""
+    """Pulse of heart and breath; None where only instruments move the tissue."""
 
     @property
     def gestures(self) -> tuple[Gesture, ...]:
-        """One an instrument."""
+        """All gestures, one per instrument."""
         return (self.gesture, *self.further)
 
     def as_dict(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class Scenario:
 
 
 def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
-    """Draws sequence `index` of `job`; independent of how many others there are and of their order."""
+    """Draws sequence `index` of `job`, independently of the others' number and order."""
     job = as_job(job)
     family = job.appearance.families[index % len(job.appearance.families)]
 
@@ -89,37 +89,37 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     tissue = draw_tissue(job.fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
     view = draw_view(job.render, generator(_VIEW))
-    sway = draw_camera_motion(job.render, generator(_SWAY))
+    motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
     opening_mm = job.anatomy.craniotomy.radius_mm
-    seen_mm = seen_radius(place(view, job.render))
+    visible_mm = visible_radius(place(view, job.render))
     rngs = generator(_GESTURE), generator(_FURTHER)
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, seen_mm)
-    appearance = draw_appearance(job, family, generator(_LOOK))
-    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], appearance, view, sway, pulse)
+    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, visible_mm)
+    appearance = draw_appearance(job, family, generator(_APPEARANCE))
+    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], appearance, view, motion, pulse)
 
 
 def frame_seeds(job: Job, index: int) -> list[int]:
-    """One seed a frame, for light paths and sensor noise: a fixed one would leave screen-fixed noise."""
+    """One seed per frame for light paths and sensor noise, so that noise differs between frames."""
     state = _sequence(job, _SEQUENCE, index, _NOISE).generate_state(job.frames)
     return [int(seed) for seed in state]
 
 
 def label_rng(job: Job, index: int) -> Random:
-    """Random numbers for the noise of the published labels."""
+    """Random generator for the noise of the published labels."""
     return _generator(job, _SEQUENCE, index, _LABELS)
 
 
 def draw_relief(anatomy: schema.AnatomySection, rng: Random) -> Relief:
-    """Seed and shape of one anatomy."""
+    """Draws seed and shape of one anatomy."""
     seed = int(rng.integers(2**31))
     return Relief(seed, _uniform(rng, anatomy.gyrus_mm), _uniform(rng, anatomy.sulcus_mm))
 
 
 def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
-    """Stiffness, law and hold. E log-uniformly: half as stiff and twice as stiff are as likely."""
+    """Draws the tissue; E log-uniformly, so that half and twice the stiffness are equally likely."""
     law, why = fem.chosen_law
     young = _log_uniform(rng, fem.young_kpa)
-    # Drawn whether it counts or not, so that no number depends on whether another is asked for.
+    # Drawn even where unused, so that other numbers do not depend on whether there is a membrane.
     drawn, membrane = rng.uniform(), fem.membrane
     pia = Pia(
         _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm), _uniform(rng, _STRETCH)
@@ -129,7 +129,7 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
 
 
 def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
-    """Amplitudes, rates and phases uniformly; None where nothing moves."""
+    """Draws amplitudes, rates and phases uniformly; None without motion."""
     turn = 0, 2 * np.pi
     heart, breath = (pulse.heart_mm, HEART_HZ, turn), (pulse.breath_mm, BREATH_HZ, turn)
     drawn = Pulse(*(_uniform(rng, ends) for ends in (*heart, *breath)))
@@ -142,12 +142,12 @@ def draw_gestures(
     young_kpa: float,
     rng: Random,
     others: Random,
-    seen_mm: float = np.inf,
+    visible_mm: float = np.inf,
 ) -> tuple[Gesture, ...]:
-    """Draws the gestures of all instruments, each redrawn until it has room beside the others.
+    """Draws the gestures of all instruments, each again until it fits next to the others.
 
-    Those of `fem.instrument_list` are as they are asked; those with a place come first, so that nothing that
-    is drawn stands where one is wanted.
+    Those of `fem.instrument_list` have the values given there; those with a place are drawn first, so that no
+    other instrument occupies it.
 
     Args:
         fem: the job's section; their number is drawn from `fem.instruments`.
@@ -155,20 +155,20 @@ def draw_gestures(
         young_kpa: E of the tissue.
         rng: random numbers of this sequence's first gesture.
         others: of its further ones.
-        seen_mm: radius about the opening's middle that the camera shows, see `draw_gesture`.
+        visible_mm: radius around the opening's middle that the camera shows, see `draw_gesture`.
 
     Raises:
-        UserError: the opening has no room for so many, or not there.
+        UserError: not all instruments fit into the opening, or not in their places.
     """
     given, (fewest, most) = fem.instrument_list, fem.instruments
     count = max(int(others.integers(fewest, most + 1)), len(given))
-    asked = [*given, *[InstrumentSection()] * (count - len(given))]
-    order = sorted(range(count), key=lambda k: asked[k].place is None)
-    for _ in range(_ROUNDS if given else 1):  # the shaft of one may leave no room to the next: all anew
+    wanted = [*given, *[InstrumentSection()] * (count - len(given))]
+    order = sorted(range(count), key=lambda k: wanted[k].place is None)
+    for _ in range(_ROUNDS if given else 1):  # all anew: the shaft of one may be in the way of the next
         found: dict[int, Gesture] = {}
         for k in order:
             for _ in range(_TRIES):
-                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, asked[k], seen_mm)
+                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, wanted[k], visible_mm)
                 fits = not given or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
                 if fits and all(tool_gesture.clearance(trial, other) >= 0 for other in found.values()):
                     found[k] = trial
@@ -177,10 +177,11 @@ def draw_gestures(
                 break
         else:
             return tuple(found[k] for k in range(count))
-    beside = f" beside the other {len(found)}" if found else ""
+    placed = f" next to {len(found)} others" if found else ""
+    key = "instrument_list" if given else "instruments"
     raise UserError(
-        f"fem.{'instrument_list' if given else 'instruments'}: instrument {k} of {count} has no room{beside} "
-        f"in an opening of {opening_mm:g} mm radius; lower fem.instruments or footprint_mm, change "
+        f"fem.{key}: instrument {k} of {count} does not fit{placed} "
+        f"into an opening of {opening_mm:g} mm radius; lower fem.instruments or footprint_mm, change "
         "its place, or widen anatomy.craniotomy.radius_mm or render.field_mm"
     )
 
@@ -190,16 +191,16 @@ def draw_gesture(
     opening_mm: float,
     young_kpa: float,
     rng: Random,
-    asked: InstrumentSection = InstrumentSection(),
-    seen_mm: float = np.inf,
+    given: InstrumentSection = InstrumentSection(),
+    visible_mm: float = np.inf,
 ) -> Gesture:
-    """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone; or as asked.
+    """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone, unless `given`.
 
-    All that it loads keeps to the opening and to `seen_mm` of its middle, what the camera shows of a
-    wide one; what has no room there is in the middle. Asked for a place, it may reach beyond.
+    Its contacts stay within the opening and within `visible_mm` of its middle, which the camera shows of a
+    wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
-    drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(asked)
-    kind = asked.gesture or drawn
+    drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(given)
+    kind = given.gesture or drawn
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
@@ -207,8 +208,8 @@ def draw_gesture(
     path = _uniform(rng, (3, 8)) if kind == "slide" else 0.0
     azimuth = _uniform(rng, (0, 360))
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
-    point = _draw_point(opening_mm, seen_mm, footprint + 0.5 * half, rng, asked)
-    along, direction = _draw_direction(fem, kind, rng, asked)
+    point = _draw_point(opening_mm, visible_mm, footprint + 0.5 * half, rng, given)
+    along, direction = _draw_direction(fem, kind, rng, given)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
     timing = _draw_timing(kind, rng)
@@ -229,25 +230,25 @@ def draw_gesture(
         spread_mm=spread,
         hover_mm=_uniform(rng, (6, 12)),
         taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
-        timing=asked.timing or timing,
+        timing=given.timing or timing,
     )
 
 
 def _draw_point(
-    opening_mm: float, seen_mm: float, reach: float, rng: Random, asked: InstrumentSection
+    opening_mm: float, visible_mm: float, reach: float, rng: Random, given: InstrumentSection
 ) -> Floats:
-    """Middle of the contacts (2,) mm, all within `reach` mm of which is in the opening and in the picture."""
-    room = max(min(opening_mm - reach - CLEAR_MM, seen_mm - reach), 0.0)
-    radius, angle = room * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-    if asked.place is not None:
-        return np.asarray(asked.place, np.float64)
+    """Middle of the contacts (2,) mm; a circle of `reach` mm around it lies in opening and picture."""
+    largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
+    radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    if given.place is not None:
+        return np.asarray(given.place, np.float64)
     return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
 
 
 def _draw_direction(
-    fem: FemSection, kind: str, rng: Random, asked: InstrumentSection
+    fem: FemSection, kind: str, rng: Random, given: InstrumentSection
 ) -> tuple[Floats, Floats]:
-    """Unit vectors: the load's component along the surface (2,), which is the way of a slide, and it (3,)."""
+    """Unit vectors: of the load along the surface (2,), the direction of a slide, and of the load (3,)."""
     turn = rng.uniform(0, 2 * np.pi)
     along = np.array([np.cos(turn), np.sin(turn)])
     cone = np.cos(np.radians(fem.max_tilt_deg))
@@ -256,8 +257,8 @@ def _draw_direction(
         rise = rng.uniform(0.1, max(cone, 0.3))
     elif kind == "slide":
         rise = 1 / np.hypot(1, tool_gesture.FRICTION)
-    if asked.direction is not None:
-        whole = np.asarray(asked.direction) / np.linalg.norm(asked.direction)
+    if given.direction is not None:
+        whole = np.asarray(given.direction) / np.linalg.norm(given.direction)
         along = whole[:2] / (np.hypot(*whole[:2]) or 1.0)
         rise = rise if kind == "slide" else abs(float(whole[2]))
     up = rise if kind in ("pull", "grasp") else -rise
@@ -265,7 +266,7 @@ def _draw_direction(
 
 
 def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
-    """Touch, full load, load begins to fall, release, as parts of the sequence."""
+    """Times of touch, full load, start of its fall, and release, as parts of the sequence."""
     touch = _uniform(rng, (0.08, 0.15))
     full = touch + _uniform(rng, (0.1, 0.2) if kind == "tap" else _RAMP)
     release = _uniform(rng, (0.85, 0.92))
@@ -274,7 +275,7 @@ def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
 
 
 def draw_view(render: RenderSection, rng: Random) -> CameraView:
-    """Where the microscope stands; of a calibrated one the lens is known better, see `camera.calibrated`."""
+    """Draws the microscope's pose and field; a calibration replaces the latter, see `camera.calibrated`."""
     return CameraView(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),
@@ -286,12 +287,12 @@ def draw_view(render: RenderSection, rng: Random) -> CameraView:
 
 
 def draw_camera_motion(render: RenderSection, rng: Random) -> CameraMotion:
-    """How far the microscope drifts."""
+    """Draws the drift of the microscope."""
     return CameraMotion(_uniform(rng, render.drift_mm), int(rng.integers(2**31)))
 
 
 def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
-    """A look of `family` under the job's light, seen by its sensor."""
+    """Draws an appearance of `family`, with the job's light and sensor."""
     lighting = draw_light(job.light, rng)
     ranges = vars(FAMILIES[family])
     if job.appearance.blood:
@@ -299,30 +300,30 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     drawn: dict[str, Any] = {
         name: _near(ends, rng) if len(ends) == 3 else _uniform(rng, ends) for name, ends in ranges.items()
     }
-    # More highlights: a thicker film over more relief, rougher, of a higher index. By eye on photographs.
+    # More glare: a thicker and rougher layer of a higher index, over more relief. Chosen on photographs.
     square = lighting.glare**2
-    drawn["film_smoothing_mm"] += 0.14 * square
+    drawn["fluid_smoothing_mm"] += 0.14 * square
     drawn["bump"] *= 1 + 3 * square
     drawn["roughness"] += 0.12 * square
     drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
     appearance = Appearance(
         family=family,
         **drawn,
-        film_index=1.33 + 0.47 * square,
+        fluid_index=1.33 + 0.47 * square,
         cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
         scenery=(),
         rim_seed=int(rng.integers(2**31)),
         light=lighting,
         sensor=draw_sensor(job.sensor, balance(lighting.kelvin + rng.uniform(-250, 350)), rng),
     )
-    # From a seed of their own, so that nothing else changes.
+    # By a seed of its own, so that no other number depends on it.
     parts = job.render.scenery
     shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
     return replace(appearance, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
 
 
 def draw_light(light: LightSection, rng: Random) -> Lighting:
-    """Where the lamps are and how they shine."""
+    """Draws the lamps' positions, power and colour."""
     glare, azimuth, tilt = _uniform(rng, light.glare), _uniform(rng, (-1, 1)), light.tilt_deg
     return Lighting(
         glare=glare,
@@ -339,7 +340,7 @@ def draw_light(light: LightSection, rng: Random) -> Lighting:
 
 
 def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> CameraSensor:
-    """A chip within the job's ranges, with that white balance; colours as asked or as a camera has them."""
+    """Draws a sensor with that white balance; colours of the job, or else of a drawn camera."""
     sensor = CameraSensor(
         exposure=_uniform(rng, section.exposure),
         white=white,
@@ -356,7 +357,7 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
 
 
 def _near(colour: Colour, rng: Random) -> Colour:
-    """A colour a little brighter or darker, redder or bluer."""
+    """A colour of slightly different brightness and hue."""
     value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
     r, g, b = np.clip(value, 0.01, 0.95).tolist()
     return r, g, b

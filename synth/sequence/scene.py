@@ -1,4 +1,4 @@
-"""One scene in memory: a sequence of a job built and moved, its frames rendered when they are asked for."""
+"""One scene in memory: a sequence of a job, built and deformed; frames are rendered on demand."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(RenderedFrame):
-    """One frame of a scene: the picture, what is true of it, and the force that made it.
+    """One frame of a scene: the picture, its ground truth, and the force in it.
 
-    Everything of a `RenderedFrame` (`rgb`, `flow`, `visible`, `depth`, `tool`, `glare`, ...; None what the
-    job doesn't keep), in the units and axes of a dataset's fields, and:
+    All attributes of a `RenderedFrame` (`rgb`, `flow`, `visible`, `depth`, `tool`, `glare`, ...; None for
+    fields that the job does not store), in the units and axes of a dataset's fields, and:
     """
 
     index: int
-    """Which frame; 0 is the rest frame."""
+    """Number of the frame; 0 is the rest frame."""
     time_s: float
     traction: NDArray[np.float32]
     """(H, W, 3) kPa on the tissue, camera axes, at the rest frame's pixels: the label."""
@@ -51,13 +51,13 @@ class Frame(RenderedFrame):
 
 @dataclass(frozen=True)
 class RestScene:
-    """One sequence of a job, drawn and built, before anything moves. `at_rest` makes it."""
+    """One sequence of a job, drawn and built, before any motion; made by `at_rest`."""
 
     job: Job
     index: int
-    """Which sequence of the job."""
+    """Number of the sequence in the job."""
     scenario: Scenario
-    """Everything drawn for it."""
+    """All numbers drawn for it."""
     surface: CortexSurface
     """The fine surface at rest, world axes; shared between sequences of one anatomy, hence read-only."""
     view: Camera
@@ -65,7 +65,7 @@ class RestScene:
 
     @cached_property
     def renderer(self) -> Renderer:
-        """What renders this scene, its surface and instruments wherever they are said to be."""
+        """Renderer of this scene for any state of its surface and instruments."""
         kinds = [gesture.kind for gesture in self.scenario.gestures]
         return Renderer(self.surface, self.scenario.appearance, self.view, self.job, kinds)
 
@@ -76,7 +76,7 @@ class RestScene:
 
     @property
     def area(self) -> NDArray[np.float32]:
-        """(H, W) mm^2 of rest surface that each pixel of the rest frame sees."""
+        """(H, W) mm^2 of rest surface in each pixel of the rest frame."""
         return self.renderer.rest.area
 
     @property
@@ -87,10 +87,7 @@ class RestScene:
 
 @dataclass(frozen=True)
 class Scene(RestScene):
-    """One sequence of a job, built and moved; nothing is written. `simulate` makes it.
-
-    What a frame needs is computed when it is asked for: light and pictures cost nothing until then.
-    """
+    """One sequence of a job, built and deformed; `simulate` makes it. Frames are rendered on demand."""
 
     motion: Deformation
     """Surface, loads and instruments over T frames, world axes: `displacement` (T, V, 3) mm."""
@@ -98,7 +95,7 @@ class Scene(RestScene):
     @cached_property
     def _timeline(self) -> Timeline:
         case = self.scenario
-        return Timeline(self.motion, self.view, case.sway, case.appearance.light, self.job.fps)
+        return Timeline(self.motion, self.view, case.camera_motion, case.appearance.light, self.job.fps)
 
     @cached_property
     def _seeds(self) -> list[int]:
@@ -123,7 +120,7 @@ class Scene(RestScene):
         return self.scenario.tissue.young_kpa
 
     def frame(self, t: int) -> Frame:
-        """Renders frame `t`, 0 <= t < T: the same whatever was rendered before it.
+        """Renders frame `t`, 0 <= t < T, independently of other frames.
 
         Raises:
             UserError: there is no such frame.
@@ -148,23 +145,23 @@ class Scene(RestScene):
         return (self.frame(t) for t in range(len(self)))
 
     def recover_flow(self, frames: Sequence[Frame], backend: str | Estimator | None = None) -> Track:
-        """What a tracker finds in the pictures: flow (T, H, W, 2) px, its confidence (T, H, W), trust (T,).
+        """Recovers flow (T, H, W, 2) px from the pictures, with its confidence (T, H, W) and trust (T,).
 
-        It is told what a real pipeline knows, the instruments' outlines and glare as the picture shows it,
-        and sees the pictures as the job's codec leaves them.
+        As in a real pipeline, its inputs are pictures (after the job's codec) and instrument masks; glare is
+        detected in the pictures.
 
         Args:
             frames: of this scene, from the rest frame on.
             backend: an estimator or its name; the job's if None.
 
         Raises:
-            UserError: no such estimator, or frames that don't begin at rest.
+            UserError: no such estimator, or frames that do not begin at rest.
         """
         if not frames or frames[0].index != 0:
             raise UserError("recover_flow: the frames must begin with the rest frame, number 0")
         chosen = self.job.flow.backend if backend is None else backend
         if chosen == "ideal":
-            raise UserError("flow.backend: `ideal` recovers nothing; name an estimator")
+            raise UserError("flow.backend: `ideal` recovers no flow; name an estimator")
         rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
         if self.job.sensor.bitrate_mbps is not None:
             rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
@@ -174,15 +171,15 @@ class Scene(RestScene):
 def at_rest(
     job: Job, index: int = 0, gestures: Sequence[str] | None = None, *, case: Scenario | None = None
 ) -> RestScene:
-    """Draws sequence `index` of a job and builds its surface: the one way to a renderer.
+    """Draws sequence `index` of a job and builds its surface and renderer.
 
-    Its renderer takes any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`.
+    The renderer accepts any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`.
 
     Args:
         job: the job.
-        index: which of its sequences.
+        index: number of the sequence.
         gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
-        case: instead of the scenario that is drawn.
+        case: a scenario to use instead of the drawn one.
 
     Raises:
         UserError: the job's surface or calibration cannot be used.
@@ -206,17 +203,17 @@ def simulate(
     case: Scenario | None = None,
     motions: Sequence[ToolMotion] = (),
 ) -> Scene:
-    """Builds sequence `index` of a job and carries out its gestures; nothing is rendered or written yet.
+    """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
 
-    The scene is the one that `synth render` computes for that job and index, unless told otherwise.
+    Without `case` and `motions` the scene is the one that `synth render` computes for that job and index.
 
     Args:
-        job: the job, or what `load_job` knows it by; it may ask for more sequences than are ever made.
-        index: which of its sequences, 0 <= index < job.sequences.
-        report: told of progress, stage by stage.
+        job: the job, or its file or name as for `load_job`; its `sequences` only limits `index`.
+        index: number of the sequence, 0 <= index < job.sequences.
+        report: called with progress, stage by stage.
         watch: adds up the time of each stage.
-        case: instead of the scenario that is drawn; its camera motion may be any dataclass with a method `at`
-            as `CameraMotion` has.
+        case: a scenario to use instead of the drawn one; its camera motion may be any dataclass with a method
+            `at` like that of `CameraMotion`.
         motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Where everything is at any time of a sequence, between its frames too."""
+"""State of a sequence at any time, also between its frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from synth.render.camera.camera import Camera
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.scene import SceneState
 
-_SUBFRAMES = 4  # pictures that make up a blurred one
+_SUBFRAMES = 4  # pictures averaged over an open shutter
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,13 @@ class Timeline:
     """Surface, instruments, microscope and lamps of one sequence over time."""
 
     motion: Deformation
-    camera: Camera
-    """At rest."""
-    sway: CameraMotion
+    camera: Camera  # at rest
+    camera_motion: CameraMotion
     light: Lighting
     fps: float
 
     def at(self, frame: float) -> SceneState:
-        """The state at a frame, or of a time between two, where all moves straight from one to the next."""
+        """The state at a frame, or linearly interpolated between two."""
         last = len(self.motion.displacement) - 1
         frame = float(np.clip(frame, 0, last))
         before = int(frame)
@@ -43,16 +42,14 @@ class Timeline:
             vertices=self.motion.rest + between(self.motion.displacement),
             tips=between(self.motion.tip),
             shafts=between(self.motion.shaft),
-            camera=self.sway.at(self.camera, frame / self.fps),
+            camera=self.camera_motion.at(self.camera, frame / self.fps),
             power=self.light.gain(frame / max(last, 1)),
         )
 
     def exposure(self, frame: int, shutter: float) -> list[SceneState]:
-        """States while the shutter is open, evenly about a frame; none if it only opens for an instant.
+        """States at even times around a frame while the shutter is open; none for an instantaneous shutter.
 
-        Args:
-            frame: which.
-            shutter: part of the time between frames.
+        `shutter`: open time, as a part of the time between frames.
         """
         if shutter == 0:
             return []

@@ -107,8 +107,8 @@ def _poses(sequence: Sequence) -> Iterator[Floats]:
         poses = sequence["camera"][:]
         yield from (poses[0] @ np.linalg.inv(pose) for pose in poses)
         return
-    sway = sequence.attrs.get("scenario", {}).get("sway", {})
-    if sway.get("drift_mm"):
+    camera_motion = sequence.attrs.get("scenario", {}).get("camera_motion", {})
+    if camera_motion.get("drift_mm"):
         raise UserError(
             f"{sequence.path}: the microscope moves and its poses were not kept; "
             "render with store.extra=[camera]"

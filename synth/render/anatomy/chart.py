@@ -1,4 +1,4 @@
-"""The square that maps are painted over: an opening's plan, or its surface unrolled where that is steep."""
+"""Chart for the maps of a patch: its projection on the opening's plane, or its surface unrolled if steep."""
 
 from __future__ import annotations
 
@@ -17,24 +17,21 @@ from synth.render.anatomy import noise
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_COARSE = 48  # side of the grid that is unrolled, in a quarter of a CPU-second; 72 takes one
-_STEEP = 1.2  # stretch that a plan may have at 1% of the opening
+_COARSE = 48  # side of the unrolled grid: a quarter of a CPU-second; 72 takes one
+_STEEP = 1.2  # stretch up to which the projection serves, exceeded at 1% of the opening
 _TURNS = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Where on the square each place of a patch lies; it is as large as the surface there."""
+    """Map from a patch's projection to a square on which lengths are those of the surface."""
 
-    shift: Map
-    """(n, n, 2) mm from the plan's x, y; rows go with y, columns with x."""
-    plan_mm: float
-    """Side of the patch."""
-    extent_mm: float
-    """Side of the square."""
+    shift: Map  # (n, n, 2) mm from world x, y; rows go with y, columns with x
+    plan_mm: float  # side of the patch
+    extent_mm: float  # side of the square
 
     def at(self, xy: Floats) -> Floats:
-        """Where world x, y (N, 2) mm lie, mm from the square's middle."""
+        """Chart coordinates (N, 2) of world x, y (N, 2), mm from the square's middle."""
         return np.asarray(xy + noise.sample(self.shift, xy, self.plan_mm))
 
     def places(self, pixels: int) -> Floats:
@@ -44,7 +41,7 @@ class Chart:
 
 @lru_cache(maxsize=1)
 def _places(chart: Chart, pixels: int) -> Floats:
-    """As `Chart.places`: sulci and the rim's shade ask one after the other."""
+    """As `Chart.places`; cached, since sulci and the rim's shade need the same one."""
     axis = noise.centres(pixels, chart.extent_mm)
     laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
     xy = laid
@@ -54,10 +51,10 @@ def _places(chart: Chart, pixels: int) -> Floats:
 
 
 def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float) -> Chart:
-    """A chart of the disc of a radius round the middle; beyond it goes on as at the disc's edge.
+    """A chart of the disc of a radius around the middle, extrapolated beyond it.
 
-    Where that disc's plan stretches by little it stays the chart. Else least-squares conformal coordinates
-    (B. Levy et al., Least squares conformal maps for automatic texture atlas generation, 2002) of xatlas.
+    Where the surface of the disc is flat enough, the projection on x, y. Else least-squares conformal maps by
+    xatlas (B. Levy et al., Least squares conformal maps for automatic texture atlas generation, 2002).
 
     Args:
         height: (N,) mm of the surface at x, y (N, 2) mm.
@@ -81,7 +78,7 @@ def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float)
     which, corners, flat = atlas[0]
     if atlas.chart_count != 1:
         return Chart(shift, plan_mm, plan_mm)
-    # Turned and moved to where the plan is, and as large as the surface: complex numbers do both at once.
+    # Turned and moved onto the projection, and scaled to the surface's area: as complex numbers.
     laid = flat.astype(np.float64) @ [atlas.width, 1j * atlas.height]
     below = plan[which] @ [1, 1j]
     turn = np.vdot(laid - laid.mean(), below - below.mean())
@@ -97,6 +94,6 @@ def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float)
 
 
 def _area(corners: Floats) -> float:
-    """Of triangles (F, 3, 2 or 3)."""
+    """Total area of triangles (F, 3, 2 or 3)."""
     sides = corners[:, 1:] - corners[:, :1]
     return float(np.sqrt(np.linalg.det(sides @ sides.swapaxes(1, 2))).sum() / 2)

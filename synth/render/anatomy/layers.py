@@ -1,4 +1,4 @@
-"""Layers on maps: soft borders, ridges, speckled colours, what a layer lets through, one over another."""
+"""Painting of maps in layers: soft borders, ridges, speckled colours, absorbing layers, opaque layers."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ def step(x: Array) -> npt.NDArray[np.float32]:
 
 
 def ridge(x: Array, width: float, at: float = 0.0) -> Array:
-    """A Gaussian ridge of `x` (...): 1 where that is `at`, 1/e a `width` from there."""
+    """A Gaussian ridge of `x` (...): 1 at `at`, 1/e at a distance of `width`."""
     return np.asarray(np.exp(-(((x - at) / width) ** 2)))
 
 
 def speckled(colour: Rgb, *contrasts: Array) -> Array:
-    """A colour, linear RGB, that varies by `contrasts` (r, n), each a share of it: (r, n, 3)."""
+    """A colour (r, n, 3), linear RGB, that varies by the sum of `contrasts` (r, n), as shares of it."""
     return np.asarray(np.asarray(colour, np.float32) * np.asarray(sum(contrasts, 1))[..., None])
 
 
 def through(colour: Array, depth: Array, absorption: Rgb) -> Array:
-    """Colours (r, n, 3) under a layer of Beer and Lambert's `depth` (r, n), times `absorption` a channel."""
+    """Colours (r, n, 3) under a layer (Beer-Lambert) of optical depth `depth` (r, n) times `absorption`."""
     return np.asarray(colour * np.exp(-depth[..., None] * np.array(absorption, np.float32)))
 
 
 def over(below: Array, above: Array, share: Array) -> Array:
-    """One layer over another (r, n, 3), or numbers (r, n), of which it covers a share that broadcasts."""
+    """One layer (r, n, 3) or map (r, n) over another, of which it covers a share that broadcasts."""
     return np.asarray(below * (1 - share) + above * share)

@@ -15,14 +15,14 @@ import numpy.typing as npt
 Map = npt.NDArray[np.float32]
 Floats = npt.NDArray[np.float64]
 
-_ROWS = 8  # of a map at a time: what is made in between stays in the processor's cache
+_ROWS = 8  # of a map at a time: intermediate results stay in the processor's cache
 
 
 def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm: float, width: float) -> Map:
     """Isotropic noise about one wavelength; zero mean, unit variance.
 
     Args:
-        rng: where the noise comes from.
+        rng: source of the noise.
         pixels: side of the map.
         extent_mm: side of the square.
         wavelength_mm: centre of the band.
@@ -46,7 +46,7 @@ def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm:
 def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
     """Gaussian blur of a map (n, n) or (n, n, c) by a width in mm."""
     sigma = sigma_mm * image.shape[0] / extent_mm
-    # Wide kernels are dear; the blurred picture carries no detail that a smaller one would lose.
+    # Wide kernels are slow; a small picture loses no detail of a widely blurred one.
     if sigma > 12:
         side = max(32, int(image.shape[0] * 6 / sigma))
         small = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
@@ -56,14 +56,14 @@ def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
 
 
 def in_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...]:
-    """What `paint` makes of maps (n, ...) pixel by pixel, a few rows at a time: the same bytes, sooner."""
+    """Applies a pixelwise `paint` to maps (n, ...) a few rows at a time: faster, same bytes."""
     starts = range(0, len(maps[0]), _ROWS)
     parts = [paint(*(image[start : start + _ROWS] for image in maps)) for start in starts]
     return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
 def sample(image: Map, xy: Floats, extent_mm: float) -> npt.NDArray[np.float32]:
-    """Map (n, n) or (n, n, c) at world x, y (N, 2) mm, bilinear, held at the border: (N,) or (N, c)."""
+    """Map (n, n, ...) at world x, y (N, 2) mm, bilinear, constant beyond its border: (N, ...)."""
     pixel = ((xy / extent_mm + 0.5) * image.shape[0] - 0.5).astype(np.float32)
     width = 32_000  # cv2.remap takes pictures no longer than a short integer
     padding = -len(pixel) % width
@@ -78,7 +78,7 @@ def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
 
 
 def _frequencies(pixels: int, extent_mm: float) -> Floats:
-    """Waves a millimetre of each coefficient of a real transform."""
+    """Spatial frequency [1/mm] of each coefficient of a real transform."""
     step = extent_mm / pixels
     return np.asarray(np.hypot(np.fft.fftfreq(pixels, step)[:, None], np.fft.rfftfreq(pixels, step)[None]))
 

@@ -1,7 +1,7 @@
-"""What frames the opening, from tissue outwards: cut edge, folded dura, gutter, bone or muscle, drapes.
+"""Rim of the opening, outwards: the dura's cut edge, folded dura, gutter, wall of bone or muscle, drapes.
 
-Distances are from the opening's edge outwards [mm]. No measurement needs these layers to be right: sizes,
-albedos and absorptions were chosen by eye against an intra-operative photograph.
+Distances are from the opening's edge [mm], albedos linear RGB, absorptions optical depths in each channel.
+No measurement depends on these layers: all were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -26,100 +26,92 @@ from synth.render.mitsuba.adapter import Coat
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_AROUND, _OUT = 320, 42  # at most: points around, rings outwards
-_SEGMENT_PX = 4.0  # points around are no nearer than this in the picture: the mesh is built anew every frame
-_WIDTH_MM = 26.0  # beyond the opening; the picture ends before
+_AROUND, _OUT = 320, 42  # at most: points around the opening, rings outwards
+_SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is built anew every frame
+_WIDTH_MM = 26.0  # of the rim; the picture ends before
 
 
 @dataclass(frozen=True)
 class CutEdge:
-    """Section of the dura where it is cut [mm]: out of the brain's surface towards the lens, then round."""
+    """Cross-section of the dura's cut edge [mm]: rings from its underside over its lip to the fold."""
 
-    lip: float = 0.5  # how far it reaches over the brain
+    lip: float = 0.5  # overhang over the brain
     inside: tuple[float, ...] = (1.0, 0.96, 0.72, 0.44, 0.2, 0.04)  # its rings, as shares of the lip
-    height: tuple[float, ...] = (-1.8, -0.12, 0.10, 0.26, 0.38, 0.46)  # of its rings, over the brain
-    laid: tuple[float, ...] = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)  # on the maps: it is steep, so wider
-    flap: tuple[float, float] = 0.12, 0.5  # where the flap begins: outwards, over the brain
-    under: Rgb = (0.35, 0.9, 1.0)  # absorption, where the light is lost under it
+    height: tuple[float, ...] = (-1.8, -0.12, 0.10, 0.26, 0.38, 0.46)  # of its rings over the brain
+    painted: tuple[float, ...] = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)  # its rings on the maps: wider apart
+    fold: tuple[float, float] = 0.12, 0.5  # start of the folded dura: outwards, over the brain
+    shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
 
 @dataclass(frozen=True)
-class Flap:
-    """The dura turned over outwards [mm]; pairs are mean and spread, see `_ragged`."""
+class FoldedDura:
+    """The dura folded back over the rim [mm]; pairs are mean and spread around the opening, see `_uneven`."""
 
     width: tuple[float, float] = 3.1, 0.7
-    sway: tuple[float, float] = 3.0, 1.2  # of its pleats
-    pulled: tuple[float, float] = 1.3, 1.6  # wider at a stitch: by how much, how far aside
-    vessel: Rgb = (0.35, 1.0, 0.95)  # absorption, of what shimmers through its outer layer
+    pleats: tuple[float, float] = 3.0, 1.2  # scales the fold's height and shifts the pleats' phase
+    pulled: tuple[float, float] = 1.3, 1.6  # added width at a stitch, and over what distance aside
+    vessel: Rgb = (0.35, 1.0, 0.95)  # absorption of its vessels
 
 
 @dataclass(frozen=True)
 class Wound:
-    """The gutter behind the flap, and what rises in two steps beyond [mm]; pairs are mean and spread."""
+    """Gutter behind the dura, and the wall that rises in two steps beyond [mm]; pairs are mean and spread."""
 
-    gutter: tuple[float, float] = 1.7, 0.6
-    floor: float = 1.3  # over the brain
+    gutter: tuple[float, float] = 1.7, 0.6  # width
+    floor: float = 1.3  # height over the brain
     rise: tuple[float, float] = 1.5, 0.8  # of each step
-    first: float = 0.4  # from the gutter to the first step
-    second: tuple[float, float] = 2.4, 0.7
-    shadow: Rgb = (0.8, 1.1, 1.1)  # absorption, of the light lost in the gutter
+    first: float = 0.4  # from the wall's foot to the first step
+    second: tuple[float, float] = 2.4, 0.7  # from the wall's foot to the second step
+    shadow: Rgb = (0.8, 1.1, 1.1)  # absorption that darkens the gutter
     fat: Rgb = (0.72, 0.46, 0.22)  # albedo
     blood: Rgb = (0.26, 2.4, 2.8)  # absorption
 
 
 @dataclass(frozen=True)
 class Bone:
-    """Albedo of bone and absorption of what stains it."""
+    """Albedos of compact bone and of its spongy section, absorption of blood stains."""
 
-    ivory: Rgb = (0.82, 0.71, 0.54)
+    compact: Rgb = (0.82, 0.71, 0.54)
     spongy: Rgb = (0.62, 0.30, 0.22)
     stain: Rgb = (0.2, 1.2, 1.4)
 
 
 @dataclass(frozen=True)
 class Drape:
-    """Cloth: where it begins behind the wall [mm], and its albedos."""
+    """Surgical drapes: distance behind the wall's foot [mm], and albedos."""
 
     away: tuple[float, float] = 3.0, 0.8  # mean and spread
     blue: Rgb = (0.07, 0.20, 0.42)
     green: Rgb = (0.06, 0.28, 0.26)
-    bled_on: Rgb = (0.22, 0.02, 0.02)
+    blood: Rgb = (0.22, 0.02, 0.02)
 
 
 @dataclass(frozen=True)
 class Rim:
-    """The frame of the opening as a mesh."""
+    """The rim as a mesh, and the outlines that its maps are painted by."""
 
     shape: Shape
-    uv: npt.NDArray[np.float32]
-    """(V, 2)."""
-    extent_mm: float
-    """Side of the square that uv spans."""
-    edge: Floats
-    """(A,) mm: radius of the opening's edge at even angles."""
-    cotton: tuple[Patty, ...]
-    """What the maps show of it; the patties over the opening's edge take theirs from one in the middle."""
-    stitches: Floats
-    """(n,) rad: where threads hold the dura."""
-    dura: Floats
-    """(A,) mm beyond the edge where the folded dura ends, and the gutter behind it begins."""
-    wall: Floats
-    """(A,) mm beyond the edge where the wound's wall rises, to bone or muscle."""
-    bone: bool
-    cloth: Floats
-    """(A,) mm beyond the edge where drapes begin; empty: there are none in view."""
+    uv: npt.NDArray[np.float32]  # (V, 2)
+    extent_mm: float  # side of the square that uv spans
+    edge: Floats  # (A,) mm: radius of the opening's edge at even angles
+    cotton: tuple[Patty, ...]  # painted on the maps; one in their middle serves the patties over the edge
+    stitches: Floats  # (n,) rad: angles of threads that hold the dura
+    dura: Floats  # (A,) mm beyond the edge: end of the folded dura, start of the gutter
+    wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
+    bone: bool  # whether the wall is of bone, else of muscle
+    cloth: Floats  # (A,) mm beyond the edge: start of the drapes; empty without drapes
 
 
 def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_per_px: float) -> Rim:
-    """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` show."""
+    """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` resolve."""
     rng = np.random.default_rng([appearance.rim_seed, 0])
     around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
     part = np.linspace(0, 1, round(_OUT * around / _AROUND))
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     edge = radius_mm * _outline(rng, angle)
     out = _WIDTH_MM * (0.4 * part + 0.6 * part**3)
-    away = np.concatenate([-CutEdge.lip * np.array(CutEdge.inside), out + CutEdge.flap[0]])
-    up = np.concatenate([CutEdge.height, CutEdge.flap[1] + 0.05 * out])
+    away = np.concatenate([-CutEdge.lip * np.array(CutEdge.inside), out + CutEdge.fold[0]])
+    up = np.concatenate([CutEdge.height, CutEdge.fold[1] + 0.05 * out])
     away = np.broadcast_to(away, (around, len(away)))
     xy = _places(angle, edge[:, None] + away)
     flat = xy.reshape(-1, 2)
@@ -132,40 +124,34 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     z = _under(surface, flat).reshape(away.shape) + up
     z += np.clip(away - 0.1, 0, 3.0) / 3.0 * sampled(folds)
     patty = scenery.drawn_patty(rng, edge) if appearance.cottonoid else None
-    stitches = scenery.stitches(edge, rng)[
-        : 0 if appearance.family == "calf" else None
-    ]  # on the bench nobody sews
+    stitches = scenery.stitches(edge, rng)
+    if appearance.family == "calf":  # the dura of a specimen is not sewn back
+        stitches = stitches[:0]
     asides = [scenery.aside(angle, stitch)[:, None] * float(edge.mean()) for stitch in stitches]
-    wider, within = Flap.pulled
-    dura = _ragged(rng, angle, *Flap.width) + sum(wider * ridge(aside[:, 0], within) for aside in asides)
-    wall = dura + _ragged(rng, angle, *Wound.gutter)
-    cloth = wall + _ragged(rng, angle, *Drape.away) if "drape" in appearance.scenery else np.zeros(0)
+    wider, within = FoldedDura.pulled
+    dura = _uneven(rng, angle, *FoldedDura.width)
+    dura = dura + sum(wider * ridge(aside[:, 0], within) for aside in asides)
+    wall = dura + _uneven(rng, angle, *Wound.gutter)
+    cloth = wall + _uneven(rng, angle, *Drape.away) if "drape" in appearance.scenery else np.zeros(0)
     beyond = step((away - dura[:, None]) / 0.35 - 0.4)
-    z += _folded(away, dura[:, None], _ragged(rng, angle, *Flap.sway)[:, None], asides) * (1 - beyond)
-    steps, bone = (
-        (wall + Wound.first, wall + _ragged(rng, angle, *Wound.second)),
-        "bone" in appearance.scenery,
-    )
+    z += _folded(away, dura[:, None], _uneven(rng, angle, *FoldedDura.pleats)[:, None], asides) * (1 - beyond)
+    bone = "bone" in appearance.scenery
+    steps = wall + Wound.first, wall + _uneven(rng, angle, *Wound.second)
     risen = sum(high * step((away - at[:, None]) / 0.7) for at, high in zip(steps, Wound.rise, strict=True))
     lumps = sampled(noise.band(rng, 256, extent, 2.6, 0.6))
     lumpy = (0.12 if bone else 0.4) * np.minimum(risen, 1) * lumps
-    z += beyond * (Wound.floor - CutEdge.flap[1] + risen + lumpy)
+    z += beyond * (Wound.floor - CutEdge.fold[1] + risen + lumpy)
     if len(cloth):
         z += step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
-    if patty:  # cotton lies over folds rather than in them
+    if patty:  # cotton bridges folds
         z += step((0.3 - patty.placed(xy[..., 0], xy[..., 1])[2]) / 0.6) * scenery.PATTY_UP_MM
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
-    laid = edge[:, None] + np.concatenate([CutEdge.laid, away[0, len(CutEdge.laid) :]])[None]
-    parts = [
-        (
-            vertices,
-            grid_faces(around, away.shape[1], "rows").reshape(-1, 3),
-            _places(angle, laid).reshape(-1, 2),
-        )
-    ]
+    painted = edge[:, None] + np.concatenate([CutEdge.painted, away[0, len(CutEdge.painted) :]])[None]
+    faces = grid_faces(around, away.shape[1], "rows").reshape(-1, 3)
+    parts = [(vertices, faces, _places(angle, painted).reshape(-1, 2))]
     cotton: tuple[Patty, ...] = () if patty is None else (patty,)
     if "cottonoid" in appearance.scenery:
-        # Their felt is painted in the middle of the maps, where the opening is.
+        # Their felt is painted in the middle of the maps, which the opening leaves free.
         cotton += (Patty((0.0, 0.0), 0.0, scenery.PATTY_MM),)
         parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
     uv = (np.concatenate([place for *_, place in parts]) / extent + 0.5).astype(np.float32)
@@ -174,13 +160,13 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
 
 
 def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
-    """Dura, blood and what lies beyond, as maps over the rim's square."""
+    """Maps of the rim, `pixels` on a side."""
     rng = np.random.default_rng([appearance.rim_seed, 1])
     extent = rim.extent_mm
     wide = noise.fractal(rng, pixels, extent, 8.0, 2.6)
     mottle = noise.fractal(rng, pixels, extent, 2.2, 2.3)
     grain = noise.fractal(rng, pixels, extent, 0.6, 1.6)
-    fibres = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
+    streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
     swell = noise.band(rng, pixels, extent, 1.4, 0.5)
     axis = noise.centres(pixels, extent)
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
@@ -190,14 +176,14 @@ def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
         ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
         weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
         maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
-    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, fibres), *maps)
+    colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, streaks), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
     bent = normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent)
     return Coat(colour, bent, dry.astype(np.float32))
 
 
 def shade(rim: Rim, surface: CortexSurface) -> Map:
-    """Share (512, 512) of light that reaches the surface past the lip, over its chart."""
+    """Share (512, 512) of light that the dura's lip lets reach the surface, over its chart."""
     x, y = surface.chart.places(512).T.reshape(2, 512, 512)
     inside = np.maximum(_round(rim.edge, np.arctan2(y, x)) - CutEdge.lip - np.hypot(x, y), 0)
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
@@ -209,7 +195,7 @@ def inside(rim: Rim, x: Map, y: Map) -> Map:
 
 
 def _round(values: Floats, angle: Map) -> Map:
-    """Values (A,) at even angles, at other angles."""
+    """Values (A,) at even angles, interpolated at angles (...) rad."""
     closed = np.append(values, values[0])
     even = np.linspace(0, 2 * np.pi, len(closed))
     return np.asarray(np.interp(angle % (2 * np.pi), even, closed), np.float32)
@@ -221,33 +207,33 @@ def _places(angle: Floats, radius: Floats) -> Floats:
 
 
 def _outline(rng: np.random.Generator, angle: Floats) -> Floats:
-    """An opening cut by hand and held by a few stitches: between a circle and a rounded polygon."""
+    """Relative radius of an opening cut by hand: between a circle and a rounded polygon, ragged."""
     corners = int(rng.integers(5, 8))
     part = 2 * np.pi / corners
     phase = (angle + rng.uniform(0, part)) % part - part / 2
     polygon = np.cos(part / 2) / np.cos(phase)
     shape = 0.65 + 0.35 * polygon / polygon.mean()
-    # Deviations of each wave, as shares of the radius: the hand's, then the cut's own raggedness.
+    # Spread of each wave's amplitude, as a share of the radius: slow deviations, then a ragged cut.
     for order, spread in [(n, 0.045 / n) for n in range(2, 9)] + [(n, 0.0010) for n in range(12, 40)]:
         shape += rng.normal(0, spread) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
     return np.asarray(shape)
 
 
-def _ragged(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
-    """A distance (A,) mm that wanders round the opening."""
+def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
+    """A distance (A,) mm that varies at random around the opening."""
     wave = np.full_like(angle, mean)
     for order in range(2, 14):
         wave += rng.normal(0, spread / order**0.7) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
     return np.maximum(wave, 0.35 * mean)
 
 
-def _folded(away: Floats, dura: Floats, sway: Floats, asides: list[Floats]) -> Floats:
-    """Height (A, R) mm of the turned-over dura: rolled edge, pleats, free end, rays and tents of stitches.
+def _folded(away: Floats, dura: Floats, pleats: Floats, asides: list[Floats]) -> Floats:
+    """Height (A, R) mm of the folded dura: its fold, pleats, free end, and rays and tents at stitches.
 
-    `away`: mm from the edge; `dura`: where it ends; `sway`: how pleats wander; `asides`: mm from each stitch.
+    `away`: mm from the edge; `dura`: mm, its end; `pleats`: see `FoldedDura`; `asides`: mm from each stitch.
     """
-    raised = 0.11 * sway * ridge(away, at=0.8, width=0.5)
-    raised += 0.2 * np.sin(3.2 * away + 2 * sway) * np.clip(away - 0.8, 0, 1)
+    raised = 0.11 * pleats * ridge(away, at=0.8, width=0.5)
+    raised += 0.2 * np.sin(3.2 * away + 2 * pleats) * np.clip(away - 0.8, 0, 1)
     # It leans against the wall: its free end is the highest, and curls.
     raised += 0.36 * np.clip(away, 0, None) + 0.35 * ridge(away - dura, at=-0.3, width=0.28)
     for aside in asides:
@@ -256,13 +242,13 @@ def _folded(away: Floats, dura: Floats, sway: Floats, asides: list[Floats]) -> F
     return np.asarray(np.where(away > 0, raised, 0.0))
 
 
-def _paint_rows(rim: Rim, appearance: Appearance, drawn: Map, *maps: Map) -> tuple[Map, Map, Map]:
-    """Colour (r, n, 3), bumps mm and share without a film (r, n) of some rows at x, y mm, of noise (r, n)."""
+def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> tuple[Map, Map, Map]:
+    """Albedo (r, n, 3), bumps mm and dry share (r, n) of some rows of the maps; see `paint` for `maps`."""
     x, y, wide, mottle, grain, swell, distance, radius, *cotton = maps
     angle = np.arctan2(y, x)
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     reach, past = _round(rim.dura, angle), away - _round(rim.wall, angle)
-    fibres = _streaks(drawn, angle, away, float(rim.edge.mean()))
+    fibres = _fibres(streaks, angle, away, float(rim.edge.mean()))
     outer = step((away - reach) / 0.3 + 0.2 * mottle)
     gutter = outer * (1 - step(past / 0.9 + 0.25 * mottle))
     bumps = 0.035 * mottle + 0.006 * swell
@@ -287,69 +273,66 @@ def _paint_rows(rim: Rim, appearance: Appearance, drawn: Map, *maps: Map) -> tup
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 
 
-def _streaks(drawn: Map, angle: Map, away: Map, radius: float) -> Map:
-    """Fibres that run outwards with the folded flap: noise (512, 512) drawn long in one direction."""
+def _fibres(streaks: Map, angle: Map, away: Map, radius: float) -> Map:
+    """Fibres of the dura that run outwards: noise (512, 512) stretched in that direction."""
     u = (angle / (2 * np.pi) % 1.0 * 512).astype(np.float32)
     v = (np.clip(away, 0, None) * 2.2 * 512 / (2 * np.pi * radius) % 512).astype(np.float32)
-    return np.asarray(cv2.remap(drawn, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
+    return np.asarray(cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
 
 
 def _dura(appearance: Appearance, fibres: Map, mottle: Map, grain: Map, distance: Map, radius: Map) -> Map:
-    """Colours of the flap; its vessels shimmer through its outer layer, with a flush beside them."""
-    flush = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
-    blood = 4.5 * thickness((distance, radius)) + flush
+    """Albedo of the folded dura, with its vessels and the redder margin along them."""
+    margin = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
+    blood = 4.5 * thickness((distance, radius)) + margin
     return through(
-        speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain), blood, Flap.vessel
+        speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain), blood, FoldedDura.vessel
     )
 
 
 def _muscle(appearance: Appearance, past: Map, mottle: Map, grain: Map) -> Map:
-    """What was cut shows its strands, and pale fascia at the edge of each step."""
+    """Albedo of cut muscle with its strands, and of pale fascia at the wall's edge."""
     strands = speckled(appearance.surroundings_albedo, 0.18 * mottle, 0.04 * grain)
     fascia = 0.45 * ridge(past - 1.0 - 0.3 * mottle, width=0.3)[..., None]
     return np.asarray(over(strands, np.asarray(appearance.dura_albedo), fascia), np.float32)
 
 
 def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
-    """Colours with bone over its first millimetres: spongy where it is cut, ivory on top, bled on."""
-    ivory = speckled(Bone.ivory, 0.06 * mottle, 0.03 * grain)
-    ivory = through(ivory, np.clip(0.7 * mottle - 0.5, 0, 2), Bone.stain)
+    """Albedo with bone over the wall's first millimetres: spongy in section, compact on top, stained."""
+    compact = speckled(Bone.compact, 0.06 * mottle, 0.03 * grain)
+    compact = through(compact, np.clip(0.7 * mottle - 0.5, 0, 2), Bone.stain)
     cut = 0.6 * ridge(past, at=0.35, width=0.25)[..., None]
-    bone = over(ivory, speckled(Bone.spongy, 0.25 * grain), cut)
+    bone = over(compact, speckled(Bone.spongy, 0.25 * grain), cut)
     return np.asarray(over(beyond, bone, step((3.9 + 0.5 * mottle - past) / 0.6)[..., None]), np.float32)
 
 
-def _blood(level: float, runs: Map, gutter: Map) -> Map:
-    """Optical depth (r, n) of blood, from none (0) to soaked (1): along fibres and in the gutter."""
-    gathered = 2.4 * level - 1.9 + runs + (0.3 + 2.6 * level) * gutter
+def _blood(level: float, uneven: Map, gutter: Map) -> Map:
+    """Optical depth (r, n) of blood at a level from 0 (none) to 1 (soaked): uneven, most in the gutter."""
+    gathered = 2.4 * level - 1.9 + uneven + (0.3 + 2.6 * level) * gutter
     return np.asarray((0.02 + 0.4 * np.log1p(np.exp(2.0 * gathered))) * min(1.0, 8 * level))
 
 
 def _shadowed(colour: Map, away: Map, reach: Map, past: Map, gutter: Map) -> Map:
-    """Colours with the pale thin lip, and without the light lost under it and in the gutter.
-
-    Least comes back from under the dura's free edge and at the wall's foot.
-    """
+    """Albedo with a pale thin lip, darkened under the lip, in the gutter, and most at its two borders."""
     pale = colour * (1 + 0.12 * ridge(away, at=-0.1, width=0.35)[..., None])
     crevice = np.minimum(np.abs(away - reach - 0.25), np.abs(past) + 0.1)
     lost = 0.7 * gutter + 0.8 * ridge(crevice, width=0.3)
-    return through(through(pale, np.clip(-away - 1.5, 0, 1), CutEdge.under), lost, Wound.shadow)
+    return through(through(pale, np.clip(-away - 1.5, 0, 1), CutEdge.shadow), lost, Wound.shadow)
 
 
 def _draped(
     appearance: Appearance, past: Map, mottle: Map, grain: Map, colour: Map, bumps: Map, dry: Map
 ) -> tuple[Map, Map, Map]:
-    """Colour, bumps and dryness with blue or green cloth `past` mm beyond its border, bled on there."""
+    """Albedo, bumps and dry share with blue or green drapes from `past` = 0 mm on, bloody at their border."""
     cloth = speckled((Drape.blue, Drape.green)[appearance.rim_seed % 2], 0.10 * grain, 0.05 * mottle)
-    bled = np.clip(appearance.blood * (1.1 - past / 2.0) + 0.3 * mottle, 0, 1.2)[..., None]
-    cloth = cloth * (1 - 0.6 * np.minimum(bled, 1)) + np.array(Drape.bled_on, np.float32) * 0.6 * bled
+    blood = np.clip(appearance.blood * (1.1 - past / 2.0) + 0.3 * mottle, 0, 1.2)[..., None]
+    cloth = cloth * (1 - 0.6 * np.minimum(blood, 1)) + np.array(Drape.blood, np.float32) * 0.6 * blood
     cover = step(past / 0.3 - 0.5)
     colour = np.asarray(colour + (cloth - colour) * cover[..., None], np.float32)
     return colour, np.asarray(over(bumps, 0.012 * grain, cover), np.float32), np.maximum(dry, cover)
 
 
 def _under(surface: CortexSurface, xy: Floats) -> Floats:
-    """Height of the smoothed surface below points; beyond the patch it goes on falling as at its border."""
+    """Height of the smoothed surface below points, extrapolated beyond the patch."""
     half = surface.extent_mm / 2
     inner = np.clip(xy, -half, half)
     _, near = cKDTree(surface.vertices[:, :2]).query(inner, k=16)

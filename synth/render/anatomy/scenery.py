@@ -1,7 +1,7 @@
-"""What else lies about an opening: cotton over its edge, a retractor's blade, stitches, dural vessels.
+"""Objects around an opening: cotton patties over its edge, a retractor's blade, stitches, dural vessels.
 
-None of it is tissue or an instrument that acts: it hides what is below it, in pictures and truth alike.
-Sizes (mm), albedos (linear RGB) and absorptions were chosen by eye against an intra-operative photograph.
+None of it is tissue or an acting instrument: it hides what is below it, in pictures and truth alike.
+Sizes (mm), albedos (linear RGB) and absorptions were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ Map = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 
 PATTY_MM = (5.0, 2.3)
-"""Half length and width of the patties over the opening's edge."""
+"""Half length and half width of the patties over the opening's edge."""
 PATTY_UP_MM = 0.55 + 0.3
-"""Height of a patty on the rim: cotton, and folds that it lies over."""
+"""Height of a patty on the rim: cotton, and the folds under it."""
 _PATTY_GRID = (34, 18)
 _COTTON_MM = 0.45
 _BLADE_RINGS, _BLADE_AROUND = 60, 24
@@ -54,15 +54,12 @@ class Suture:
 class Patty:
     """A strip of cotton on the rim."""
 
-    middle: tuple[float, float]
-    """World x, y [mm]."""
-    turn: float
-    """Direction of its long side [rad]."""
-    half: tuple[float, float]
-    """Half its length and width [mm]."""
+    middle: tuple[float, float]  # world x, y [mm]
+    turn: float  # direction of its long side [rad]
+    half: tuple[float, float]  # half its length and width [mm]
 
     def placed(self, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats, Map]:
-        """Places x, y mm along its length, across it, and from its outline, negative inside [mm]."""
+        """Points x, y in its own axes: along, across, and distance from its outline, negative inside [mm]."""
         c, s = np.cos(self.turn), np.sin(self.turn)
         dx, dy = x - self.middle[0], y - self.middle[1]
         along, across = c * dx + s * dy, c * dy - s * dx
@@ -71,7 +68,7 @@ class Patty:
 
 
 def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
-    """Angles (n,) rad at which threads hold the dura: where the opening is widest, one a sector."""
+    """Angles (n,) rad of the stitches: where the opening is widest in each of a few sectors."""
     sectors = int(rng.integers(4, 7))
     first = int(rng.integers(len(edge)))
     parts = np.array_split(np.roll(np.arange(len(edge)), -first), sectors)
@@ -80,7 +77,7 @@ def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
 
 
 def aside(angle: npt.NDArray[Any], stitch: float) -> npt.NDArray[Any]:
-    """Angle (...) from a stitch, to the shorter side [rad]."""
+    """Signed angle (...) from a stitch, the shorter way [rad]."""
     return np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi
 
 
@@ -89,12 +86,12 @@ def threaded(
 ) -> tuple[Map, Map]:
     """Colour (r, n, 3) and bumps mm with threads: two strands from each stitch, meeting far out.
 
-    `angle` rad and `away` mm: places (r, n) around an opening of mean `radius` mm, and beyond its edge.
+    `angle` rad and `away` mm: points (r, n) around an opening of mean `radius` mm, and beyond its edge.
     """
     covered = np.zeros_like(away)
     for stitch in stitches:
         across = aside(angle, stitch) * (radius + away)
-        # A loop that is round where it goes through, drawn together far out.
+        # A loop, round where it pierces the dura, its strands together far out.
         apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
         line = np.where(away > 0.9, np.abs(np.abs(across) - apart), 9.0)
         covered = np.maximum(covered, step((Suture.half_mm - line) / 0.06 + 0.2))
@@ -104,15 +101,15 @@ def threaded(
 
 
 def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
-    """Meningeal vessels (nodes in world x, y mm) that run over the dura round an opening and branch.
+    """Meningeal vessels (nodes in world x, y mm) that branch over the dura around an opening.
 
-    `edge`: (A,) mm, radius of the opening at even angles; `rng`: where they run.
+    `edge`: (A,) mm, radius of the opening at even angles.
     """
     nodes: list[Floats] = []
     parent: list[int] = []
     radius: list[float] = []
     mean = float(edge.mean())
-    # A stem: where it starts (angle, mm from the edge), how it leans, its width, steps, and what it leaves.
+    # A stem: its start (angle, mm from the edge), lean, width (sign: its way around), steps, and parent node.
     stems: list[tuple[float, float, float, float, int, int]] = []
     count, way = int(rng.integers(6, 10)), rng.choice([-1, 1])
     for k in range(count):
@@ -127,7 +124,7 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
             parent.append(before)
             radius.append(own)
             before = len(nodes) - 1
-            # On along the edge (a width's sign is its way round), swaying, and held to the dura.
+            # Along the edge, with a random lean that is drawn back to the middle of the folded dura.
             lean = 0.94 * lean + rng.normal(0, 0.09) - 0.02 * (away - 3.8)
             angle, away = angle + 0.25 * np.sign(width) / r, float(np.clip(away + 0.25 * lean, 0.8, 8.0))
             if own > 0.06 and rng.random() < 0.045:
@@ -148,7 +145,7 @@ def drawn_patty(rng: np.random.Generator, edge: Floats) -> Patty:
 def with_patty(
     patty: Patty, x: Map, y: Map, drawn: Sequence[Map], blood: float, colour: Map, bumps: Map
 ) -> tuple[Map, Map]:
-    """Colour (r, n, 3) and bumps mm at x, y mm with a patty's felt, of noise (r, n), soaked at its edges."""
+    """Colour (r, n, 3) and bumps mm at x, y mm with a patty, by noise `drawn` (r, n), soaked at its edges."""
     ragged, weave, stains = drawn
     along, across, far = patty.placed(x, y)
     far = far + 0.12 * ragged
@@ -169,10 +166,10 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
     Args:
         edge: (A,) mm, radius of the opening at even angles.
         points: (N, 3) mm, of everything that they may lie on.
-        rng: where they lie.
+        rng: source of their positions.
 
     Returns:
-        Vertices (V, 3) mm, faces (F, 3), and where each vertex is on its patty (V, 2) mm, of each.
+        Vertices (V, 3) mm, faces (F, 3), and the vertices' places on the patty (V, 2) mm, of each.
     """
     tree = cKDTree(points[:, :2])
     faces = grid_faces(*_PATTY_GRID)[::-1, :, [0, 2, 1]].reshape(-1, 3)
@@ -191,7 +188,7 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
         y = at * np.sin(around) + s * u + c * v
         _, near = tree.query(np.stack([x.ravel(), y.ravel()], 1), k=6)
         below = points[near, 2].max(axis=1).reshape(x.shape)
-        # Soaked felt hangs over what it lies on, and its outermost ring is tucked under.
+        # Soaked felt follows the surface below; its outermost ring is tucked under.
         z = np.maximum(gaussian_filter(below, 1.5, mode="nearest"), below) + _COTTON_MM
         z[[0, -1]] -= _COTTON_MM + 0.25
         z[:, [0, -1]] -= _COTTON_MM + 0.25
@@ -203,20 +200,19 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
 def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
     """A blade of steel from outside over the rim, bent down into the opening.
 
-    `edge`: (A,) mm, radius of the opening at even angles; `points`: (N, 3) mm, of what it may lie on; `rng`:
-    from where it comes.
+    `edge`: (A,) mm, radius of the opening at even angles; `points`: (N, 3) mm, of the surfaces below it.
     """
     around, wide = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(2.8, 4.2))
     outwards = np.array([np.cos(around), np.sin(around)])
     across = np.array([-outwards[1], outwards[0]])
     along = points[:, :2] @ outwards
-    beside = np.abs(points[:, :2] @ across) < wide
+    below = np.abs(points[:, :2] @ across) < wide
     start = edge_at(edge, around) - float(rng.uniform(0.8, 2.0))
     s = np.linspace(0, 1, _BLADE_RINGS) ** 1.3 * 34.0
-    slot = np.floor((along[beside] - start) / 0.5).astype(int)
+    slot = np.floor((along[below] - start) / 0.5).astype(int)
     highest = np.full(int(s[-1] / 0.5) + 2, -np.inf)
     inside = (slot >= 0) & (slot < len(highest))
-    np.maximum.at(highest, slot[inside], points[beside, 2][inside])
+    np.maximum.at(highest, slot[inside], points[below, 2][inside])
     known = np.flatnonzero(np.isfinite(highest))
     highest = np.interp(np.arange(len(highest)), known, highest[known])
     smooth = gaussian_filter(maximum_filter1d(highest, 5), 2.5, mode="nearest")
@@ -233,5 +229,5 @@ def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
 
 
 def edge_at(edge: Floats, angle: float) -> float:
-    """Radius mm at an angle [rad] of an opening's edge (A,) mm, which is given at even angles."""
+    """Radius mm at an angle [rad] of an opening's edge (A,) mm at even angles."""
     return float(edge[int(angle / (2 * np.pi) * len(edge)) % len(edge)])

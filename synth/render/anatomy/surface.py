@@ -1,8 +1,7 @@
 """The exposed cortex: relief, vessels and the fine surface that is loaded, moved and rendered.
 
-The surface is a height field over the opening and a margin under its rim: arachnoid bridges the sulci, and
-what lies deeper is never in view. Shares and widths of relief were chosen by eye against an intra-operative
-photograph.
+The surface is a height field over the opening and a margin under its rim: the arachnoid bridges the sulci and
+hides what lies deeper. Shares and widths of the relief were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -26,59 +25,47 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 MARGIN_MM = 5.0
-"""Reach under the rim: no drawn tilt or pull shows the patch's edge."""
+"""Extent under the rim, so that no drawn tilt or pull reveals the patch's edge."""
 LEAST_FILLED = 0.65
-"""Share of the patch under which a user's brain must have surface."""
+"""Least share of the patch that a user's brain has to fill."""
 _RELIEF_PX = 512
 _BULGE_PX = 1024
-_BED = 0.5  # of a sulcus's depth that a vein of 0.8 mm lies in wherever it runs
+_BED = 0.5  # depth of the groove under a vein of 0.8 mm radius, as a share of a sulcus's
 _ROUND = 1.2  # 1: gyri are half waves; more: narrower clefts between flatter crowns
 
 
 @dataclass(frozen=True)
 class Relief:
-    """What is drawn for one anatomy."""
+    """Relief of one anatomy, as drawn."""
 
-    seed: int
-    """Seed of the folds, vessels and stains."""
-    gyrus_mm: float
-    """Spacing of the gyri."""
-    sulcus_mm: float
-    """Depth of the sulci as seen from outside."""
+    seed: int  # seed of the folds, vessels and stains
+    gyrus_mm: float  # spacing of the gyri
+    sulcus_mm: float  # visible depth of the sulci
 
 
 @dataclass(frozen=True)
 class CortexSurface:
-    """The fine surface at rest, in world axes, and what is on it."""
+    """The fine surface at rest, in world axes, with its chart, sulci and vessels."""
 
-    vertices: Floats
-    """(V, 3) mm."""
-    faces: npt.NDArray[np.int32]
-    """(F, 3), counter-clockwise seen from outside."""
-    uv: npt.NDArray[np.float32]
-    """(V, 2): place on the chart, from 0 to 1."""
-    pia: Floats
-    """(n, n) mm, height at the vertices without vessels; rows go with y, columns with x."""
-    extent_mm: float
-    """Side of the square patch."""
-    chart: Chart
-    """The square that sulci, vessels and every map lie on."""
-    sulci: Map
-    """(n, n) 0 on the crown of a gyrus to 1 in a sulcus."""
-    vessels: Vessels
-    """Nodes in mm from the chart's middle."""
-    seed: int
-    """Seed of everything else that belongs to this anatomy."""
+    vertices: Floats  # (V, 3) mm
+    faces: npt.NDArray[np.int32]  # (F, 3), counter-clockwise from outside
+    uv: npt.NDArray[np.float32]  # (V, 2): place on the chart, from 0 to 1
+    pia: Floats  # (n, n) mm, height at the vertices without vessels; rows go with y, columns with x
+    extent_mm: float  # side of the square patch
+    chart: Chart  # the square that sulci, vessels and every map lie on
+    sulci: Map  # (n, n) 0 on the crown of a gyrus to 1 in a sulcus
+    vessels: Vessels  # nodes in mm from the chart's middle
+    seed: int  # seed of everything else that belongs to this anatomy
 
 
 def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = None) -> CortexSurface:
     """A cortex under the opening, with veins that stand out of it.
 
     Args:
-        relief: what the job drew; a user's own folds stand in for its relief.
+        relief: as drawn; a user's brain has folds of its own.
         anatomy: the job's section.
-        brain: a user's, z out of it, origin at the craniotomy's centre; any winding, holes and duplicates
-            allowed. None: winding gyri on a dome.
+        brain: a user's, z outwards, origin at the craniotomy's centre; any winding, holes and duplicates
+            allowed. None: random gyri on a dome.
 
     Raises:
         UserError: there is no surface under the opening.
@@ -137,12 +124,12 @@ def _dome(xy: Floats, radius: float) -> Floats:
 
 
 def _folds(relief: Relief, extent_mm: float) -> Map:
-    """Sulci (n, n) from 0 to 1: the zero lines of band-passed noise, each about a gyrus from the next."""
+    """Sulci (n, n) from 0 to 1: zero lines of band-passed noise, about a gyrus apart."""
     rng = np.random.default_rng([relief.seed, 0])
     # Zero lines of noise lie half a wavelength apart.
     waves = noise.band(rng, _RELIEF_PX, extent_mm, 2 * relief.gyrus_mm, 0.22)
     waves = waves + 0.12 * noise.band(rng, _RELIEF_PX, extent_mm, 0.7 * relief.gyrus_mm, 0.3)
-    # Of a sine of that length these two have the same amplitude: |sin| is a row of cushions between clefts.
+    # For a sine of that wavelength both have the same amplitude: |sin| is a row of cushions between clefts.
     away = np.abs(waves)
     slope = np.hypot(*np.gradient(waves, extent_mm / _RELIEF_PX)) * relief.gyrus_mm / np.pi
     slope = noise.blur(slope.astype(np.float32), 0.5, extent_mm)
@@ -152,22 +139,22 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
 
 
 def _beds(veins: Tree, extent_mm: float) -> Map:
-    """What wide veins press into a gyrus where they leave its clefts, (n, n) from 0 to 1 as the sulci."""
+    """Grooves of wide veins where they cross a gyrus, (n, n) from 0 to 1 as the sulci."""
     distance, radius = tube.raster(veins, _RELIEF_PX, extent_mm)
     bed = _BED * np.clip(radius / 0.8, 0, 1) * np.exp(-((distance / 1.8) ** 2))
     return noise.blur(bed.astype(np.float32), 0.3, extent_mm)
 
 
 def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
-    """Height (n, n) mm of a brain as the arachnoid bridges it, and its sulci (n, n) from 0 to 1."""
+    """Height (n, n) mm of the arachnoid over a brain, and its sulci (n, n) from 0 to 1."""
     height = _height_map(brain, extent, _RELIEF_PX // 2)
     if np.isnan(height).mean() > 1 - LEAST_FILLED:
         raise UserError(
             "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
-            "mesh finds places that work"
+            "mesh finds suitable places"
         )
     height = _filled(height)
-    # The arachnoid bridges what is narrower than itself: a closing, then a smoothing.
+    # The arachnoid bridges narrow clefts: a closing, then a smoothing.
     pixel = extent / len(height)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
     bridged = cv2.morphologyEx(height, cv2.MORPH_CLOSE, disc)
@@ -186,7 +173,7 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
     low = np.ceil(corners.min(axis=1)).astype(np.int64)
     high = np.floor(corners.max(axis=1)).astype(np.int64)
     near = ((high >= 0) & (low < pixels) & (high >= low)).all(axis=1)
-    # Only what faces the opening: the far side of the brain and its base lie deeper than any sulcus.
+    # Without the far side and the base of the brain, which lie deeper than any sulcus.
     near &= vertices[faces][:, :, 2].max(axis=1) > -0.75 * extent
     height = np.full((pixels, pixels), np.nan, np.float32)
     for face in np.flatnonzero(near):
@@ -207,7 +194,7 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
 
 
 def _filled(height: Map) -> Map:
-    """Holes take the height of the nearest pixel that has one."""
+    """Fills holes with the height of the nearest pixel."""
     hole = np.isnan(height)
     if not hole.any():
         return height

@@ -1,8 +1,8 @@
-"""Colour and microstructure of the cortex as maps over its patch, from parenchyma outwards to the wet film.
+"""Colour and microstructure of the cortex as maps over its patch, from the parenchyma up to the wet film.
 
-Sizes are mm, albedos linear RGB; an absorption is the optical depth (natural) of red, green and blue for a
-unit of what lies there. All were chosen by eye against an intra-operative photograph
-(`evidence.render.realism` measures how near).
+Sizes are mm, albedos linear RGB; an absorption is the optical depth (natural) of red, green and blue for one
+unit of the layer's depth map. All were chosen by eye on an intra-operative photograph
+(`evidence.render.realism` compares colours with one).
 """
 
 from __future__ import annotations
@@ -29,85 +29,85 @@ Tubes = dict[str, tuple[Map, Map]]
 Random = np.random.Generator
 
 _TEXELS_A_PIXEL = 2.2
-_NARROW = 2  # power of the sulci's depth that is dark and wet: little is left a millimetre beside a cleft
+_NARROW = 2  # exponent on the sulci's depth map, so that only clefts are dark and wet, not the slopes above
 
 
 @dataclass(frozen=True)
 class Parenchyma:
-    """Two tints in clouds, finely grained, under the blood of the pia and of vessels deeper in."""
+    """Two tints in clouds, finely grained, under the blood of the pia and of vessels below the pia."""
 
     grain: Rgb = (0.5, 1.0, 1.2)  # of `appearance.grain`, in each channel
     pia: Rgb = (0.16, 1.0, 1.3)  # absorption
-    beside: tuple[float, float] = 0.7, 1.1  # blur of arteries and of veins, to which the pia is redder
-    deep: float = 0.16  # blur of what lies under the pia
-    scatter: Rgb = (0.055, 0.032, 0.026)  # blur of what leaves tissue near where it came in, red farthest
+    perivascular: tuple[float, float] = 0.7, 1.1  # blur of arteries and of veins that redden the pia around
+    deep: float = 0.16  # blur of vessels below the pia
+    scatter: Rgb = (0.055, 0.032, 0.026)  # blur by light that travels in tissue, farthest in red
 
 
 @dataclass(frozen=True)
 class Sulcus:
-    """Grey fluid under a haze of arachnoid with whiter strands; little light comes back out of a cleft."""
+    """Grey fluid under hazy arachnoid with whiter strands; a cleft returns little light."""
 
-    fluid: Rgb = (0.50, 0.50, 0.72)  # of a crown's albedo
+    fluid: Rgb = (0.50, 0.50, 0.72)  # of the albedo of gyri
     strands: Rgb = (0.62, 0.52, 0.48)  # albedo
     dark: Rgb = (0.5, 0.75, 0.62)  # absorption
-    depth: tuple[float, float] = 2.4, 1.8  # optical: by the sulcus, and more beyond its half
+    depth: tuple[float, float] = 2.4, 1.8  # optical: by the sulcus's depth, and more beyond half of it
 
 
 @dataclass(frozen=True)
 class Bleeding:
-    """Blood spilt under the arachnoid, ragged and thin at its edges; pairs are ranges."""
+    """Blood under the arachnoid, ragged and thin at its edges; pairs are ranges."""
 
-    count: float = 3.5  # on a patch where the rim is soaked with blood
+    count: float = 3.5  # mean on a patch whose rim is soaked with blood
     radius: tuple[float, float] = 0.4, 1.6
-    depth: tuple[float, float] = 0.3, 0.9
+    depth: tuple[float, float] = 0.3, 0.9  # optical
     blood: Rgb = (0.12, 1.5, 2.3)  # absorption
 
 
 @dataclass(frozen=True)
 class Artery:
-    """Even the finest stop much of the green; a wide one's wall hides what is under it."""
+    """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
     absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
-    opaque: tuple[float, float] = 0.30, 0.16  # depth that the finest have, and the chord that gives 63% of it
+    opaque: tuple[float, float] = 0.30, 0.16  # depth that even fine ones reach, and the chord for 63% of it
     wall: Rgb = (0.7, 0.13, 0.075)  # albedo
-    wide: tuple[float, float] = 0.16, 0.24  # radius from which on a wall hides, and over which it comes
+    wide: tuple[float, float] = 0.16, 0.24  # radius of the first opaque walls, and span to fully opaque ones
 
 
 @dataclass(frozen=True)
 class Vein:
-    """Wine red where thin or seen at its sides, slate along the crest; in a haze that misses its light."""
+    """Dark red where thin and at the sides, bluish along a thick one's crest, in a dark margin of tissue."""
 
     thin: Rgb = (0.50, 0.13, 0.15)  # albedo
-    wide: tuple[float, float] = 0.12, 0.3  # radius from which on it is not thin, and over which that comes
-    haze: float = 0.8
-    missed: Rgb = (0.45, 1.0, 0.75)  # absorption
+    wide: tuple[float, float] = 0.12, 0.3  # radius at which a vein begins to be thick, span to fully thick
+    margin: float = 0.8  # blur
+    margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
 
 
 @dataclass(frozen=True)
 class Film:
-    """Fluid on it all: it climbs beside vessels, evens out what is finer than itself, and swells a little."""
+    """Fluid over everything: it climbs along vessels, smooths finer relief, and undulates a little."""
 
-    climb: float = 0.16  # of a vessel's radius, beside it
-    climb_mm: float = 0.16  # over which that falls off
-    swell_mm: float = 0.004
+    climb: float = 0.16  # of a vessel's radius
+    climb_mm: float = 0.16  # distance over which that falls off
+    swell_mm: float = 0.004  # standard deviation of the undulation
 
 
 def resolution(extent_mm: float, mm_per_px: float) -> int:
-    """Side of a map fine enough for the picture, and no finer."""
+    """Side [texels] of a map that is as fine as the picture needs."""
     return int(np.clip(64 * round(extent_mm / mm_per_px * _TEXELS_A_PIXEL / 64), 128, 4096))
 
 
 def cortex(
     surface: CortexSurface, appearance: Appearance, pixels: int, photo: Path | None, shade: Map | None = None
 ) -> Coat:
-    """Parenchyma, vessels and wet film over the surface's chart.
+    """Maps of parenchyma, vessels and wet film over the surface's chart.
 
     Args:
         surface: the cortex.
         appearance: its appearance.
         pixels: side of the maps.
-        photo: a picture that takes the place of the painted albedo.
-        shade: (m, m) share of light that reaches the surface past what frames it; all of it if not given.
+        photo: a picture that replaces the painted albedo.
+        shade: (m, m) share of light that the rim lets reach the surface; 1 if not given.
 
     Raises:
         UserError: the photograph cannot be read.
@@ -118,7 +118,6 @@ def cortex(
         name: tube.raster(getattr(surface.vessels, name), pixels, extent)
         for name in ("veins", "arteries", "deep")
     }
-    # Light and blood tell the clefts from the slopes above them.
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
@@ -150,7 +149,7 @@ def _tilt(dx: Map, dy: Map, normal: Map) -> None:
 
 
 def thickness(tube: tuple[Map, Map]) -> Map:
-    """Chord through a round vessel, seen from above, (n, n) mm, of its distance and radius maps."""
+    """Vertical chord (n, n) mm through round vessels, from their distance and radius maps."""
     distance, radius = tube
     return np.asarray(2 * np.sqrt(np.maximum(radius**2 - distance**2, 0)), np.float32)
 
@@ -159,64 +158,67 @@ def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, exte
     pixels = len(sulci)
     wide = noise.fractal(rng, 256, extent, 12.0, 2.4)
     mottle = noise.fractal(rng, 256, extent, 3.0, 1.3)
-    crown = np.clip(0.62 + 0.42 * wide + 0.04 * mottle, 0, 1)
-    crown = cv2.resize(crown, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
+    pale = np.clip(0.62 + 0.42 * wide + 0.04 * mottle, 0, 1)
+    pale = cv2.resize(pale, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
     grain = noise.fractal(rng, pixels, extent, 0.35, 1.2)
     chords = {name: thickness(drawn) for name, drawn in tubes.items()}
-    beside = noise.blur(chords["arteries"], Parenchyma.beside[0], extent)
-    beside = beside + noise.blur(chords["veins"], Parenchyma.beside[1], extent)
+    around = noise.blur(chords["arteries"], Parenchyma.perivascular[0], extent)
+    around = around + noise.blur(chords["veins"], Parenchyma.perivascular[1], extent)
     bled = _bleedings(rng, appearance.blood, pixels, extent)
     even = cv2.resize(mottle, (pixels, pixels))
     deep = noise.blur(chords["deep"], Parenchyma.deep, extent)
-    tissue = [crown, grain, sulci, beside, even, deep, _strands(rng, sulci, extent), bled]
+    tissue = [pale, grain, sulci, around, even, deep, _strands(rng, sulci, extent), bled]
     veins = _vein_maps(rng, tubes["veins"], extent)
     arteries = [cv2.resize(wide, (pixels, pixels)), *tubes["arteries"]]
     (albedo,) = noise.in_rows(partial(_paint_rows, appearance), *tissue, *veins, *arteries)
-    # Light that enters tissue leaves it nearby, red farthest: a blur stands in for the volume.
+    # Light that enters tissue leaves it nearby: a blur approximates the scattering volume.
     for channel, width in enumerate(Parenchyma.scatter):
         albedo[..., channel] = noise.blur(np.ascontiguousarray(albedo[..., channel]), width, extent)
     return np.asarray(np.clip(albedo, 0.01, 0.95, out=albedo), np.float32)
 
 
 def _paint_rows(appearance: Appearance, *maps: Map) -> tuple[Map]:
-    """Albedo (r, n, 3) of some rows: 6 maps of parenchyma, strands, bleedings, 7 of veins, 3 of arteries."""
+    """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 7 of veins, 3 of arteries."""
     tissue = _with_clefts(appearance, _parenchyma(appearance, *maps[:6]), sulci=maps[2], strands=maps[6])
     veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:15])
     return (_with_arteries(appearance, veined, *maps[15:]),)
 
 
 def _parenchyma(
-    appearance: Appearance, crown: Map, grain: Map, sulci: Map, beside: Map, mottle: Map, deep: Map
+    appearance: Appearance, pale: Map, grain: Map, sulci: Map, around: Map, mottle: Map, deep: Map
 ) -> Map:
-    """Albedo (r, n, 3) under the blood of the pia, most in sulci and beside vessels, and `deep` [mm]."""
+    """Albedo (r, n, 3) under the blood of the pia, most in sulci and `around` vessels, and of `deep` ones.
+
+    `pale`: share of the less perfused tint; `deep`: mm.
+    """
     gyrus, perfused = (
         np.asarray(c, np.float32) for c in (appearance.gyrus_albedo, appearance.perfused_albedo)
     )
-    albedo = over(perfused, gyrus, crown)
+    albedo = over(perfused, gyrus, pale)
     albedo = albedo * (1 + appearance.grain * grain[..., None] * np.array(Parenchyma.grain, np.float32))
-    blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * beside
+    blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * around
     blood = blood * np.clip(1 + 0.3 * mottle, 0.2, 2) + appearance.subpial_absorbance_per_mm * deep
     return through(albedo, blood, Parenchyma.pia)
 
 
 def _with_clefts(appearance: Appearance, albedo: Map, sulci: Map, strands: Map) -> Map:
-    """Albedo (r, n, 3) with fluid, haze and strands of arachnoid over the deepest sulci, and their dark."""
+    """Albedo (r, n, 3) with fluid, haze and strands of arachnoid over the deepest sulci, darkened there."""
     haze = np.clip(0.45 * np.clip((sulci - 0.45) / 0.4, 0, 1) + 0.35 * strands, 0, 0.7)[..., None]
     fluid = np.array(appearance.gyrus_albedo, np.float32) * np.array(Sulcus.fluid, np.float32)
-    milk = fluid + strands[..., None] * (np.array(Sulcus.strands, np.float32) - fluid)
-    albedo = albedo + haze * appearance.sulcus_shading * (milk - albedo)
+    hazy = fluid + strands[..., None] * (np.array(Sulcus.strands, np.float32) - fluid)
+    albedo = albedo + haze * appearance.sulcus_shading * (hazy - albedo)
     depth = Sulcus.depth[0] * sulci + Sulcus.depth[1] * np.clip(sulci - 0.5, 0, 1)
     return through(albedo, appearance.sulcus_shading * depth, Sulcus.dark)
 
 
 def _strands(rng: Random, sulci: Map, extent: float) -> Map:
-    """Share (n, n) of the arachnoid's fibres where it bridges a cleft: thin lines, most of them across it."""
+    """Share (n, n) covered by the arachnoid's fibres over clefts: thin lines."""
     small = 512
     wave = noise.band(rng, small, extent, 1.6, 0.4)
     slope = np.hypot(*np.gradient(wave, extent / small)).astype(np.float32)
     line = ridge(wave / np.maximum(slope, 0.5), width=0.07)
-    over = np.clip((cv2.resize(sulci, (small, small)) - 0.5) / 0.3, 0, 1)
-    return np.asarray(cv2.resize((line * over).astype(np.float32), sulci.shape[::-1]), np.float32)
+    bridged = np.clip((cv2.resize(sulci, (small, small)) - 0.5) / 0.3, 0, 1)
+    return np.asarray(cv2.resize((line * bridged).astype(np.float32), sulci.shape[::-1]), np.float32)
 
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
@@ -234,7 +236,7 @@ def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
 
 
 def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
-    """What `_veined` paints by, each (n, n)."""
+    """The maps (n, n) of `_veined`."""
     distance, radius = tube
     size = distance.shape
     across = np.asarray(np.clip(distance / np.maximum(radius, 1e-3), 0, 1), np.float32)
@@ -243,32 +245,32 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), size)
     streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), size)
     cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.05, extent)
-    halo = noise.blur(((across < 1) * thick).astype(np.float32), Vein.haze, extent)
-    # Not every stretch lies on the surface: some shimmer through the arachnoid.
+    margin = noise.blur(((across < 1) * thick).astype(np.float32), Vein.margin, extent)
+    # Some stretches lie deeper, under the arachnoid.
     depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), size)
-    return [across, thick, along, streak, cover, halo, depth]
+    return [across, thick, along, streak, cover, margin, depth]
 
 
 def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
-    """Albedo (r, n, 3) of some rows with their veins, of the maps of `_vein_maps`."""
-    across, thick, along, streak, cover, halo, depth = maps
-    slate = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.55)
-    slate = np.clip(slate * (1 + 0.12 * streak), 0, 1)[..., None]
+    """Albedo (r, n, 3) of some rows with their veins, by the maps of `_vein_maps`."""
+    across, thick, along, streak, cover, margin, depth = maps
+    crest = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.55)
+    crest = np.clip(crest * (1 + 0.12 * streak), 0, 1)[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
-    wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), slate)
+    wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
     cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
-    return np.asarray(over(through(albedo, 1.7 * halo, Vein.missed), wall, cover), np.float32)
+    return np.asarray(over(through(albedo, 1.7 * margin, Vein.margin_dark), wall, cover), np.float32)
 
 
 def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map, radius: Map) -> Map:
-    """Albedo (r, n, 3) of some rows with their arteries, redder here and paler there."""
+    """Albedo (r, n, 3) of some rows with their arteries, in a red that varies with the noise `wide`."""
     chord = thickness((distance, radius))
     most, soon = Artery.opaque
     reach = most * (1 - np.exp(-chord / soon)) + 0.08 * chord
     fade = np.clip(0.95 + 0.25 * wide, 0.4, 1.2)
     red = through(albedo, appearance.arterial_absorption * reach * fade, Artery.absorption_per_mm)
-    # A wide one's wall scatters light of its own, most along the crest.
+    # The wall of a wide artery scatters light itself, most along the crest.
     start, span = Artery.wide
     thick = np.clip((radius - start) / span, 0, 1) * (distance < radius)
     crest = ridge(distance / np.maximum(0.7 * radius, 1e-3), width=1.0)
@@ -277,26 +279,20 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
 
 
 def _film(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent: float) -> tuple[Map, Map]:
-    """Height of the wet surface above the mesh, and where its film is thin, 0 to 1.
-
-    The film evens out what is finer than itself; it gathers in sulci and leaves crowns and veins bare.
-    """
+    """Height of the wet surface above the mesh [mm], and the share of it under too thin a film, 0 to 1."""
     coarse = 512
     relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
-    relief = noise.blur(relief, appearance.film_smoothing_mm, extent)
+    relief = noise.blur(relief, appearance.fluid_smoothing_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
-    # It lies in pools, in sulci and beside vessels; what is left of it elsewhere mirrors next to nothing.
+    # Fluid lies in pools, in sulci and along vessels; elsewhere the film mirrors next to nothing.
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
-    beside = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
-    wet = (
-        0.9 * cv2.resize(sulci, (coarse, coarse))
-        + 3.2 * np.minimum(beside, 0.25)
-        + 1.6 * appearance.light.glare
-    )
+    around = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
+    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(around, 0.25)
+    wet = wet + 1.6 * appearance.light.glare
     dry = np.clip(3.8 + 1.5 * pools - 3 * wet, 0.05, 1.0)
     swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
-    # The wall of a vein is taut and smooth: its crest mirrors the lamp in one line.
+    # A vein's wall is smooth: its crest mirrors the lamp in one line.
     distance, radius = tubes["veins"]
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
     height = relief + appearance.bump * (1 - 0.9 * on_vein) * swell
@@ -305,7 +301,7 @@ def _film(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent:
 
 
 def _meniscus(tube: tuple[Map, Map]) -> Map:
-    """Height (n, n) mm of the fluid that climbs beside vessels; none on a vessel's crest."""
+    """Height (n, n) mm of the fluid that climbs along vessels; none on a vessel's crest."""
     distance, radius = tube
     beyond = distance - radius
     steep = np.where(beyond > 0, Film.climb_mm, np.maximum(0.3 * radius, 1e-3))
@@ -325,5 +321,5 @@ def _photograph(path: Path, pixels: int) -> Map:
     )
     encoded = square[..., ::-1].astype(np.float32) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    # First row of a map is the lower y.
+    # A map's first row has the lowest y.
     return np.asarray(np.clip(linear[::-1], 0.01, 0.95), np.float32)

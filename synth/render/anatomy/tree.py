@@ -2,7 +2,7 @@
 
 A. Runions, B. Lane, P. Prusinkiewicz, "Modeling trees with a space colonization algorithm", 2007.
 C. D. Murray, "The physiological principle of minimum work", 1926: r^3 of a parent is its children's sum.
-Other numbers were chosen by eye against an intra-operative photograph.
+Other numbers were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -19,20 +19,17 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
 
-_REACH_MM = 9.0  # the farthest attractor that pulls
-_INERTIA = 1.2  # part that a twig keeps of its direction: it bends, and does not turn on the spot
+_REACH_MM = 9.0  # range of an attractor
+_INERTIA = 1.2  # weight of a twig's own direction: it bends rather than turning abruptly
 
 
 @dataclass(frozen=True)
 class Tree:
     """One kind of vessel as segments: each node is joined to its parent, which comes before it."""
 
-    nodes: Floats
-    """(N, 2) mm."""
-    parent: Ints
-    """(N,) index of the parent; -1 at a root."""
-    radius: Floats
-    """(N,) mm."""
+    nodes: Floats  # (N, 2) mm
+    parent: Ints  # (N,) index of the parent; -1 at a root
+    radius: Floats  # (N,) mm
 
 
 def grow(
@@ -52,23 +49,23 @@ def grow(
         nodes: (N, 2) mm, where growth starts.
         parent: (N,).
         attractors: (A, 2) mm.
-        buds: (N,) which of the given nodes may sprout; everything grown may.
+        buds: (N,) which of these nodes may sprout; new ones all may.
         step: length of a segment [mm].
-        kill: an attractor this near is used up [mm].
+        kill: distance within which an attractor is used up [mm].
         wander: random part of a step's direction, as a share.
-        rng: where the wandering comes from.
+        rng: source of that part.
 
     Returns:
-        All nodes (M, 2) and parents (M,), the given ones first.
+        All nodes (M, 2) and parents (M,), those at the start first.
     """
     all_nodes, all_parent = [nodes], [parent]
     distance, nearest = cKDTree(nodes[buds]).query(attractors)
     nearest = np.flatnonzero(buds)[nearest]
-    # What lies beside a trunk is already supplied, bud or no bud.
+    # A trunk supplies what is next to it, also where it has no bud.
     distance = np.where(cKDTree(nodes).query(attractors)[0] < kill, 0.0, distance)
     total = len(nodes)
     children = np.bincount(parent[parent >= 0], minlength=total)
-    heading = np.zeros((total, 2))  # of what is grown here; a given node sprouts to any side
+    heading = np.zeros((total, 2))  # of new nodes; those at the start sprout to any side
     for _ in range(int(4 * _REACH_MM / step) + 400):
         keep = distance > kill
         attractors, distance, nearest = attractors[keep], distance[keep], nearest[keep]
@@ -85,7 +82,7 @@ def grow(
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
         direction += _INERTIA * heading[pulled] + wander * rng.standard_normal(direction.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        # A node pulled evenly from two sides would sprout the same twig for ever.
+        # A node pulled evenly from two sides would sprout the same twig again and again.
         free = children[pulled] < 3
         stuck = np.isin(nearest, pulled[~free])
         if stuck.any():
@@ -132,7 +129,7 @@ def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
 
 
 def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floats, Ints]:
-    """Nodes (N, 2) mm and parents (N,), without side twigs of fewer than `shortest` nodes: they look cut."""
+    """Nodes (N, 2) mm and parents (N,), without side twigs of fewer than `shortest` nodes."""
     links = parent.tolist()
     reach = [1] * len(links)
     for node in range(len(links) - 1, -1, -1):
@@ -143,9 +140,9 @@ def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floa
         up = links[node]
         side_twig = up < fixed or reach[node] + 1 < reach[up]
         keep[node] = keep[up] and not (side_twig and reach[node] < shortest)
-    kept = np.flatnonzero(keep)
     number = np.cumsum(keep) - 1
-    return nodes[kept], np.where(parent[kept] >= 0, number[parent[kept]], -1)
+    parent = parent[keep]
+    return nodes[keep], np.where(parent >= 0, number[parent], -1)
 
 
 def scattered(
@@ -156,7 +153,7 @@ def scattered(
     Args:
         extent_mm: side of the square.
         spacing: of the points [mm].
-        rng: where they come from.
+        rng: source of the points.
         density: (m, m) share of the points that stay; all of them if not given.
     """
     side = max(1, int(extent_mm / spacing))
@@ -168,7 +165,7 @@ def scattered(
 
 
 def relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:
-    """Nodes (N, 2) mm, those after the first `fixed` drawn to their neighbours: that rounds off the steps."""
+    """Nodes (N, 2) mm, those after the first `fixed` smoothed towards their neighbours."""
     has = np.flatnonzero(parent >= 0)
     for _ in range(rounds):
         total, count = np.zeros_like(nodes), np.zeros(len(nodes))

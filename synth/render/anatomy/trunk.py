@@ -1,6 +1,6 @@
-"""Trunks of vessels: smooth paths across the patch that keep to the sulci.
+"""Trunks of vessels: smooth paths across the patch that follow the sulci.
 
-What a path costs, and how widths and bends vary, was chosen by eye against an intra-operative photograph.
+Costs of a path, and variations of widths and bends, were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Map = npt.NDArray[np.float32]
 
-_SHORTEST = 8  # steps of a path that is worth a vessel: it joins another before it gets anywhere
+_SHORTEST = 8  # steps of a path: a shorter one joins another vessel at once and is dropped
 
 
 def trunks(
@@ -39,12 +39,12 @@ def trunks(
     Args:
         sulci: (n, n) 0 on a crown to 1 in a sulcus.
         extent_mm: side of the square.
-        rng: where the anatomy comes from.
+        rng: of the anatomy.
         count: number of trunks.
-        radius: between which a trunk's own radius is drawn [mm].
+        radius: range of a trunk's radius [mm].
         smooth: rounds of smoothing; thick vessels bend in wider curves.
         wiggle: share of short bends in the path.
-        settle: mm by which a round of smoothing also draws the path into the cleft beside it.
+        settle: mm by which a round of smoothing also moves the path into the nearest cleft.
     """
     side = 72
     depth = cv2.resize(sulci, (side, side), interpolation=cv2.INTER_AREA)
@@ -75,7 +75,7 @@ def trunks(
             line = line + np.exp(-along / (0.1 * extent_mm))[:, None] * (nodes[root] - line[0])
             own = min(own, rng.uniform(0.6, 0.85) * radii[root])
         taper = np.linspace(1.0, rng.uniform(0.55, 0.85), len(line))
-        # No vessel is as wide as itself a few millimetres on.
+        # A vessel's width varies along it.
         swell = 1 + 0.1 * noise.sample(noise.band(rng, 128, extent_mm, 6.0, 0.5), line, extent_mm)
         parents = np.concatenate([parents, [root], np.arange(len(line) - 1) + len(nodes)])
         nodes = np.concatenate([nodes, line])
@@ -84,9 +84,9 @@ def trunks(
 
 
 def _joined(line: Floats, nodes: Floats, near: float) -> tuple[Floats, int]:
-    """The part of a path up to earlier nodes, from there on, and which it meets; all of it and -1 if none.
+    """The part of a path from where it meets earlier nodes, and that node's index; else all of it and -1.
 
-    Of the path's two ends the one that runs longer before it meets them is kept.
+    Of the path's two free ends the longer one remains.
     """
     if not len(nodes):
         return line, -1
@@ -103,7 +103,7 @@ def _joined(line: Floats, nodes: Floats, near: float) -> tuple[Floats, int]:
 def meander(
     rng: np.random.Generator, points: Floats, extent_mm: float, amplitude: float, wiggle: float
 ) -> Floats:
-    """A smooth random shift of points (n, 2) mm: no vessel runs straight; `wiggle` is its short part."""
+    """A smooth random shift (n, 2) mm of points (n, 2) mm; `wiggle` is the share of short bends."""
     shifts = []
     for _ in range(2):
         long = noise.band(rng, 128, extent_mm, 9.0, 0.3)

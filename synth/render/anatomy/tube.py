@@ -1,4 +1,4 @@
-"""Vessels drawn onto maps: distance to the nearest centre line, and how wide that vessel is."""
+"""Maps of vessels: distance to the nearest centre line, and that vessel's radius."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
     which = np.repeat(np.arange(len(child)), count)
     step = (np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)) / (count[which] - 1)
     points = start[which] + step[:, None] * (end - start)[which]
-    # A twig is no wider where it leaves its trunk than further on.
+    # A twig is not as wide as its trunk where it branches off.
     first = np.minimum(tree.radius[tree.parent[child]], 1.3 * tree.radius[child])
     radii = first[which] * (1 - step) + tree.radius[child][which] * step
     pixel = np.floor((points / extent_mm + 0.5) * pixels).astype(np.int64)
@@ -36,7 +36,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
     pixel, radii = pixel[inside], radii[inside].astype(np.float32)
     distance = np.full((pixels, pixels), np.float32(extent_mm))
     radius = np.zeros((pixels, pixels), np.float32)
-    # Where a twig leaves a trunk the nearest line may be the twig's: one class of width at a time.
+    # Where a twig branches off, the nearest line may be the twig's: one class of width at a time.
     edges = np.geomspace(radii.min() * 0.999, radii.max() * 1.001, 4) if len(radii) else np.zeros(1)
     for low, high in itertools.pairwise(edges):
         own = (radii >= low) & (radii < high)
@@ -55,7 +55,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
 
 @vectorised
 def _deepen(away: Map, label: Labels, table: Map, scale: np.float32, distance: Map, radius: Map) -> None:
-    """Puts vessels of width table[label] mm, `away` texels from their lines, over shallower ones."""
+    """Draws vessels of radius table[label] mm, `away` texels from their lines, over shallower ones."""
     for y in range(away.shape[0]):
         for x in range(away.shape[1]):
             there, width = away[y, x] / scale, table[label[y, x]]

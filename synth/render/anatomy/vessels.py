@@ -21,17 +21,17 @@ _PATCH_MM = 34.0  # side of the patch that `Kind.trunks` are counted on
 
 @dataclass(frozen=True)
 class Kind:
-    """How one kind of vessel grows; lengths in mm, chosen by eye against an intra-operative photograph."""
+    """Growth of one kind of vessel; lengths in mm, chosen by eye on an intra-operative photograph."""
 
-    trunks: tuple[int, int]  # from, and below
+    trunks: tuple[int, int]  # least number, and one more than the largest
     radius: tuple[float, float]  # of a trunk
-    smooth: int  # rounds over a trunk
+    smooth: int  # rounds of smoothing over a trunk
     wiggle: float  # share of a trunk's short bends
     spacings: tuple[float, ...]  # of the branches of each round
     leaf: float  # radius of the finest: Murray's law gives the others'
     wander: float  # random part of a step's direction
-    settle: float = 0.0  # by which a round of smoothing draws a trunk into its cleft
-    winding: float = 0.0  # amplitude
+    settle: float = 0.0  # shift of a trunk into its cleft, per round of smoothing
+    winding: float = 0.0  # amplitude of bends
 
 
 VEINS = Kind((1, 4), (0.55, 1.2), 60, 0.0, (9.0, 5.5), 0.1, 0.3, settle=0.1)
@@ -45,8 +45,7 @@ class Vessels:
 
     veins: Tree
     arteries: Tree
-    deep: Tree
-    """Under the pia, seen through the tissue."""
+    deep: Tree  # below the pia, visible through the tissue
 
 
 def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
@@ -55,11 +54,11 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     Args:
         sulci: (n, n) depth below the gyri, 0 on a crown to 1 in a sulcus.
         extent_mm: side of the square that the map covers.
-        rng: where the anatomy comes from.
+        rng: of the anatomy.
     """
     veins = _tree(VEINS, _trunks(VEINS, sulci, extent_mm, rng), extent_mm, rng)
     trunks = _trunks(ARTERIES, sulci, extent_mm, rng)
-    # No gyrus has as dense a web as the next, and a wide vein has none.
+    # The density of arteries varies between gyri, and is 0 on a wide vein.
     rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
     distance, width = tube.raster(veins, 128, extent_mm)
     rich = np.clip(rich, 0.3, 1.0) * ((distance > width + 0.3) | (width < 0.3))
@@ -77,7 +76,7 @@ def _trunks(kind: Kind, sulci: Map, extent_mm: float, rng: np.random.Generator) 
 def _tree(
     kind: Kind, trunks: Trunks, extent_mm: float, rng: np.random.Generator, density: Map | None = None
 ) -> Tree:
-    """Branches from the trunks, of their own radii, then finer ones from those: a round a spacing."""
+    """A tree from trunks and their radii: branches, then finer ones from those, a round per spacing."""
     (nodes, parent), own = trunks
     fixed = len(nodes)
     for spacing in kind.spacings:
@@ -109,14 +108,14 @@ def _tree(
 def _wound(
     rng: np.random.Generator, nodes: Floats, radius: Floats, extent_mm: float, amplitude: float
 ) -> Floats:
-    """Shift (N, 2) mm that makes vessels wind in bends of a millimetre or two, the wide ones less."""
+    """Shift (N, 2) mm that winds vessels in bends of one or two millimetres, wide ones less."""
     bends = [noise.sample(noise.band(rng, 256, extent_mm, 1.7, 0.35), nodes, extent_mm) for _ in range(2)]
     stiff = 1 / (1 + (radius / _STIFF_MM) ** 2)
     return np.asarray(amplitude * stiff[:, None] * np.stack(bends, axis=1), np.float64)
 
 
 def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """A random share of nodes, and one at least: short trunks have few."""
+    """A random share of nodes, at least one."""
     buds = rng.random(count) < share
     buds[count // 2] |= not buds.any()
     return np.asarray(buds)

@@ -1,1 +1,1 @@
-"""How it looks: families of colour and wetness, lamps, reflections."""
+"""Appearance of a sequence: families of colour and wetness, lamps, reflections."""

@@ -15,7 +15,7 @@ class Ranges:
     """Middle colours (linear RGB) and ranges of the quantities in `appearance.Appearance`, in drawing order.
 
     Defaults are those of healthy cortex. Chosen by eye on intra-operative photographs;
-    `evidence.render.realism` measures colours against one.
+    `evidence.render.realism` compares colours with one.
     """
 
     gyrus_albedo: Colour = (0.95, 0.79, 0.49)
@@ -27,7 +27,7 @@ class Ranges:
     pial_absorbance: Ends = (0.3, 0.9)
     sulcus_shading: Ends = (0.3, 0.6)
     grain: Ends = (0.008, 0.02)
-    film_smoothing_mm: Ends = (0.035, 0.06)
+    fluid_smoothing_mm: Ends = (0.035, 0.06)
     bump: Ends = (0.8, 1.3)
     roughness: Ends = (0.012, 0.02)
     dry_roughness: Ends = (0.22, 0.34)
@@ -59,7 +59,7 @@ FAMILIES: dict[Family, Ranges] = {
         subpial_absorbance_per_mm=(0.6, 1.2),
         pial_absorbance=(0.1, 0.4),
         sulcus_shading=(0.2, 0.4),
-        film_smoothing_mm=(0.04, 0.07),
+        fluid_smoothing_mm=(0.04, 0.07),
         bump=(0.7, 1.1),
         blood=(0.1, 0.45),
         dura_albedo=(0.88, 0.7, 0.62),
@@ -74,7 +74,7 @@ FAMILIES: dict[Family, Ranges] = {
         subpial_absorbance_per_mm=(0.9, 1.5),
         pial_absorbance=(0.3, 0.7),
         sulcus_shading=(0.1, 0.25),
-        film_smoothing_mm=(0.07, 0.12),
+        fluid_smoothing_mm=(0.07, 0.12),
         bump=(0.4, 0.8),
         blood=(0.2, 0.6),
         dura_albedo=(0.87, 0.64, 0.55),
@@ -89,7 +89,7 @@ FAMILIES: dict[Family, Ranges] = {
         subpial_absorbance_per_mm=(0.4, 0.9),
         pial_absorbance=(0.3, 0.8),
         sulcus_shading=(0.4, 0.7),
-        film_smoothing_mm=(0.03, 0.05),
+        fluid_smoothing_mm=(0.03, 0.05),
         bump=(1.0, 1.7),
         blood=(0.0, 0.04),
         dura_albedo=(0.66, 0.54, 0.44),

@@ -1,4 +1,4 @@
-"""The microscope's lamps: two windows next to its lens, near enough to the axis that shadows are short.
+"""The microscope's lamps: two windows next to its lens, so near to the axis that shadows are short.
 
 Their angles and the spot's fall-off were chosen by eye; no microscope was measured.
 """
@@ -19,45 +19,36 @@ Map = npt.NDArray[np.float32]
 
 _APART = 2.2  # between the lamps, round the optical axis [rad]
 _STEEPEST_DEG = 6.5
-_FADE = 0.6  # widths of the field over which the spot ends
+_FADE = 0.6  # widths of the field over which the spot fades
 _RAYS = 65  # across a picture
-_WINDOW_DEG = 0.7  # radius of a lamp's window, seen from the tissue
+_WINDOW_DEG = 0.7  # angular radius of a lamp's window at the tissue
 
 
 @dataclass(frozen=True)
 class Lighting:
     """Light of one sequence."""
 
-    glare: float
-    """0 few highlights to 1 many."""
-    mirror_deg: float
-    """Slope that mirrors the main lamp into the lens, if the lamp stays beside it; not with `tilt_deg`."""
-    tilt_deg: float | None
-    """Angle between main lamp and optical axis, if the job sets one."""
-    azimuth_deg: float
-    """Which side the lamp is on: of the optical axis's own tilt, or of the picture with `tilt_deg`."""
-    main: float
-    """Share of the light that comes from the main lamp."""
+    glare: float  # 0 few highlights to 1 many
+    mirror_deg: float  # slope that mirrors the main lamp into the lens; unused with `tilt_deg`
+    tilt_deg: float | None  # angle between main lamp and optical axis, if the job sets one
+    azimuth_deg: float  # of the lamp, from the optical axis's tilt, or in the picture with `tilt_deg`
+    main: float  # share of the light that comes from the main lamp
     power: float
-    kelvin: float
-    """Colour temperature."""
-    even: float
-    """Radius of the even spot, in widths of the field."""
-    drift: float
-    """Largest change of power over the sequence."""
-    phase: float
-    """Where in its slow wave the drift begins [rad]."""
+    kelvin: float  # colour temperature
+    even: float  # radius of the even spot, in widths of the field
+    drift: float  # largest change of power over the sequence
+    phase: float  # of the drift's slow wave in the rest frame [rad]
 
     def gain(self, part: float) -> float:
-        """Power at a part (0 to 1) of the sequence, against that of the rest frame."""
+        """Power at a part (0 to 1) of the sequence, relative to the rest frame."""
         return 1 + self.drift * 0.5 * float(np.sin(self.phase + np.pi * part) - np.sin(self.phase))
 
 
 def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
-    """Lamps that together give a white surface in the opening a radiance of about 1."""
+    """The lamps, which together give a white surface in the opening a radiance of about 1."""
     colour = blackbody(lighting.kelvin)
     distance = float(np.linalg.norm(camera.centre))
-    # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is not square to it.
+    # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is at an angle to it.
     total = lighting.power * np.pi * distance**2
     window = distance * float(np.tan(np.deg2rad(_WINDOW_DEG)))
     made = []
@@ -69,14 +60,14 @@ def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
 
 
 def spot(camera: Camera, rest: Camera, lighting: Lighting) -> Map:
-    """Share (H, W) of the lamps' light that reaches what each pixel of a camera sees at the opening's height.
+    """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening.
 
-    Even in the middle and fading outside; it moves with the microscope at `rest`.
+    Even in the middle and fading outside; fixed to the microscope's pose `rest`.
     """
     field = rest.size[0] * rest.mm_per_px
     axis = rest.centre / np.linalg.norm(rest.centre)
     width, height = camera.size
-    # A smooth field: some rays are enough.
+    # A smooth field: a coarse grid of rays is enough.
     columns, rows = (np.linspace(0, n - 1, _RAYS) for n in (width, height))
     x, y = np.meshgrid((columns - camera.K[0, 2]) / camera.K[0, 0], (rows - camera.K[1, 2]) / camera.K[1, 1])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ camera.rotation

@@ -1,8 +1,8 @@
-"""What polished steel mirrors: the wound below it, a dark theatre with its lamps, the microscope's windows.
+"""Reflections in polished steel: of the wound, a dark theatre with its lamps, the microscope's windows.
 
-It is evaluated at vertices, with the finish as a blur: a renderer's own reflection of small bright lamps is
-grain at few paths a pixel, and the rest of the theatre lights nothing else. Reflectances and the theatre's
-radiances (1: white that fills the sensor) were chosen by eye; no instrument or theatre was measured.
+They are evaluated at vertices, blurred by the finish: a path tracer's reflection of small bright lamps is
+noise at few paths a pixel, and the theatre lights nothing else. Reflectances and the theatre's radiances (1:
+white that fills the sensor) were chosen by eye; no instrument or theatre was measured.
 """
 
 from __future__ import annotations
@@ -25,59 +25,50 @@ _TINT = np.array([1.0, 0.985, 0.96])
 _DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.16, 0.17, 0.18])
 _LAMPS = 7
 _FINISH = 0.30  # GGX alpha of machined steel
-_FADE_MM = 22.0  # from the opening's middle, where the wound ends and drapes begin
+_FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 
 
 @dataclass(frozen=True)
 class Theatre:
-    """What is around the instruments."""
+    """Surroundings that the instruments reflect."""
 
-    wound: Map
-    """(n, n, 3) linear colour of cortex and rim, seen from above."""
-    extent_mm: float
-    """Side of the square that it covers."""
-    lamps: tuple[Lamp, ...]
-    """The microscope's."""
-    light: Floats
-    """(3,) colour and power of what lights wound and theatre; 1 is white that just fills the sensor."""
-    seed: int
-    """Of the lamps on the ceiling."""
+    wound: Map  # (n, n, 3) linear colour of cortex and rim, from above
+    extent_mm: float  # side of the square that it covers
+    lamps: tuple[Lamp, ...]  # of the microscope
+    light: Floats  # (3,) colour and power of the light on wound and theatre; 1 is white that fills the sensor
+    seed: int  # of the theatre's lamps
 
 
 def tint(coat: npt.NDArray[np.floating], satin: float) -> Floats:
-    """Diffuse reflectance (V, 3) of steel under a black `coat` (V,), of which a share `satin` is even."""
+    """Diffuse reflectance (V, 3) of steel that scatters a share `satin`, under a black `coat` (V,) 0 to 1."""
     bare, black = satin * _STEEL * _TINT, np.full(3, 0.03)
     return np.asarray(bare + coat[:, None] * (black - bare))
 
 
-def glow(tool: Shape, coat: npt.NDArray[np.floating], eye: Floats, theatre: Theatre) -> Floats:
-    """Radiance (V, 3) that each vertex of a tool mirrors towards the lens at `eye` (3,) mm.
+def glow(tool: Shape, coat: npt.NDArray[np.floating], lens: Floats, theatre: Theatre) -> Floats:
+    """Radiance (V, 3) that the vertices of posed instruments mirror towards the lens at (3,) mm.
 
-    Args:
-        tool: the instruments where they are.
-        coat: (V,) 0 bare to 1 coated black.
-        eye: the lens.
-        theatre: what they mirror.
+    `coat`: (V,) 0 bare to 1 coated black.
     """
     normal = normals(tool)
-    towards = eye - tool.vertices
+    towards = lens - tool.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     mirrored = 2 * facing * normal - towards
     straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
     # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
     share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
-    seen = _surroundings(tool.vertices, mirrored, theatre) * theatre.light
+    mirror = _surroundings(tool.vertices, mirrored, theatre) * theatre.light
     for lamp in theatre.lamps:
-        seen += _window(tool.vertices, normal, towards, lamp)
-    return np.asarray(share * seen)
+        mirror += _window(tool.vertices, normal, towards, lamp)
+    return np.asarray(share * mirror)
 
 
 def _surroundings(place: Floats, direction: Floats, theatre: Theatre) -> Floats:
     """Radiance (N, 3) that arrives at places (N, 3) mm from directions (N, 3)."""
     up = direction[:, 2:]
     below = 1 / (1 + np.exp((up + 0.05) / 0.09))
-    # Where the mirrored ray meets the wound's plane; nearly level ones see drapes.
+    # Intersection of the mirrored ray with the wound's plane; nearly level ones meet drapes.
     steep = np.maximum(-direction[:, 2], 0.05)
     far = np.maximum(place[:, 2], 0.0) / steep
     met = place[:, :2] + far[:, None] * direction[:, :2]
@@ -87,12 +78,12 @@ def _surroundings(place: Floats, direction: Floats, theatre: Theatre) -> Floats:
     lit = 1 / (1 + np.exp(np.clip((np.linalg.norm(met, axis=1) - _FADE_MM) / 3.0, -40, 40)))[:, None]
     ground = lit * 0.8 * wound + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1) ** 0.5
-    room = (1 - high) * _DRAPE + high * _CEILING
-    return np.asarray(below * ground + (1 - below) * (room + _ceiling_lamps(direction, theatre.seed)))
+    above = (1 - high) * _DRAPE + high * _CEILING
+    return np.asarray(below * ground + (1 - below) * (above + _ceiling_lamps(direction, theatre.seed)))
 
 
 def _ceiling_lamps(direction: Floats, seed: int) -> Floats:
-    """Radiance (N, 1) of the theatre's own lamps."""
+    """Radiance (N, 1) of the theatre's lamps."""
     rng = np.random.default_rng([seed, 3])
     total = np.zeros((len(direction), 1))
     for azimuth, height, size, power in zip(
@@ -109,7 +100,7 @@ def _ceiling_lamps(direction: Floats, seed: int) -> Floats:
 
 
 def _window(place: Floats, normal: Floats, towards: Floats, lamp: Lamp) -> Floats:
-    """A microscope's window mirrored by a machined finish, (N, 3): Trowbridge and Reitz's lobe (GGX)."""
+    """Reflection (N, 3) of a microscope's window in a machined finish, by a GGX lobe."""
     way = lamp.position - place
     away2 = np.einsum("nc,nc->n", way, way)
     way /= np.sqrt(away2)[:, None]

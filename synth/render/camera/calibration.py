@@ -1,4 +1,4 @@
-"""Reading a camera calibration that OpenCV wrote: FileStorage YAML or XML, or JSON of either kind."""
+"""Reader of OpenCV camera calibrations: FileStorage YAML or XML, or JSON of either kind."""
 
 from __future__ import annotations
 
@@ -26,20 +26,17 @@ _LENS = (
     "D1",
     "dist",
 )
-_LARGEST = 1e6  # of anything in px or of a lens
+_LARGEST = 1e6  # of any value in px, and of a distortion coefficient
 _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """What a calibrated camera is, for pictures of one size."""
+    """Intrinsics of a calibrated camera, for pictures of one size."""
 
-    K: Floats
-    """(3, 3) px, centre of the top-left pixel at (0, 0)."""
-    distortion: Floats
-    """(5,) k1, k2, p1, p2, k3."""
-    size: tuple[int, int] | None
-    """Width, height of the pictures it was made from, if the file says so."""
+    K: Floats  # (3, 3) px, centre of the top-left pixel at (0, 0)
+    distortion: Floats  # (5,) k1, k2, p1, p2, k3
+    size: tuple[int, int] | None  # width, height of the pictures it was made from, if given
 
     def fitted(self, size: tuple[int, int]) -> Floats:
         """K (3, 3) for pictures of another size with the same field of view.
@@ -52,8 +49,8 @@ class CameraCalibration:
         across, down = size[0] / self.size[0], size[1] / self.size[1]
         if abs(across / down - 1) > 0.01:
             raise UserError(
-                f"render.calibration: made from pictures of {self.size[0]} x {self.size[1]}, "
-                f"render.size {size[0]} x {size[1]} has another shape"
+                f"render.calibration: made from pictures of {self.size[0]} x {self.size[1]}, whose shape "
+                f"differs from render.size {size[0]} x {size[1]}; change render.size"
             )
         K = self.K.copy()
         # Pixel centres, not corners, are whole numbers.
@@ -63,10 +60,10 @@ class CameraCalibration:
 
 
 def read(path: Path) -> CameraCalibration:
-    """The calibration in a file.
+    """Reads the calibration in a file.
 
     Raises:
-        UserError: it cannot be read, or what it holds is no pinhole with Brown-Conrady distortion.
+        UserError: it cannot be read, or is not of a pinhole camera with Brown-Conrady distortion.
     """
     largest, is_json = identity.FILES["render", "calibration"], path.suffix.lower() == ".json"
     try:
@@ -83,7 +80,7 @@ def read(path: Path) -> CameraCalibration:
         or abs(K[0, 1]) > 1e-6 * K[0, 0]
     ):
         raise UserError(
-            f"render.calibration: {path.name}: the camera matrix is not that of a camera without skew"
+            f"render.calibration: {path.name}: the camera matrix has skew, or values out of range"
         )
     lens = _array(path, found, _LENS, "distortion coefficients").ravel()
     if not (np.abs(lens) < _LARGEST).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
@@ -100,7 +97,7 @@ def read(path: Path) -> CameraCalibration:
                 size = (0, 0)
             if min(size) < 1:
                 raise UserError(
-                    f"render.calibration: {path.name}: {wide} and {tall} are no size of a picture"
+                    f"render.calibration: {path.name}: {wide} and {tall} are not a picture's size"
                 )
     return CameraCalibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
 
@@ -115,5 +112,5 @@ def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str)
                 value = np.reshape(value["data"], (int(value["rows"]), -1))
             return np.asarray(value, np.float64)
         except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
-            raise UserError(f"render.calibration: {path.name}: {name} holds no numbers") from None
+            raise UserError(f"render.calibration: {path.name}: {name} is not a matrix of numbers") from None
     raise UserError(f"render.calibration: {path.name}: holds no {what} (looked for {', '.join(names)})")

@@ -1,4 +1,4 @@
-"""The microscope camera: one model for rays, truth, flow and bench.
+"""The microscope camera: one model for rays, ground truth, flow and bench.
 
 OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3), the centre
 of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera calibration", 1971.
@@ -18,26 +18,20 @@ from synth.render.camera import calibration
 Floats = npt.NDArray[np.float64]
 
 _NEWTON = 20
-_BORDER = 65  # places on a side of the picture
+_BORDER = 65  # points on a side of the picture
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """How the microscope looks at the craniotomy in one sequence."""
+    """Pose and field of the microscope in one sequence."""
 
-    field_mm: float
-    """Width of the field of view at the craniotomy [mm]; a calibration's, where there is one."""
+    field_mm: float  # width of the field of view at the craniotomy [mm]; a calibration's, where there is one
     working_distance_mm: float
-    tilt_deg: float
-    """Angle between the optical axis and the craniotomy's normal."""
-    azimuth_deg: float
-    """Towards which side the axis tilts."""
-    roll_deg: float
-    """Turn of the picture about the optical axis."""
-    focus_mm: float
-    """Distance of the plane in focus beyond the craniotomy's centre."""
-    off_centre: tuple[float, float] = (0.0, 0.0)
-    """Principal point from the middle of the picture, in its widths; x, y. Likewise."""
+    tilt_deg: float  # angle between the optical axis and the craniotomy's normal
+    azimuth_deg: float  # direction of that tilt
+    roll_deg: float  # rotation of the picture about the optical axis
+    focus_mm: float  # distance of the plane in focus beyond the craniotomy's centre
+    off_centre: tuple[float, float] = (0.0, 0.0)  # principal point from the picture's middle, in its widths
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ def place(view: CameraView, render: RenderSection) -> Camera:
     backward = np.array(
         [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)], dtype=np.float64
     )
-    # Any axis across the view serves to start from; roll makes it uniform.
+    # Any axis across the view is a start; roll makes the orientation uniform.
     right = np.cross([0.0, 1.0, 0.0], backward)
     right /= np.linalg.norm(right)
     up = np.cross(backward, right)
@@ -106,15 +100,15 @@ def place(view: CameraView, render: RenderSection) -> Camera:
 
 
 def calibrated(view: CameraView, lens: Camera) -> CameraView:
-    """The view with the field and principal point of a calibrated lens that `place` put there."""
+    """The view with the field and principal point of the calibrated lens that `place` returned for it."""
     width, _ = lens.size
     x, y = (lens.K[:2, 2] - (np.array(lens.size) - 1) / 2) / width
     field_mm = float(width * view.working_distance_mm / lens.K[0, 0])
     return replace(view, field_mm=field_mm, off_centre=(float(x), float(y)))
 
 
-def seen_radius(camera: Camera) -> float:
-    """Radius [mm] of the largest circle about the craniotomy's centre, in its plane, that is in the picture.
+def visible_radius(camera: Camera) -> float:
+    """Radius [mm] of the largest circle around the craniotomy's centre, in its plane, that is in the picture.
 
     Raises:
         UserError: as `rays`.
@@ -124,19 +118,19 @@ def seen_radius(camera: Camera) -> float:
     edge = np.array(across + [(y, x) for x, y in across])
     pixels = edge * (width, height) + 0.5 * np.array([width - 1, height - 1])
     away = rays(camera, pixels) @ camera.rotation
-    # A ray that doesn't come down to the plane meets it very far away.
+    # A ray that does not come down to the plane meets it very far away.
     met = camera.centre - away * (camera.centre[2] / np.minimum(away[:, 2], -1e-9))[:, None]
     return float(np.hypot(met[:, 0], met[:, 1]).min())
 
 
 def refuse_unfit(render: RenderSection) -> None:
-    """UserError for a calibration that can't be read, or was made from pictures of another shape."""
+    """Raises UserError for a calibration that cannot be read or was made from pictures of another shape."""
     if render.calibration is not None:
         calibration.read(render.calibration).fitted(render.size)
 
 
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:
-    """The second lens of a stereo pair, to the right; its picture is shifted to show the same field."""
+    """The right camera of a stereo pair; its principal point is shifted so that both show the same field."""
     K = camera.K.copy()
     K[0, 2] += K[0, 0] * baseline_mm / camera.translation[2]
     return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
@@ -191,13 +185,10 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
             return guess
         a, b, c, d = _slope(guess, distortion)
         determinant = a * d - b * c
-        guess = (
-            guess
-            - np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1)
-            / (determinant[:, None])
-        )
+        step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1)
+        guess = guess - step / determinant[:, None]
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
-        raise UserError("render.distortion: this distortion folds the picture over itself")
+        raise UserError("render.distortion: folds the picture over itself; choose smaller coefficients")
     return guess
 
 

@@ -1,4 +1,4 @@
-"""Slow drift of the microscope on its stand: a camera for every moment."""
+"""Slow drift of the microscope on its stand: its camera at any time."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ Floats = npt.NDArray[np.float64]
 
 _SLOW_HZ = (0.05, 0.25)
 _WAVES = 3
-_TURN = 0.002  # rad of turn about each axis that go with a shift of 1 mm
+_TURN = 0.002  # rad of rotation about each axis per mm of shift
 
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """How the microscope moves in one sequence; it is in its place in the rest frame."""
+    """Drift of the microscope in one sequence, from its pose in the rest frame."""
 
-    drift_mm: float
-    """Largest slow shift from there, about."""
+    drift_mm: float  # largest shift, approximately
     seed: int
 
     def at(self, camera: Camera, seconds: float) -> Camera:
@@ -30,11 +29,11 @@ class CameraMotion:
             return camera
         shift = self._waves(seconds) * self.drift_mm / np.sqrt(_WAVES)
         turn = _rotation(shift[3:] * _TURN)
-        # The turn is about the craniotomy, so that it stays in view.
+        # The rotation is about the craniotomy, which so stays in view.
         return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])
 
     def _waves(self, seconds: float) -> Floats:
-        """Six random waves (x, y, z and three turns), 0 at time 0."""
+        """Six random waves (x, y, z and three rotations), 0 at time 0."""
         rng = np.random.default_rng([self.seed, 0])
         hertz = rng.uniform(*_SLOW_HZ, (_WAVES, 6))
         phase = rng.uniform(0, 2 * np.pi, (_WAVES, 6))
@@ -43,7 +42,7 @@ class CameraMotion:
 
 
 def _rotation(turn: Floats) -> Floats:
-    """Rodrigues' formula for a small turn (3,) rad."""
+    """Rotation matrix of a rotation vector (3,) rad, by Rodrigues' formula."""
     angle = float(np.linalg.norm(turn))
     if angle < 1e-15:
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""From radiance to the recorded picture: one pure function, in the order light goes through a camera."""
+"""From radiance to the recorded picture: one pure function, in the order of a camera's signal chain."""
 
 from __future__ import annotations
 
@@ -15,40 +15,27 @@ from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 
-_HEADROOM = KNOTS[-1]  # times full scale that the sensor still measures
-_STEPS = 4096  # of the tone curves, over full scale
+_HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
+_STEPS = 4096  # of the tabulated tone curves per full scale
 
 
 @dataclass(frozen=True)
 class CameraSensor:
     """A colour camera on the microscope."""
 
-    exposure: float = 1.0
-    """Share of full scale that radiance 1 fills."""
-    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """White balance: gain of red, green, blue. A channel of less than 1 still reaches full scale."""
-    full_well: float = 12_000.0
-    """Photoelectrons at full scale."""
-    read_noise: float = 12.0
-    """Standard deviation of the readout [electrons]."""
-    bits: int = 12
-    """Of the converter."""
-    vignette: float = 0.15
-    """Share of light lost in the picture's corners."""
-    blur: float = 0.0
-    """Standard deviation of the optics' blur [px]."""
-    bloom: float = 0.03
-    """Share of light that the optics scatter around."""
-    matrix: Matrix = PLAIN.matrix
-    """From balanced sensor colours to the picture's, in linear light; rows that sum to 1 keep white."""
-    curves: Curves = PLAIN.curves
-    """Tone curves of red, green, blue: video levels (1: white, more is cut off) at `KNOTS` of full scale."""
-    sharpening: float = 0.3
-    """Unsharp mask of the video processor, as a share of the detail."""
-    chroma: str = "4:4:4"
-    """Colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0."""
-    coded: bool = False
-    """Whether a codec follows, which thins the colours out itself."""
+    exposure: float = 1.0  # share of full scale that radiance 1 fills
+    white: tuple[float, float, float] = (1.0, 1.0, 1.0)  # white balance: gain of red, green, blue
+    full_well: float = 12_000.0  # photoelectrons at full scale
+    read_noise: float = 12.0  # standard deviation of the readout [electrons]
+    bits: int = 12  # of the converter
+    vignette: float = 0.15  # share of light lost in the picture's corners
+    blur: float = 0.0  # standard deviation of the optics' blur [px]
+    bloom: float = 0.03  # share of light that the optics scatter around
+    matrix: Matrix = PLAIN.matrix  # from balanced sensor colours to the picture's; rows of sum 1 keep white
+    curves: Curves = PLAIN.curves  # tone curves of red, green, blue: video levels at `KNOTS` of full scale
+    sharpening: float = 0.3  # unsharp mask of the video processor, as a share of the detail
+    chroma: str = "4:4:4"  # colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0
+    coded: bool = False  # whether a codec follows, which subsamples colours itself
 
 
 def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
@@ -65,16 +52,16 @@ def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt
     video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
     video = _sharpen(video, sensor.sharpening)
     np.clip(video, 0, 1, out=video)
-    video = video if sensor.coded else _thinned(video, sensor.chroma)
+    video = video if sensor.coded else _subsampled(video, sensor.chroma)
     np.clip(video, 0, 1, out=video)
     video *= np.float32(255)
     return np.rint(video, out=video).astype(np.uint8)
 
 
 def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Map:
-    """What the chip measures of radiance (H, W, 3), white-balanced, 1 at full scale, up to `_HEADROOM`."""
+    """White-balanced signal of the chip for radiance (H, W, 3): 1 at full scale, up to `_HEADROOM`."""
     white = np.asarray(sensor.white, np.float32)
-    # Gains below 1 are taken off the exposure: what fills the sensor has to be white, not short of a colour.
+    # Gains below 1 lower the exposure instead, so that what saturates the sensor is white.
     least = white.min()
     light = radiance * (least * sensor.exposure * _falloff(radiance.shape[:2], sensor.vignette))[..., None]
     if sensor.blur > 0:
@@ -89,10 +76,10 @@ def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator
 
 
 def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
-    """Video levels of balanced light (H, W, 3), `_HEADROOM` at most: a matrix, then a curve a channel.
+    """Video levels of balanced light (H, W, 3), `_HEADROOM` at most: a matrix, then a curve per channel.
 
-    Between knots a curve is monotone (F. N. Fritsch, R. E. Carlson, 1980) over sRGB-encoded light, of which
-    it makes plain sRGB where its levels are `encoded(KNOTS)`. Black is 0.
+    Between knots a curve is monotone (F. N. Fritsch, R. E. Carlson, 1980) over sRGB-encoded light; levels of
+    `encoded(KNOTS)` give plain sRGB. Black is 0.
     """
     video = np.empty(linear.shape, np.float32)
     red, green, blue = (_table(curve) for curve in curves)
@@ -103,7 +90,7 @@ def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
 
 @lru_cache(16)
 def _table(curve: Curve) -> Map:
-    """A tone curve in `_STEPS` a full scale."""
+    """A tone curve, tabulated in `_STEPS` per full scale."""
     levels = encoded(np.linspace(0, _HEADROOM, int(_HEADROOM * _STEPS) + 1))
     curve_of = PchipInterpolator(encoded(np.array([0.0, *KNOTS])), [0.0, *curve])
     return np.asarray(curve_of(levels), np.float32)
@@ -119,9 +106,9 @@ def _convert(
     white: Map,
     noise: Map,
 ) -> None:
-    """Noise, converter of so many `steps` and white balance, up to `most` times full scale.
+    """Noise, converter with `steps` per full scale, and white balance, up to `most` full scales.
 
-    Takes normal `noise` (H, W, 3) and leaves the picture in it.
+    Normal `noise` (H, W, 3) is overwritten by the result.
     """
     zero = np.float32(0)
     for y in range(light.shape[0]):
@@ -134,8 +121,8 @@ def _convert(
                 noise[y, x, k] = min(max(digital * white[k], zero), most)
 
 
-def _thinned(video: Map, chroma: str) -> Map:
-    """Colour at half the resolution across, or across and down."""
+def _subsampled(video: Map, chroma: str) -> Map:
+    """Video with its colour at half the resolution across, or across and down."""
     if chroma == "4:4:4":
         return video
     height, width = video.shape[:2]
@@ -155,7 +142,7 @@ def _falloff(shape: tuple[int, int], vignette: float) -> Map:
 
 
 def _scatter(light: Map, share: float) -> Map:
-    """A narrow halo around bright spots; the light it takes is taken from them."""
+    """Light with a narrow halo around bright spots, at the spots' expense."""
     if share == 0:
         return light
     sigma = light.shape[1] / 200
@@ -166,7 +153,7 @@ def _scatter(light: Map, share: float) -> Map:
 
 @vectorised
 def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: Map) -> None:
-    """A matrix (3, 3) on linear (H, W, 3), and of it curves of `_STEPS` a full scale, into `video`."""
+    """Writes to `video` a matrix (3, 3) on linear (H, W, 3), then tabulated curves."""
     most, steps = np.float32(len(red) - 1.001), np.float32(_STEPS)
     for y in range(linear.shape[0]):
         for x in range(linear.shape[1]):

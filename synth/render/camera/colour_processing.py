@@ -1,4 +1,4 @@
-"""How cameras make colours: a matrix in linear light, then a tone curve a channel."""
+"""Colour processing of cameras: a matrix in linear light, then a tone curve per channel."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Curve = tuple[float, float, float, float, float]
 Curves = tuple[Curve, Curve, Curve]
 
 KNOTS = (0.05, 0.2, 0.5, 1.0, 2.0)
-"""Light, in parts of full scale, at which a tone curve is given."""
+"""Light levels, in full scales, at which tone curves are given."""
 _TO_XYZ = [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
-_SHARE = 0.3  # of the way to a published matrix: what is rendered is sRGB, not what a chip has of it
+_SHARE = 0.3  # of a published matrix's effect: rendered colours are sRGB, not a chip's
 
 
 class ColourProcessing(NamedTuple):
-    """Of one camera."""
+    """Matrix and tone curves of one camera."""
 
     matrix: Matrix
     curves: Curves
@@ -31,25 +31,25 @@ def encoded(linear: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
 
 
 def _saturating(*from_xyz: int) -> Matrix:
-    """Towards the matrix to sRGB that follows from a chip's colours of XYZ (times 10,000, in daylight)."""
+    """`_SHARE` of a chip's matrix to sRGB, from its matrix from XYZ (times 10,000, in daylight)."""
     from_srgb = np.reshape(from_xyz, (3, 3)) @ np.array(_TO_XYZ)
     published = np.linalg.inv(from_srgb / from_srgb.sum(axis=1, keepdims=True))
     red, green, blue = (np.eye(3) + _SHARE * (published - np.eye(3))).round(4).tolist()
     return tuple(red), tuple(green), tuple(blue)
 
 
-# S-curves over sRGB, weak, middle and strong, that spare highlights.
+# S-curves over sRGB that preserve highlights: weak, middle and strong.
 _SOFT, _MIDDLE, _HARD = (
     (0.22, 0.48, 0.76, 0.975, 1.0),
     (0.21, 0.48, 0.77, 0.98, 1.0),
     (0.2, 0.48, 0.79, 0.98, 1.0),
 )
-_FULL = (0.22, 0.52, 0.84, 0.99, 1.0)  # of a channel that is exposed to its shoulder, as red is on tissue
+_FULL = (0.22, 0.52, 0.84, 0.99, 1.0)  # of a channel exposed up to its shoulder, as red is on tissue
 PLAIN = ColourProcessing(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (_MIDDLE,) * 3)
-"""Three chips whose colours need no matrix."""
+"""A camera of three chips, whose colours need no matrix."""
 CAMERAS = (
     PLAIN,
-    # What `synth fit` found on three of five sectors of one intra-operative photograph.
+    # By `synth fit` on three of five sectors of one intra-operative photograph.
     ColourProcessing(
         ((1.13, 0.0, -0.13), (0.0, 0.96, 0.04), (-0.02, 0.01, 1.01)),
         ((0.2, 0.43, 0.71, 0.99, 1.0), (0.21, 0.38, 0.76, 0.99, 1.0), (0.19, 0.46, 0.82, 0.96, 1.0)),
@@ -61,4 +61,4 @@ CAMERAS = (
     ),
     ColourProcessing(_saturating(5271, -712, -347, -6153, 13653, 2763, -1601, 2366, 7242), (_HARD,) * 3),
 )
-"""What a job without `sensor.matrix` and `curves` draws from."""
+"""Cameras that a job without `sensor.matrix` and `sensor.curves` draws from."""

@@ -1,4 +1,4 @@
-"""The video link between camera and recorder: H.264 at a bitrate, there and back."""
+"""The video link between camera and recorder: H.264 at a bitrate, encoded and decoded."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 
 
 def recorded(pictures: Pictures, section: schema.SensorSection, fps: float) -> Pictures:
-    """What a recorder gives back of pictures (T, H, W, 3) sRGB; the same pictures without a bitrate.
+    """Pictures (T, H, W, 3) sRGB after the recorder's codec; the same pictures without a bitrate.
 
-    One thread and no look at the clock: the same bytes every time.
+    Deterministic, since it runs on one thread.
 
     Raises:
-        UserError: the codec refuses pictures of this size or kind.
+        UserError: the codec rejects pictures of this size or kind.
     """
     if section.bitrate_mbps is None:
         return pictures
     import av
 
     height, width = pictures.shape[1:3]
-    # Codecs take even sizes only when they thin out chroma.
+    # With subsampled chroma codecs accept even sizes only.
     padded = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
     buffer = io.BytesIO()
     try:
@@ -43,5 +43,5 @@ def recorded(pictures: Pictures, section: schema.SensorSection, fps: float) -> P
             # Bilinear from subsampled chroma, as players do; the default of nearest leaves blocks.
             back = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     except av.FFmpegError as error:
-        raise UserError(f"sensor.bitrate_mbps: the codec refused this video ({error})") from error
+        raise UserError(f"sensor.bitrate_mbps: the codec rejects this video ({error})") from error
     return np.stack(back)[:, :height, :width]

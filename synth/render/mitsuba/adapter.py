@@ -1,7 +1,7 @@
 """A stage of meshes, lamps and a camera in Mitsuba; vertices are moved in place.
 
-With its lens the only room that knows Mitsuba. The variant is chosen on first use and its
-LLVM found by `synth.system.llvm`: a wrong one ends the process.
+Only this package imports Mitsuba. The variant is chosen on first use; `synth.system.llvm` finds its LLVM,
+since an unsuitable one would crash the process.
 """
 
 from __future__ import annotations
@@ -31,19 +31,16 @@ from synth.system import cache, gpu, llvm
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_REGISTER = 64  # bytes
+_REGISTER = 64  # bytes of a vector register
 
 
 @dataclass(frozen=True)
 class Coat:
-    """Maps of what one body of wet tissue looks like."""
+    """Texture maps of one body of wet tissue."""
 
-    albedo: Map
-    """(n, n, 3) linear reflectance."""
-    normal: Map
-    """(n, n, 3) unit normals in the surface's own frame."""
-    dry: Map
-    """(m, m) share of the surface whose film is too thin to be smooth."""
+    albedo: Map  # (n, n, 3) linear reflectance
+    normal: Map  # (n, n, 3) unit normals in the surface's tangent frame
+    dry: Map  # (m, m) share of the surface under a film too thin to be smooth
 
 
 @dataclass(frozen=True)
@@ -51,72 +48,60 @@ class Wet:
     """A diffuse body under a wet coat."""
 
     coat: Coat
-    roughness: float
-    """GGX alpha of the coat under film."""
-    dry_roughness: float
-    """GGX alpha where there is none."""
-    ambient: Floats
-    """(3,) light from all around, as a white diffuser's radiance: what a wound throws into its shadows."""
-    index: float = 1.33
-    """Refractive index of the coat."""
+    roughness: float  # GGX alpha of the coat under film
+    dry_roughness: float  # GGX alpha where the film is too thin
+    ambient: Floats  # (3,) light scattered into shadows by the wound, as a white diffuser's radiance
+    index: float = 1.33  # refractive index of the coat
 
 
 @dataclass(frozen=True)
 class Metal:
-    """A polished body: what it scatters is the renderer's, what it mirrors is given."""
+    """A polished body, whose reflections are given rather than rendered."""
 
-    tint: Floats
-    """(V, 3) share of light that the finish scatters evenly at vertices."""
-    glow: Floats
-    """(V, 3) radiance that vertices mirror; `Stage.move` renews it."""
+    tint: Floats  # (V, 3) diffuse reflectance at vertices
+    glow: Floats  # (V, 3) mirrored radiance at vertices; `Stage.move` updates it
 
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh and what it is made of."""
+    """A mesh and its material."""
 
-    vertices: Floats
-    """(V, 3) mm."""
+    vertices: Floats  # (V, 3) mm
     faces: npt.NDArray[np.int32]
     uv: npt.NDArray[np.float32]
     material: Wet | Metal
-    film: Floats | None = None
-    """(V,) mm: heights of a film that light sees the vertices under."""
+    film: Floats | None = None  # (V,) mm: height of a film on the vertices, for the normals
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A round window that light leaves."""
+    """A round window that emits light."""
 
-    position: Floats
-    """(3,) mm, its middle."""
-    target: Floats
-    """(3,) mm: what it faces."""
-    radius: float
-    """mm."""
-    intensity: Floats
-    """(3,) radiant intensity towards its target, linear RGB."""
+    position: Floats  # (3,) mm, its middle
+    target: Floats  # (3,) mm: point that it faces
+    radius: float  # mm
+    intensity: Floats  # (3,) radiant intensity towards its target, linear RGB
 
 
-def pick(asked: str) -> str:
-    """The variant that `asked` stands for on this machine.
+def pick(variant: str) -> str:
+    """The variant to use on this machine for `render.variant`.
 
     Raises:
-        UserError: the machine cannot run the one asked for.
+        UserError: the machine cannot run it.
     """
-    if asked == "scalar_rgb":
-        return asked
-    # Kernels are the same for all scenes of a job; the renderer would keep them in the user's home, for ever.
-    with suppress(OSError):  # nowhere to write: compiled anew in every process
+    if variant == "scalar_rgb":
+        return variant
+    # All scenes of a job share kernels; by default Dr.Jit would cache them in the user's home without limit.
+    with suppress(OSError):  # no writable folder: compiled anew in every process
         os.environ.setdefault("DRJIT_CACHE_DIR", str(cache.folder("kernels")))
     os.environ.setdefault("DRJIT_CACHE_MAXSIZE", str(cache.LIMIT_BYTES))
-    if asked == "cuda_ad_rgb":
+    if variant == "cuda_ad_rgb":
         if why := gpu.obstacle(gpu.probe()):
             raise UserError(f"render.variant: cuda_ad_rgb: {why}")
-        return asked
+        return variant
     found = llvm.find()
     if found is None:
-        if asked == "llvm_ad_rgb":
+        if variant == "llvm_ad_rgb":
             raise UserError("render.variant: llvm_ad_rgb needs libLLVM 17 or newer (Debian: libllvm19)")
         return "scalar_rgb"
     os.environ["DRJIT_LIBLLVM_PATH"] = found
@@ -148,7 +133,7 @@ class Stage:
         scene: dict[str, Any] = {
             "type": "scene",
             "integrator": _integrator(integrator),
-            # A GPU may sort paths by what they hit: sums in another order, so other last bits.
+            # A GPU may sort paths by what they hit, which changes the order of sums and so their last bits.
             "allow_thread_reordering": False,
         }
         for index, lamp in enumerate(lamps):
@@ -157,7 +142,7 @@ class Stage:
             scene[name] = _mesh(mi, name, body)
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
-        # Of each lamp where its axis ends, in green.
+        # Irradiance of all lamps at their targets, in green.
         self._power = sum(
             float(lamp.intensity[1] / ((lamp.position - lamp.target) ** 2).sum()) for lamp in lamps
         )
@@ -167,14 +152,7 @@ class Stage:
     def move(
         self, name: str, vertices: Floats, *, film: Floats | None = None, glow: Floats | None = None
     ) -> None:
-        """New positions (V, 3) mm of a body's vertices.
-
-        Args:
-            name: the body.
-            vertices: (V, 3) mm.
-            film: (V,) mm of film under which light sees them.
-            glow: (V, 3) radiance that they mirror, of metal.
-        """
+        """Moves a body's vertices (V, 3) mm; `film` and `glow` as of `Body` and `Metal`."""
         new = {"positions": vertices, "normals": _bent(vertices, self._faces[name], film), "glow": glow}
         for key, values in new.items():
             if values is not None:
@@ -182,7 +160,7 @@ class Stage:
                 self._parameters[f"{name}.vertex_{key}"] = self._mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
-        """Linear radiance (H, W, 3) float32 of the stage as it stands, from a camera with the same lens."""
+        """Linear radiance (H, W, 3) float32 of the stage as it is, from a camera with the same lens."""
         self._parameters.update()
         if camera is not None:
             self._lens.place(camera)
@@ -194,7 +172,7 @@ class Stage:
             image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
             radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
         if self.variant.startswith("llvm"):
-            # What one frame needs is not kept for the next: asking again is free here, on a GPU it isn't.
+            # Memory goes back after each frame: allocating anew is cheap on a CPU, unlike on a GPU.
             import drjit as dr
 
             dr.flush_malloc_cache()
@@ -202,9 +180,9 @@ class Stage:
 
 
 def forget() -> None:
-    """Frees what stages that are gone held: Python's plugins and their scenes refer to each other."""
+    """Frees the memory of deleted stages, whose Python plugins and scenes refer to each other."""
     gc.collect()
-    _leave_modules_out()
+    _freeze_modules()
     if "drjit" in sys.modules:
         import drjit as dr
 
@@ -213,20 +191,20 @@ def forget() -> None:
 
 
 @functools.cache
-def _leave_modules_out() -> None:
-    """Has later collections pass over what was there before the first stage: 0.15 CPU-s each, for nothing."""
+def _freeze_modules() -> None:
+    """Excludes objects older than the first stage from later collections, which saves 0.15 CPU-s each."""
     gc.freeze()
 
 
 def _trim() -> None:
-    """Gives free pages back to the system: glibc would keep what maps needed while they were made."""
+    """Returns free pages to the system, which glibc would hold after maps are painted."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def _limit_threads() -> None:
-    """Workers that share a machine say how many threads each may take."""
+    """Limits Dr.Jit's threads where several workers share a machine."""
     threads = os.environ.get("SULCUS_THREADS")
     if threads:
         import drjit as dr
@@ -236,7 +214,7 @@ def _limit_threads() -> None:
 
 def _integrator(kind: str) -> dict[str, Any]:
     if kind == "direct":
-        # Lamps are small: what a surface scatters towards by itself hardly ever meets one.
+        # Lamps are small: directions sampled from a surface's scattering hardly ever hit one.
         return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
     return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
 
@@ -254,7 +232,7 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
         "light": {
             "type": "area",
             "radiance": {"type": "rgb", "value": radiance.tolist()},
-            # Each has half of a pixel's strata, and the choice makes no noise.
+            # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
             "sampling_weight": 1.0,
         },
     }
@@ -263,7 +241,7 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
-    # Seen, but never chosen as a lamp: its weight is nothing.
+    # Visible, but never sampled as a lamp, since its weight is 0.
     kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
     glow = {"type": kind, "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
     properties["glow"] = mi.load_dict(glow)
@@ -296,10 +274,10 @@ def _bent(vertices: Floats, faces: npt.NDArray[np.int32], film: Floats | None) -
 
 
 def _aligned(values: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:
-    """The values in one row, of a type, where a vector register may read them.
+    """The values as one row of a type, in memory aligned to vector registers.
 
-    Dr.Jit takes NumPy's memory as it lies, and compiles one kernel for what is aligned and another for what
-    isn't: which of them a scene got was chance.
+    Dr.Jit uses NumPy's memory in place, and compiles separate kernels for aligned and unaligned arrays;
+    without this it is a matter of chance which of them a scene needs.
     """
     count = values.size
     raw = np.empty(count * np.dtype(kind).itemsize + _REGISTER, np.uint8)
@@ -310,7 +288,7 @@ def _aligned(values: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[An
 
 
 def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
-    """Radiance that a body shows of light which no lamp stands for."""
+    """Radiance of a body by light that is not of a lamp: reflections of metal, ambient light on tissue."""
     if isinstance(material, Metal):
         return {"type": "mesh_attribute", "name": "vertex_glow"}
     half = cv2.resize(material.coat.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -322,7 +300,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
         scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
         return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
     encoded = material.coat.normal * np.float32(0.5) + np.float32(0.5)
-    albedo = mi.load_dict(_bitmap(mi, material.coat.albedo))  # once, for both
+    albedo = mi.load_dict(_bitmap(mi, material.coat.albedo))  # shared by both coats
 
     def coat(roughness: float) -> dict[str, Any]:
         return {
@@ -354,7 +332,7 @@ def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
     given: dict[str, Any]
     if "scalar" in mi.variant():
         given = {"bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32))}
-    else:  # as it lies, in a quarter of the time: a bitmap is copied and converted first
+    else:  # in place, in a quarter of the time: a bitmap is copied and converted first
         given = {"data": mi.TensorXf(_aligned(texels, np.float32).reshape(texels.shape))}
     return {
         "type": "bitmap",

@@ -1,8 +1,8 @@
-"""Light that comes straight from lamps, kept apart by what makes grain: what is out of focus, and shadow.
+"""Direct light of lamps, separated by the two sources of noise: objects out of focus, and shadows.
 
-Lamps are small: what a surface scatters towards by itself hardly ever meets one, so a path asks for one lamp.
-Where paths pierce pixel, lens and lamps are (0, 2)-sequences in Morton order of the pixels, shuffled anew for
-every seed: not only a pixel's four, but the sixteen of four neighbours, are spread over the whole lens.
+Lamps are small: directions sampled from a surface's scattering hardly ever hit one, so a path samples one
+lamp. Sample points on pixel, lens and lamps are (0, 2)-sequences in Morton order of the pixels, shuffled for
+every seed: not only a pixel's four paths, but the sixteen of four neighbours, are spread over the whole lens.
 A. G. M. Ahmed, P. Wonka, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical
 ordering of pixels", 2020; B. Burley, "Practical hash-based Owen scrambling", 2020.
 """
@@ -16,38 +16,33 @@ import numpy.typing as npt
 
 Map = npt.NDArray[np.float32]
 
-_BLURRED_PX = 0.75  # circle of confusion (radius) from which on steel nearer than the focus is apart
-_AT_ONCE = 256  # paths a pixel: more would be more than 32 bits count
+_BLURRED_PX = 0.75  # least radius of the circle of confusion of steel that is separated
+_AT_ONCE = 256  # paths per pixel: more would exceed indices of 32 bits
 _HALVES = ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555))
 
 
 class Light(NamedTuple):
-    """Means over each pixel's paths."""
+    """Direct light of a picture, as means over each pixel's paths."""
 
-    radiance: Map
-    """(3, H, W)."""
-    near: Map
-    """(3, H, W) the part of it from steel that is nearer than the focus, and out of it."""
-    cover: Map
-    """(H, W) share of the paths that end there."""
-    blocked: Map
-    """(3, H, W) radiance that shadow took from the others."""
-    shade: Map
-    """(H, W) irradiance that it took from them."""
+    radiance: Map  # (3, H, W)
+    near: Map  # (3, H, W) its part from steel nearer than the focus and out of focus
+    cover: Map  # (H, W) share of the paths that end on such steel
+    blocked: Map  # (3, H, W) radiance that shadows take from the other paths
+    shade: Map  # (H, W) irradiance that shadows take from them
 
 
 def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, seed: int) -> Light:
     """Light of a compiled scene in a `sulcus_lens` over a picture of a size (width, height) px.
 
-    `steel`: id of the mesh, if it is there, that is apart where it is out of focus.
+    `steel`: id of the mesh that is separated where it is out of focus; it may be missing.
     """
     import drjit as dr
     import mitsuba as mi
 
     width, height = size
-    # Numbers as data: one that stands in the code would compile it anew.
+    # Numbers as data: a literal in the code would compile the kernel anew.
     seeds = [dr.opaque(mi.UInt32, int(word)) for word in np.random.SeedSequence(seed).generate_state(9)]
-    # A path's index in the sequences has its number within the pixel last; its bits, in reverse, first.
+    # A path's index has its number within the pixel in its lowest bits; then all bits are reversed.
     shift = dr.opaque(mi.UInt32, int(np.ceil(np.log2(spp))))
     found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
     number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
@@ -61,7 +56,7 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
 def _add_paths(
     scene: Any, lens: Any, size: tuple[int, int], which: tuple[int, int], order: Any, sums: Any
 ) -> None:
-    """Adds what `which` (first, how many) of each pixel's paths bring to sums over each pixel."""
+    """Adds the light of paths `which` (first, count) of each pixel to the pixels' sums."""
     import drjit as dr
     import mitsuba as mi
 
@@ -91,7 +86,7 @@ def _add_paths(
 
 
 def _pair(index: Any, seeds: list[Any]) -> Any:
-    """Points of a (0, 2)-sequence in the unit square, of indices with their bits in reverse, shuffled."""
+    """Points of a shuffled (0, 2)-sequence in the unit square, from indices with their bits reversed."""
     import mitsuba as mi
 
     index = index + seeds[0]

@@ -1,9 +1,9 @@
-"""Soft edges without grain: what is out of focus, and shadow, averaged along their own edges.
+"""Denoising of soft edges: defocused objects and shadows are averaged along their own edges.
 
-A few paths a pixel say where a soft edge is only roughly, but along it little changes. So the share of paths
-that it takes is averaged along it, and what lies behind keeps its own pixel. K. Vaidyanathan et al., "Layered
-light field reconstruction for defocus blur", 2015; E. Heitz et al., "Combining analytic direct illumination
-and stochastic shadows", 2018.
+A few paths per pixel locate a soft edge only roughly, but along it little changes. So the share of paths that
+it covers is averaged along the edge, while the background behind it stays unfiltered. K. Vaidyanathan et al.,
+"Layered light field reconstruction for defocus blur", 2015; E. Heitz et al., "Combining analytic direct
+illumination and stochastic shadows", 2018.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from synth.system.jit import vectorised
 
 Map = npt.NDArray[np.float32]
 
-_REACH = 4  # px: how far along an edge
-_ENOUGH = 16  # paths a pixel that need no neighbours
+_REACH = 4  # px along an edge
+_ENOUGH = 16  # paths per pixel from which on nothing is filtered
 _SIGMA_PX = 1.5  # of the smoothing before and after slopes are taken
-_FLAT = np.float32(1e-4)  # square of the slope, a pixel, below which there is no edge
+_FLAT = np.float32(1e-4)  # squared slope per pixel below which there is no edge
 
 
 def soften(light: Light, power: float, spp: int) -> Map:
-    """Radiance (H, W, 3) of `direct_light.trace`, its soft edges without grain.
+    """Radiance (H, W, 3) of `direct_light.trace` with its soft edges denoised.
 
-    `power`: irradiance of the lamps together, in green; `spp`: paths a pixel; the mean of many stays.
+    `power`: irradiance of all lamps, in green; `spp`: paths per pixel.
     """
     if spp >= _ENOUGH:
         return np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
@@ -36,16 +36,15 @@ def soften(light: Light, power: float, spp: int) -> Map:
         _shade(behind, behind + light.blocked, share, light.cover, _along(share))
     picture = np.ascontiguousarray((light.near + behind).transpose(1, 2, 0))
     if light.cover.any():
-        # Its own highlights run along it too.
+        # Highlights on an object run along its edge as well.
         _cover(picture, light.near, behind, light.cover, _along(light.cover + light.near[1]))
     return picture
 
 
 def _along(share: Map) -> Map:
-    """Vectors (2, H, W) px along the edges of a share (H, W), as long as its average reaches; 0 off them.
+    """Vectors (2, H, W) px along the edges of a share (H, W), of the length to average over; 0 elsewhere.
 
-    By the structure tensor, which is largest across an edge. Where edges meet it has no direction, and they
-    are short.
+    By the structure tensor, which is largest across an edge. They are short where edges meet.
     """
     smooth = cv2.GaussianBlur(share, (0, 0), _SIGMA_PX)
     x, y = cv2.Sobel(smooth, -1, 1, 0, scale=0.125), cv2.Sobel(smooth, -1, 0, 1, scale=0.125)
@@ -64,14 +63,14 @@ def _point(xx: Map, xy: Map, yy: Map, along: Map) -> None:
             if whole > _FLAT:
                 apart = np.sqrt((xx[y, x] - yy[y, x]) ** 2 + 4 * xy[y, x] ** 2)
                 turn = 0.5 * np.arctan2(2 * xy[y, x], xx[y, x] - yy[y, x])
-                # Beyond the picture's border nothing is known: the average ends there.
+                # The average ends at the picture's border.
                 reach = min(_REACH, x, y, width - 1 - x, height - 1 - y) * apart / whole
                 along[0, y, x], along[1, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
 
 
 @vectorised
 def _shade(behind: Map, clear: Map, share: Map, cover: Map, along: Map) -> None:
-    """Puts the light behind (3, H, W) under shadows whose share (H, W) is averaged along their edges."""
+    """Shades the light `behind` (3, H, W) by shadows whose share (H, W) is averaged along their edges."""
     height, width = share.shape
     for y in range(height):
         for x in range(width):
@@ -89,7 +88,7 @@ def _shade(behind: Map, clear: Map, share: Map, cover: Map, along: Map) -> None:
                         total += bare
                         blocked += weight * share[top + j, left + i]
                         dull += bare * bare / (weight * clear[1, top + j, left + i] + np.float32(1e-6))
-            # A highlight is one lamp's, and its grain is its own: what is put right is the light around it.
+            # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
             bare = max(1 - cover[y, x], np.float32(1e-6))
             most = 4 * total * bare / (dull * (clear[1, y, x] + np.float32(1e-6)))
             gain = (share[y, x] / bare - blocked / total) * min(most, 1)
@@ -99,7 +98,7 @@ def _shade(behind: Map, clear: Map, share: Map, cover: Map, along: Map) -> None:
 
 @vectorised
 def _cover(picture: Map, near: Map, behind: Map, cover: Map, along: Map) -> None:
-    """Puts what is out of focus, averaged along its edges, over what is behind (3, H, W), into a picture."""
+    """Composes a picture of defocused objects, averaged along their edges, over the light behind."""
     height, width = cover.shape
     found = np.zeros(8, np.float32)
     for y in range(height):
@@ -121,7 +120,7 @@ def _cover(picture: Map, near: Map, behind: Map, cover: Map, along: Map) -> None
                             found[5 + k] += weight * behind[k, top + j, left + i]
             open_here = 1 - cover[y, x]
             open_around = 1 - found[1] / found[0]
-            if open_around < np.float32(1e-3):  # no edge, but a highlight on what covers all
+            if open_around < np.float32(1e-3):  # no edge, but a highlight on an object that covers everything
                 continue
             for k in range(3):
                 back = behind[k, y, x] + np.float32(0.05) * found[5 + k] / found[0]

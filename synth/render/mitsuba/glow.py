@@ -1,7 +1,7 @@
-"""What a surface shows of light that no lamp stands for: an emitter that is seen and never sampled.
+"""An emitter that is visible but never sampled, for light on a surface that is not of a lamp.
 
-Mitsuba's own area light would be sampled by nobody either (its weight was nothing), but its sampling would
-still be compiled, and with it the mesh's number of faces: a kernel for every scene.
+Mitsuba's own area light with a sampling weight of 0 is not sampled either, but its sampling would still be
+compiled, with the mesh's number of faces in the code, which takes a kernel for every scene.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 
 @functools.cache
 def register_glow(variant: str) -> None:
-    """Makes `sulcus_glow`, with a texture `radiance`, known to one compiled variant."""
+    """Registers the emitter `sulcus_glow`, with a texture `radiance`, in one compiled variant."""
     import drjit as dr
     import mitsuba as mi
 
     class Glow(mi.Emitter):
-        """Radiance of a texture towards the side that normals point to."""
+        """An emitter of a texture's radiance to the side of the normals."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)

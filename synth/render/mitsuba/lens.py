@@ -1,8 +1,8 @@
-"""The microscope's lens for Mitsuba: `camera.rays` with an aperture of some width.
+"""The microscope's lens for Mitsuba: `camera.rays` with an aperture.
 
-Compiled variants take a sensor plugin that distorts exactly. Written in Python it would cost the scalar
-one twenty times its own work, so there Mitsuba's own thin lens renders the undistorted picture, twice as
-fine, and that is warped.
+Compiled variants have a sensor plugin with the exact distortion. In the scalar variant a plugin in Python
+would take twenty times as long as the rendering, so there Mitsuba's thin lens renders the undistorted picture
+at twice the resolution, which is then warped.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Map = npt.NDArray[np.float32]
 
 
 class Compiled:
-    """The exact lens, for variants that compile it."""
+    """The exact lens, for compiled variants."""
 
     def __init__(self, camera: Camera, spp: int) -> None:
         import mitsuba as mi
@@ -42,11 +42,11 @@ class Compiled:
         self.place(camera)
 
     def place(self, camera: Camera) -> None:
-        """Puts the lens where the camera is."""
+        """Moves the lens to the camera's pose."""
         self.sensor.place(camera)
 
     def develop(self, image: Map) -> Map:
-        """The film (H, W, 3) is the picture."""
+        """The picture (H, W, 3) of the film, which is the same here."""
         return image
 
 
@@ -60,11 +60,11 @@ class Scalar:
         self.place(camera)
 
     def _fit(self, camera: Camera) -> None:
-        """The larger film, and where the picture's pixels lie on it."""
+        """Sets the larger film's size, and the positions of the picture's pixels on it."""
         self._K = camera.K
         width, height = camera.size
         fx, fy = camera.K[0, 0], camera.K[1, 1]
-        # The middle of each fine pixel, and where it lies on a film whose principal point is its middle.
+        # Centres of fine pixels, and their positions on a film whose principal point is its middle.
         step = 1 / self._fine
         columns = (np.arange(width * self._fine) + 0.5) * step - 0.5
         rows = (np.arange(height * self._fine) + 0.5) * step - 0.5
@@ -78,7 +78,7 @@ class Scalar:
         self._fov = float(np.rad2deg(2 * np.arctan(film_width / (2 * fx * self._fine))))
 
     def place(self, camera: Camera) -> None:
-        """Puts the lens where the camera is."""
+        """Moves the lens to the camera's pose."""
         import mitsuba as mi
 
         if not np.array_equal(camera.K, self._K):
@@ -113,7 +113,7 @@ class Scalar:
 
 
 def _film(width: int, height: int) -> dict[str, Any]:
-    # A box keeps pixels apart: no order of summing, so the same bytes on any number of threads.
+    # A box filter does not mix pixels, so sums have one order on any number of threads: the same bytes.
     return {
         "type": "hdrfilm",
         "width": width,
@@ -126,23 +126,23 @@ def _film(width: int, height: int) -> dict[str, Any]:
 
 @functools.cache
 def _register(variant: str) -> None:
-    """Makes the thin lens with Brown-Conrady distortion known to one variant."""
+    """Registers the sensor `sulcus_lens`, a thin lens with Brown-Conrady distortion, in one variant."""
     import drjit as dr
     import mitsuba as mi
 
     class Lens(mi.Sensor):
-        """`camera.rays` for film samples, with a lens of some width."""
+        """`camera.rays` for film samples, with an aperture."""
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            # As data: a number written into the code would compile it anew for every scene.
+            # As data: a literal in the code would compile it anew for every scene.
             names = ("fx", "fy", "k1", "k2", "p1", "p2", "k3", "aperture", "focus")
             self.v = {name: dr.opaque(mi.Float, float(props[name])) for name in names}
             size = self.film().size()
             self.width, self.height = int(size[0]), int(size[1])
 
         def place(self, camera: Camera) -> None:
-            """Pose and principal point, as data: a number written into the code would compile it anew."""
+            """Sets pose and principal point, as data as well."""
 
             def data(values: Any) -> list[Any]:
                 return [dr.opaque(mi.Float, float(value)) for value in values]
@@ -159,7 +159,7 @@ def _register(variant: str) -> None:
             goal_x = (position.x * self.width - 0.5 - self.middle[0]) / v["fx"]
             goal_y = (position.y * self.height - 0.5 - self.middle[1]) / v["fy"]
             x, y = goal_x, goal_y
-            for _ in range(6):  # each round gains a factor of the distortion itself
+            for _ in range(6):  # each round reduces the error by the size of the distortion
                 r2 = x * x + y * y
                 radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * v["k3"]))
                 dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)

@@ -250,7 +250,7 @@ def moving(out: Path, job: Job) -> list[Camera]:
         translation=cameras[0].translation.tolist(),
         young_kpa=1.0,
         scale_mm_per_px=1 / 3,
-        scenario={"sway": {"drift_mm": 1.0}},
+        scenario={"camera_motion": {"drift_mm": 1.0}},
     )
     return cameras
 

@@ -46,5 +46,5 @@ def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[in
         pixels = camera.project(lens, circle)
         assert (pixels > -0.6).all()
         assert (pixels < np.array(size) - 0.4).all()
-        reach.append(reach_mm / camera.seen_radius(lens))
+        reach.append(reach_mm / camera.visible_radius(lens))
     assert max(reach) > 0.9, "up to the picture's edge"
