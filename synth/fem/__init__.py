@@ -1,1 +1,1 @@
-"""Physics: from a gesture to the motion of the surface and the traction on it."""
+"""Mechanics: from a gesture to the motion of the surface and the traction on it."""

@@ -42,7 +42,7 @@ class Clock:
 
     @property
     def prony_terms(self) -> list[tuple[float, float, float]]:
-        """Of each Prony term: its part of the stiffness, its decay over a step, that decay's mean."""
+        """For each Prony term its part of the stiffness, its decay over a step, and that decay's mean."""
         return [
             (part, float(np.exp(-self.dt / tau)), float(tau / self.dt * -np.expm1(-self.dt / tau)))
             for part, tau in self.relaxation

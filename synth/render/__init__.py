@@ -1,1 +1,1 @@
-"""Pictures and their truth: one surface under the microscope, moved frame by frame."""
+"""Pictures and their ground truth: one surface under the microscope, moved frame by frame."""

@@ -1,4 +1,4 @@
-"""Where the physics breaks and that it says so: past a law's range, odd steps, slivers, random scenes."""
+"""Stability of the mechanics and errors at its limits: a law's range, odd steps, slivers, random scenes."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_push_past_a_laws_range_is_refused(law: str, broken: float) -> None:
         fem_case.moved(case, broken, "push", 8)
 
 
-def test_equilibrium_knows_nothing_of_the_steps_to_it() -> None:
+def test_equilibrium_does_not_depend_on_the_steps_to_it() -> None:
     on = fem_case.patch(10_000)
     for law in ("corotational", "neo-hookean"):
         case = fem_case.brain(on, law, 500, CONTACT)

@@ -1,1 +1,1 @@
-"""The volume mesh: tetrahedra of a block or of a brain, their shape functions, what holds them."""
+"""The volume mesh: tetrahedra of a block or of a brain, their shape functions and supports."""

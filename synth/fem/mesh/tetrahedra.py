@@ -152,7 +152,7 @@ def boundary(cells: Ints) -> Ints:
 
 
 def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
-    """Of the faces with one tetrahedron: that tetrahedron (F,), and its corner that is off the face (F,)."""
+    """Tetrahedra (F,) of the faces with one tetrahedron, and their corners (F,) that are off these faces."""
     key = np.sort(cells[:, FACES].reshape(-1, 3), axis=1)
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
     alone = np.sort(first[count == 1])

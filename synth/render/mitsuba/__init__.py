@@ -1,1 +1,1 @@
-"""All that knows Mitsuba: stage and lens."""
+"""The Mitsuba backend: stage, lens, direct light and its filter."""

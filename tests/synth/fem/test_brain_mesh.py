@@ -1,4 +1,4 @@
-"""A user's surface: holes and duplicates, placing, meshing, and what is refused."""
+"""A user's surface: holes and duplicates, placement, meshing, and refused files."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ def test_a_messy_surface_of_every_format_is_meshed_and_moved(suffix: str, tmp_pa
     assert motion.min_jacobian.min() > 0.2
 
 
-def test_what_is_no_closed_surface_at_the_craniotomy_is_refused(tmp_path: Path) -> None:
+def test_a_surface_that_is_not_closed_at_the_craniotomy_is_refused(tmp_path: Path) -> None:
     egg = written(tmp_path / "egg.obj", soup())
     sheet, torn, bad = tmp_path / "sheet.stl", tmp_path / "torn.ply", tmp_path / "bad.vtk"
     trimesh.creation.box((50, 50, 0)).export(sheet)
     torn.write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
     bad.write_text("# vtk DataFile Version 3.0\n\nASCII\nDATASET POLYDATA\nPOINTS 2 float\n0 0 0\n")
-    beside = schema.CraniotomySection(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
-    for path, opening in ((sheet, OPENING), (torn, OPENING), (bad, OPENING), (egg, beside)):
+    outside = schema.CraniotomySection(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+    for path, opening in ((sheet, OPENING), (torn, OPENING), (bad, OPENING), (egg, outside)):
         with pytest.raises(UserError):
             brain_surface.load_brain(path, opening)
 
 
-def test_holes_are_filled_where_asked_and_what_stays_open_is_refused(tmp_path: Path) -> None:
+def test_holes_are_filled_on_request_and_surfaces_still_open_refused(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=30.0)
     middle = ball.triangles_center
     cut = (middle[:, 0] > -20) & (np.linalg.norm(middle - [0.0, 0.0, 30.0], axis=1) > 5)

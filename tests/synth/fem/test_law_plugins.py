@@ -1,4 +1,4 @@
-"""Laws of other packages: the same answers where they are the same law, and refused where they are none."""
+"""Plug-in laws: the same results for the same law, and faulty laws refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 
 class NeoHookean:
-    """Ours, written again."""
+    """Our law, implemented independently."""
 
     largest_load = 0.4
 
@@ -43,10 +43,8 @@ def test_the_same_law_gives_the_same_equations(own: str) -> None:
     np.testing.assert_allclose(one.force, other.force, atol=1e-9 * np.abs(other.force).max())
 
 
-def spoilt(change: str) -> type[NeoHookean]:
-    """The law with something wrong in it."""
-
-    class Spoilt(NeoHookean):
+def faulty(change: str) -> type[NeoHookean]:
+    class Faulty(NeoHookean):
         def stress(self, f: Floats, mu: float, lam: float) -> tuple[Floats, Floats]:
             energy, first = super().stress(f, mu, lam)
             log = np.log(np.linalg.det(f))
@@ -59,11 +57,11 @@ def spoilt(change: str) -> type[NeoHookean]:
                 first[:, 0, 1] += 4 * f[:, 0, 1] ** 3
             return energy, first
 
-    return Spoilt
+    return Faulty
 
 
 @pytest.mark.parametrize("change", ["slope", "rest", "turn"])
-def test_one_that_would_be_silently_wrong_is_refused(change: str) -> None:
+def test_a_law_that_would_be_silently_wrong_is_refused(change: str) -> None:
     foreign_law.check_law(NeoHookean())
     with pytest.raises(synth.UserError):
-        foreign_law.check_law(spoilt(change)())
+        foreign_law.check_law(faulty(change)())

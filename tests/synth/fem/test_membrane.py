@@ -1,4 +1,4 @@
-"""The membrane: force and stiffness follow from its energy, wrinkles bear nothing, work is kept."""
+"""The membrane: force and stiffness follow from its energy, wrinkles bear nothing, work is conserved."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
 
 @pytest.mark.slow
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
-    """The tools' work on the way up is what is stored at the top, and comes back whole."""
+    """The instruments' work while loading equals the stored energy, and comes back in unloading."""
     fem = schema.FemSection(
         gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(probability=1)
     )

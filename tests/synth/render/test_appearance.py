@@ -1,4 +1,4 @@
-"""What surfaces are made of: a user's brain and photograph, and the light on it."""
+"""A user's brain and photograph as surface and albedo, and the light on it."""
 
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def test_a_photograph_is_the_albedo(brain: CortexSurface, tmp_path: Path) -> Non
     assert coat.albedo[64, 108, 1] > 4 * coat.albedo[64, 108, 0]
 
 
-def test_the_spot_moves_with_the_microscope_and_is_one_for_both_eyes() -> None:
+def test_the_spot_moves_with_the_microscope_and_is_the_same_for_both_cameras() -> None:
     render = RenderSection(stereo_mm=24.0)
     lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     drawn = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
@@ -63,8 +63,8 @@ def test_the_spot_moves_with_the_microscope_and_is_one_for_both_eyes() -> None:
     for radius, expected in ((0.0, 1.0), (0.29, 1.0), (0.45, 0.75)):
         point = radius * field * across
         assert abs(point @ axis) < 1e-9
-        for eye in (lens, right):
-            x, y = np.rint(camera.project(eye, point[None])[0]).astype(int)
-            found = light.spot(eye, lens, drawn)
+        for one in (lens, right):
+            x, y = np.rint(camera.project(one, point[None])[0]).astype(int)
+            found = light.spot(one, lens, drawn)
             assert found.shape == (lens.size[1], lens.size[0])
             assert found[y, x] == pytest.approx(expected, abs=0.01)

@@ -1,10 +1,13 @@
-"""The sensor's noise and transfer against their closed forms."""
+"""The sensor's noise and transfer against their closed forms, and the recorder's codec."""
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from synth.job.schema import SensorSection
+from synth.render.camera import video_link
 from synth.render.camera.camera_sensor import CameraSensor, processed, record
 from synth.render.camera.colour_processing import CAMERAS, KNOTS, encoded
 from synth.render.camera.colour_processing import PLAIN as ORDINARY
@@ -26,16 +29,16 @@ def linear(video: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("level", [0.1, 0.4, 0.8])
 def test_noise_is_photons_and_readout(level: float) -> None:
     sensor = replace(PLAIN, full_well=500.0, read_noise=6.0)
-    seen = linear(record(flat(level), sensor, np.random.default_rng(0)).astype(float))
+    found = linear(record(flat(level), sensor, np.random.default_rng(0)).astype(float))
     expected = np.sqrt(level * 500 + 36) / 500
-    assert seen.std() == pytest.approx(expected, rel=0.05)
-    assert seen.mean() == pytest.approx(level, rel=0.02)
+    assert found.std() == pytest.approx(expected, rel=0.05)
+    assert found.mean() == pytest.approx(level, rel=0.02)
 
 
 def test_white_balance_multiplies_channels() -> None:
     sensor = replace(PLAIN, white=(1.5, 1.0, 0.5), full_well=1e6, read_noise=0.0)
-    seen = linear(record(flat(0.4), sensor, np.random.default_rng(0)).astype(float)).mean(axis=(0, 1))
-    np.testing.assert_allclose(seen, [0.6, 0.4, 0.2], rtol=0.02)
+    found = linear(record(flat(0.4), sensor, np.random.default_rng(0)).astype(float)).mean(axis=(0, 1))
+    np.testing.assert_allclose(found, [0.6, 0.4, 0.2], rtol=0.02)
 
 
 def test_what_fills_the_sensor_is_white_under_any_lamp() -> None:
@@ -47,8 +50,8 @@ def test_what_fills_the_sensor_is_white_under_any_lamp() -> None:
 def test_a_matrix_mixes_linear_light_and_keeps_white() -> None:
     matrix = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
     colour = flat(1.0) * np.array([0.5, 0.3, 0.2], np.float32)
-    seen = linear(record(colour, replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float))
-    np.testing.assert_allclose(seen.mean(axis=(0, 1)), np.array(matrix) @ [0.5, 0.3, 0.2], rtol=0.02)
+    found = linear(record(colour, replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float))
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), np.array(matrix) @ [0.5, 0.3, 0.2], rtol=0.02)
     grey = linear(
         record(flat(0.4), replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float)
     )
@@ -73,17 +76,16 @@ def test_a_camera_keeps_its_knots_and_rises_between_them_not_steeply_in_the_dark
 def test_bloom_keeps_the_light() -> None:
     spot = np.zeros((101, 101, 3), np.float32)
     spot[50, 50] = 0.5
-    sharp = replace(PLAIN, full_well=1e9, read_noise=0.0, bits=30)
-    without = linear(record(spot, sharp, np.random.default_rng(0)).astype(float))
-    with_bloom = linear(record(spot, replace(sharp, bloom=0.4), np.random.default_rng(0)).astype(float))
+    without = linear(record(spot, NOISELESS, np.random.default_rng(0)).astype(float))
+    with_bloom = linear(record(spot, replace(NOISELESS, bloom=0.4), np.random.default_rng(0)).astype(float))
     assert with_bloom[50, 50, 0] < 0.75 * without[50, 50, 0]
     assert with_bloom[52, 50, 0] > without[52, 50, 0]
 
 
-def test_corners_lose_the_share_asked_for() -> None:
+def test_corners_lose_the_given_share() -> None:
     sensor = replace(PLAIN, vignette=0.3, full_well=1e6, read_noise=0.0)
-    seen = linear(record(flat(0.5, 201), sensor, np.random.default_rng(0)).astype(float))[..., 0]
-    assert seen[0, 0] / seen[100, 100] == pytest.approx(0.7, rel=0.03)
+    found = linear(record(flat(0.5, 201), sensor, np.random.default_rng(0)).astype(float))[..., 0]
+    assert found[0, 0] / found[100, 100] == pytest.approx(0.7, rel=0.03)
 
 
 def test_same_seed_same_bytes_other_seed_other_noise() -> None:
@@ -100,3 +102,27 @@ def test_blur_widens_an_edge_by_its_own_width() -> None:
     # A Gaussian's edge rises from 15.9 to 84.1% over two of its standard deviations.
     low, high = np.interp([0.1587, 0.8413], light[54:75], np.arange(54, 75))
     assert (high - low) / 2 == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize("chroma", ["4:2:0", "4:4:4"])
+def test_the_codec_is_deterministic_and_loses_more_at_a_lower_bitrate(chroma: str) -> None:
+    rng = np.random.default_rng(1)
+    grey = cv2.GaussianBlur(rng.uniform(0, 255, (48, 66)).astype(np.float32), (0, 0), 1.0)
+    base = np.repeat(grey[..., None], 3, axis=2)
+    video = np.stack([np.roll(base, t, axis=1) for t in range(6)]).astype(np.uint8)
+    errors = []
+    for rate in (0.02, 5.0):
+        section = SensorSection.model_validate({"bitrate_mbps": rate, "chroma": chroma})
+        back = video_link.recorded(video, section, 25.0)
+        assert back.shape == video.shape
+        assert (back == video_link.recorded(video, section, 25.0)).all()
+        errors.append(np.abs(back.astype(int) - video).mean())
+    assert errors[1] < 4
+    assert errors[0] > 2 * errors[1]
+
+
+def test_odd_sizes_and_no_codec() -> None:
+    video = np.full((3, 33, 35, 3), 90, np.uint8)
+    section = SensorSection.model_validate({"bitrate_mbps": 1.0, "chroma": "4:2:0"})
+    assert np.abs(video_link.recorded(video, section, 25.0).astype(int) - 90).max() <= 4
+    assert video_link.recorded(video, SensorSection(), 25.0) is video

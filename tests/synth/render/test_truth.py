@@ -1,4 +1,4 @@
-"""Truth against what other code makes of the same geometry."""
+"""Ground truth against other implementations on the same geometry."""
 
 from dataclasses import replace
 
@@ -47,10 +47,10 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
     rest = truth.trace_rest(near, Shape(coarse.vertices, coarse.faces), NOTHING)
     pixels = camera.pixel_grid(near.size)[::11]
-    seen = camera.rays(near, pixels)
-    origins, directions = np.tile(near.centre, (len(pixels), 1)), seen @ near.rotation
+    rays = camera.rays(near, pixels)
+    origins, directions = np.tile(near.centre, (len(pixels), 1)), rays @ near.rotation
     straight = (pixels - near.K[:2, 2]) / np.diag(near.K)[:2]
-    shift = np.linalg.norm(seen[:, :2] / seen[:, 2:] - straight, axis=1) * near.K[0, 0]
+    shift = np.linalg.norm(rays[:, :2] / rays[:, 2:] - straight, axis=1) * near.K[0, 0]
     assert shift.max() > 5, "a lens that bends nothing proves nothing"
     mesh = trimesh.Trimesh(coarse.vertices, coarse.faces, process=False)
     where, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
@@ -65,22 +65,22 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
 
 
 def test_flow_warps_the_moved_surface_back_to_rest(surface: CortexSurface, lens: Camera) -> None:
-    """What a pixel sees at rest is what is seen at the flow's end in the moved frame."""
+    """The material point of a pixel at rest is the one at the flow's end in the moved frame."""
     shape, moved = Shape(surface.vertices, surface.faces), Shape(bump(surface), surface.faces)
     rest = truth.trace_rest(lens, shape, NOTHING)
     now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
-    seen = now.visible & rest.tissue
-    assert seen.mean() > 0.5
-    assert np.linalg.norm(now.flow[seen], axis=1).max() > 3
+    visible = now.visible & rest.tissue
+    assert visible.mean() > 0.5
+    assert np.linalg.norm(now.flow[visible], axis=1).max() > 3
     pixels = camera.pixel_grid(lens.size).reshape(72, 96, 2)
-    ends = pixels[seen] + now.flow[seen]
+    ends = pixels[visible] + now.flow[visible]
     directions = camera.rays(lens, ends) @ lens.rotation
     origins = np.tile(lens.centre, (len(ends), 1))
     mesh = trimesh.Trimesh(moved.vertices, moved.faces, process=False)
     where, ray, triangle = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
     bary = trimesh.triangles.points_to_barycentric(moved.vertices[moved.faces[triangle]], where)
     material = np.einsum("nk,nkc->nc", bary, shape.vertices[shape.faces[triangle]])
-    error = np.linalg.norm(camera.project(lens, material) - pixels[seen][ray], axis=1)
+    error = np.linalg.norm(camera.project(lens, material) - pixels[visible][ray], axis=1)
     assert np.median(error) < 1e-4
     assert np.quantile(error, 0.999) < 1e-3
 
@@ -94,7 +94,7 @@ def test_what_hides_a_point_makes_it_invisible(surface: CortexSurface, lens: Cam
     )
     now = truth.trace_frame(lens, rest, shape, NOTHING, plate)
     assert 0.02 < now.tool.mean() < 0.3
-    # Nothing moved, so a rest pixel is seen just where the plate is not.
+    # Nothing moved, so a rest pixel is visible just where the plate is not.
     np.testing.assert_array_equal(now.visible, rest.tissue & ~now.tool)
     assert now.depth[now.tool].max() < now.depth[rest.tissue & ~now.tool].max()
     np.testing.assert_allclose(now.flow[rest.tissue], 0, atol=1e-5)
@@ -104,8 +104,8 @@ def test_what_hides_a_point_makes_it_invisible(surface: CortexSurface, lens: Cam
 def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn: int) -> None:
     """Whichever of the three it is; the other two are in the picture, where rays would meet NaN."""
     directions = camera.rays(lens, camera.pixel_grid(lens.size))
-    seen = directions.reshape(72, 96, 3)[[10, 60], [12, 80]]
-    corners = np.concatenate([80.0 * seen / seen[:, 2:], [[0.0, 6.0, -3.0]]])
+    found = directions.reshape(72, 96, 3)[[10, 60], [12, 80]]
+    corners = np.concatenate([80.0 * found / found[:, 2:], [[0.0, 6.0, -3.0]]])
     shape = Shape(
         (corners - lens.translation) @ lens.rotation, np.array([np.roll([0, 1, 2], turn)], np.int32)
     )
@@ -137,8 +137,8 @@ def test_motion_lands_where_opencv_projects_it(surface: CortexSurface, lens: Cam
     now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
     on = rest.tissue
     points = rest.points.reshape(*on.shape, 3)[on] + now.motion[on]
-    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    found = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
     pixels = camera.pixel_grid(lens.size).reshape(*on.shape, 2)[on]
-    np.testing.assert_allclose(seen - pixels, now.flow[on], atol=2e-4)
+    np.testing.assert_allclose(found - pixels, now.flow[on], atol=2e-4)
     assert np.abs(now.motion[on][:, 2]).max() > 1.0
     assert not now.motion[~on].any()

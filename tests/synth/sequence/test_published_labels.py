@@ -1,4 +1,4 @@
-"""The published method's labels: both stages of noise do what they say, and a dataset holds them."""
+"""Labels of the published method: both stages of noise, and their fields in a dataset."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_intensity_peaks_at_the_total_force_and_keeps_direction() -> None:
     assert not published_labels.intensity(0 * load, 0.0).any()
 
 
-def test_first_stage_has_the_deviation_asked_for() -> None:
+def test_first_stage_has_the_given_deviation() -> None:
     label = np.zeros((*SIZE, 3))
     label[..., 2] = 50.0
     noisy = published_labels.with_noise(label, TISSUE, 0.02, np.random.default_rng(0))
@@ -44,7 +44,7 @@ def test_first_stage_has_the_deviation_asked_for() -> None:
     np.testing.assert_array_equal(still[TISSUE], label[TISSUE])
 
 
-def test_second_stage_disturbs_the_share_asked_for_away_from_the_contact() -> None:
+def test_second_stage_disturbs_the_given_share_away_from_the_contact() -> None:
     flow, load = scene()
     label = np.linalg.norm(published_labels.intensity(load, 70.0), axis=-1)
     noisy, left = published_labels.disturbed(flow, label, TISSUE, np.random.default_rng(0))
@@ -62,7 +62,7 @@ def test_second_stage_disturbs_the_share_asked_for_away_from_the_contact() -> No
 
 
 @pytest.mark.slow
-def test_the_papers_dataset_holds_noisy_labels_beside_the_truth(tmp_path: Path) -> None:
+def test_the_papers_dataset_holds_noisy_labels_next_to_the_truth(tmp_path: Path) -> None:
     small = ["frames=12", "anatomy.vertices=2500", "fem.tets=600", "render.size=[96,72]", "render.spp=1"]
     job = reader.load_job("paper", [*small, "flow.backend=dis"])
     sequence = open_sequence(render_sequence(job, 0, tmp_path, lambda *_: None))

@@ -1,4 +1,4 @@
-"""A scenario depends on (job, index) only, and what it loads is in the opening and in the picture."""
+"""A scenario depends on (job, index) only; its contacts lie in the opening and in the picture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_
     assert frame_seeds(few, 2) == frame_seeds(many, 2)
 
 
-def test_shares_are_drawn_and_what_is_not_asked_for_changes_no_draw() -> None:
+def test_shares_are_drawn_and_unused_quantities_change_no_draw() -> None:
     plain = [draw_scenario(Job(sequences=40), k) for k in range(40)]
     fem = {"membrane": {"probability": 0.5}, "pulse": {"heart_mm": [0.1, 0.5]}, "skull": ["bonded", "slip"]}
     drawn = [

@@ -1,4 +1,4 @@
-"""A scene from a script is the one that a dataset holds, frame by frame, and needs no folder."""
+"""A scene from a script is the one in a dataset, frame by frame, and needs no folder; a stereo sequence."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import synth
+from synth.checks import stereo
 from synth.sequence.pipeline import render_sequence
 
 SMALL = ["seed=3", "frames=3", "anatomy.vertices=2500", "fem.tets=400", "render.spp=1", "render.size=[96,72]"]
@@ -25,7 +26,7 @@ def scene(job: synth.Job) -> synth.Scene:
 
 
 @pytest.mark.slow
-def test_it_is_what_a_dataset_holds(
+def test_it_is_the_scene_in_a_dataset(
     scene: synth.Scene, job: synth.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -54,8 +55,28 @@ def test_a_frame_does_not_depend_on_those_before_it(scene: synth.Scene, job: syn
     np.testing.assert_array_equal(alone.rgb, again.rgb)
 
 
-def test_what_cannot_be_is_refused(scene: synth.Scene, job: synth.Job) -> None:
+def test_missing_sequences_and_frames_are_refused(scene: synth.Scene, job: synth.Job) -> None:
     with pytest.raises(synth.UserError):
         synth.simulate(job, 2)
     with pytest.raises(synth.UserError):
         scene.frame(3)
+
+
+@pytest.mark.slow
+def test_a_stereo_sequence_agrees_with_its_truth_and_recovers_motion(tmp_path: Path) -> None:
+    changes = ["frames=4", "render.size=[160,120]", "render.stereo_mm=24"]
+    job = synth.load_job("tiny", [*changes, "sequences=1", "render.spp=4"])
+    sequence = synth.open_sequence(render_sequence(job, 0, tmp_path, lambda *_: None))
+    measures = list(stereo.stereo(sequence, [0, 2]))
+    assert len(measures) > 8
+    assert all(one.good for one in measures), [one for one in measures if not one.good]
+    tissue, found = sequence["tissue"][:], sequence["motion_recovered"][:]
+    assert not found[0].any()
+    assert not found[:, ~tissue].any()
+    assert (sequence["motion_deviation"][2][tissue] > 0).all()
+    t = int(np.abs(sequence["motion"][..., 2]).max(axis=(1, 2)).argmax())
+    visible = tissue & sequence["visible"][t] & ~sequence["tool"][0]
+    error = (found - sequence["motion"][:])[t][visible]
+    # At 160 px a pixel of disparity is 2.7 mm of depth.
+    assert np.sqrt(np.square(error[:, 2]).mean()) < 0.2
+    assert sequence.attrs["right"]["baseline_mm"] == 24

@@ -1,30 +1,67 @@
-"""Several instruments at once: labels that add up; loads given as force."""
+"""Instruments given by the job, several at once: labels that add up, forces in place of loads."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 from dome import OPENING_MM, block, patch
+from pydantic import ValidationError
 
-from synth.fem import solver
+import synth
+from synth.fem import solver, tool_gesture
 from synth.fem.material import Tissue
-from synth.fem.tool_gesture import Gesture
 from synth.job import schema
 from synth.sequence import scenario
 
-TISSUE = Tissue(1.0, 0.4, "neo-hookean")
+PUSH = {
+    "gesture": "push",
+    "place": [4.0, 0.0],
+    "direction": [0.0, 0.6, -0.8],
+    "load": 0.1,
+    "footprint_mm": 3.5,
+    "timing": [0.1, 0.3, 0.6, 0.9],
+}
+PULL = {"gesture": "pull", "place": [-5.0, 1.0], "force_mn": 1.5, "direction": [0, 0, 2]}
 
 
-def drawn(fem: schema.FemSection, seed: int) -> tuple[Gesture, ...]:
-    rng = np.random.default_rng(seed)
-    return scenario.draw_gestures(fem, OPENING_MM, TISSUE.young_kpa, rng, rng)
+def job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
+    return synth.Job.model_validate({"seed": 3, "sequences": 20, "fem": {"instrument_list": crew, **fem}})
+
+
+def test_given_values_are_used_and_the_others_drawn() -> None:
+    given = job(PUSH, PULL)
+    cases = [scenario.draw_scenario(given, index) for index in range(20)]
+    for case in cases:
+        push, pull = case.gestures
+        assert (push.kind, push.point_mm, push.load, push.footprint_mm) == ("push", (4.0, 0.0), 0.1, 3.5)
+        assert push.direction == pytest.approx((0.0, 0.6, -0.8))
+        assert push.timing == (0.1, 0.3, 0.6, 0.9)
+        assert push.force_mn == pytest.approx(0.1 * case.tissue.young_kpa * 3.5**2)
+        assert (pull.kind, pull.point_mm, pull.direction) == ("pull", (-5.0, 1.0), pytest.approx((0, 0, 1)))
+        assert pull.force_mn == pytest.approx(1.5)
+        assert 3 <= pull.footprint_mm <= 6
+        assert tool_gesture.clearance(push, pull) >= 0
+    for drawn in ("azimuth_deg", "hover_mm"):
+        assert len({getattr(case.gesture, drawn) for case in cases}) == 20
+    assert len({case.further[0].timing for case in cases}) == 20
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"place": [11, 0]}, {"gesture": "slide", "direction": [0, 0, -1]}, {"load": 0.1, "force_mn": 1}],
+)
+def test_contradictions_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="instrument_list"):
+        job(wrong)
 
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     fem = schema.FemSection(law=law, tets=400, load=(0.1, 0.15), instruments=2, gestures=("pull", "push"))
-    gestures, frames = drawn(fem, 3), 17
-    tissue = Tissue(1.0, 0.4, law)
+    rng, frames, tissue = np.random.default_rng(3), 17, Tissue(1.0, 0.4, law)
+    gestures = scenario.draw_gestures(fem, OPENING_MM, tissue.young_kpa, rng, rng)
     tets, surface = block(fem), patch()
     motion = solver.deform(fem, tissue, gestures, tets, surface, frames, 25.0)
     np.testing.assert_allclose(motion.by_instrument.sum(axis=1), motion.force, atol=1e-12)
@@ -48,7 +85,7 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
         np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
 
 
-def test_a_force_takes_the_place_of_the_load() -> None:
+def test_a_force_replaces_the_load() -> None:
     fem = schema.FemSection(force_mn=(3.0, 5.0), young_kpa=(2.0, 3.0), footprint_mm=(3.0, 4.0))
     assert fem.largest_load == pytest.approx(5.0 / 18)
     for seed in range(20):

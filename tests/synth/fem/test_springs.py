@@ -1,0 +1,102 @@
+"""Springs of attachments and of the skull: what they hold and what stays free, in block and mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dome import ANATOMY
+from pydantic import ValidationError
+
+from synth.errors import UserError
+from synth.fem.material import Tissue
+from synth.fem.mesh import attachments, tetrahedra
+from synth.fem.mesh.tetrahedra import Tets, boundary
+from synth.fem.motion import Clock, march_in_time
+from synth.fem.system import assemble
+from synth.job import schema
+
+FALX = schema.AttachmentSection(point=(14, 0, -20), normal=(1, 0, 0), radius_mm=18, thickness_mm=6)
+
+
+def moved(tets: Tets) -> np.ndarray:
+    """Displacement (N, 3) mm under an even pull on the opening, upwards and aside."""
+    near = np.linalg.norm(tets.points, axis=1) < 7
+    outer = np.isin(np.arange(len(near)), tetrahedra.boundary(tets.cells[:, :4]))
+    return assemble(tets, "linear", 0.4).solve(np.outer(near & outer, (0.5, 0.0, 1.0)))
+
+
+def compared(free: Tets, held: Tets, region: schema.AttachmentSection, edge_mm: float) -> tuple[float, float]:
+    """Motion inside the region and farther than `edge_mm` from it, as parts of the motion without it."""
+    before, after = (np.linalg.norm(moved(tets), axis=1) for tets in (free, held))
+    inside = attachments.within(region, free.points)
+    wide = {"radius_mm": region.radius_mm + edge_mm, "thickness_mm": region.thickness_mm + 2 * edge_mm}
+    beyond = ~attachments.within(region.model_copy(update=wide), free.points)
+    assert inside.sum() >= 3
+    left = [float(after[at].sum() / before[at].sum()) for at in (inside, beyond)]
+    return left[0], left[1]
+
+
+@pytest.mark.slow
+def test_an_attachment_holds_its_region_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attachments, "_FIRM_PER_MM", 20.0)
+    free = tetrahedra.block(schema.AnatomySection(), 2500)
+    held = tetrahedra.block(schema.AnatomySection(attachments=(FALX,)), 2500)
+    inside, beyond = compared(free, held, FALX, 8.0)
+    assert inside < 0.1
+    assert beyond > 0.6
+
+
+def test_springs_scale_with_the_attachments_volume() -> None:
+    """A rigid shift by 1 mm costs firm/thickness times the volume of the sheet."""
+    tets = tetrahedra.block(schema.AnatomySection(), 1500)
+    disc = schema.AttachmentSection(point=(0, 0, -25), normal=(0, 0.6, 0.8), radius_mm=15, thickness_mm=4)
+    ones = np.ones(len(tets.points))
+    total = ones @ (attachments.springs(tets.points, tets.cells, (disc,)) @ ones)
+    assert total == pytest.approx(2 * np.pi * 15**2, rel=0.05)
+
+
+def test_an_attachment_without_tissue_or_direction_is_refused() -> None:
+    nowhere = schema.AttachmentSection(point=(0, 0, 40), radius_mm=5)
+    with pytest.raises(UserError, match="attachments"):
+        tetrahedra.block(schema.AnatomySection(attachments=(nowhere,)), 300)
+    for wrong in ({"normal": (0, 0, 0)}, {"radius_mm": -1}):
+        with pytest.raises(ValidationError):
+            schema.AttachmentSection.model_validate({"point": (0, 0, -20), "radius_mm": 5} | wrong)
+
+
+def test_slip_is_as_firm_along_the_normal_and_free_along_the_surface() -> None:
+    bonded = tetrahedra.block(ANATOMY, 300)
+    slipping = tetrahedra.block(ANATOMY, 300, slips=True)
+    assert bonded.slip is None
+    assert slipping.slip is not None
+    soft, firm = assemble(slipping, "linear", 0.4), assemble(bonded, "linear", 0.4)
+    top = boundary(bonded.cells)
+    top = np.unique(top[~bonded.fixed[top].all(axis=1)])
+    normal = np.zeros_like(bonded.points)
+    normal[top] = bonded.points[top] + [0, 0, ANATOMY.dome_mm]  # the dome's centre
+    shallow = top[bonded.points[top, 2] > -20]
+    normal[np.setdiff1d(np.arange(len(normal)), shallow)] = 0
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    along = np.cross(normal, [1.0, 0.3, 0.0])
+
+    def held(u: np.ndarray) -> tuple[float, float]:
+        return float(np.vdot(u, soft.springs(u))), float(np.vdot(u, firm.springs(u)))
+
+    slip, bond = held(normal)
+    assert slip == pytest.approx(bond, rel=0.04)  # coarse faces on a round dome
+    slip, bond = held(along)
+    assert slip < 0.02 * bond
+
+
+def test_damped_motion_comes_to_rest_in_equilibrium() -> None:
+    tets = tetrahedra.block(ANATOMY, 300, slips=True)
+    load = np.zeros_like(tets.points)
+    load[np.hypot(*tets.points[:, :2].T) < 15] = [0.05, 0.0, -0.02]
+    frames = 40
+    clock = Clock(0.5, 1, 1.0, 20.0)
+    found = march_in_time(
+        tets, Tissue(1.0, 0.4, "linear"), np.stack([load] * frames), np.full(frames, 0.1), clock
+    )
+    still = assemble(tets, "linear", 0.4).solve(load)
+    assert np.abs(found.displacement[-1] - still).max() <= 2e-3 * np.abs(still).max()
+    assert found.energy[-1] == pytest.approx(0.5 * float(np.vdot(load, still)), rel=5e-3)
