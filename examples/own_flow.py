@@ -35,10 +35,10 @@ class Farneback:
         flags = 0 if initial is None else cv2.OPTFLOW_USE_INITIAL_FLOW
         found = cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 4, 15, 5, 7, 1.5, flags)
         y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
-        seen = cv2.remap(
+        visible = cv2.remap(
             now_usable.astype(np.float32), x + found[..., 0], y + found[..., 1], cv2.INTER_LINEAR
         )
-        return np.asarray(found, np.float32), (rest_usable * (seen > 0.9)).astype(np.float32)
+        return np.asarray(found, np.float32), (rest_usable * (visible > 0.9)).astype(np.float32)
 
 
 def error_px(sequence: synth.Sequence) -> float:

@@ -19,7 +19,7 @@ def describe(sequence: synth.Sequence) -> dict[str, float]:
     # Traction is the label: over the area that each pixel sees it adds up to the force.
     traction, area = sequence["traction"][t], sequence["area"][:]  # (H, W, 3) kPa, (H, W) mm2
     labelled = np.linalg.norm(np.einsum("hwk,hw->k", traction, area))  # 1 kPa mm2 = 1 mN
-    flow, seen = sequence["flow"][t], sequence["visible"][t]  # (H, W, 2) px, (H, W)
+    flow, visible = sequence["flow"][t], sequence["visible"][t]  # (H, W, 2) px, (H, W)
     found = {
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "peak_force_mn": float(force[t]),
@@ -28,7 +28,7 @@ def describe(sequence: synth.Sequence) -> dict[str, float]:
     }
     if "flow_recovered" in sequence:
         error = np.linalg.norm(sequence["flow_recovered"][t] - flow, axis=2)
-        found["median_flow_error_px"] = float(np.median(error[seen]))
+        found["median_flow_error_px"] = float(np.median(error[visible]))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Renders one frame with its truth: a push on a cortex seen 15 degrees askew in warm light, without a folder.
+"""Renders one frame with its ground truth: a push on a cortex viewed at 15 degrees, without a folder.
 
 python examples/render_frame.py frame.png
 """
