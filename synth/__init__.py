@@ -2,5 +2,5 @@
 
 import lazy_loader
 
-# Importing this package loads nothing but this file; `__init__.pyi` lists the names and where they are.
+# Importing this package loads only this file; `__init__.pyi` lists the public names and their modules.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""The `synth` command. Heavy imports are inside the commands, so that `synth --help` answers at once."""
+"""The `synth` command. Heavy imports are inside the commands, so that `synth --help` is fast."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from synth.tune.command import tune
 app = typer.Typer(
     name="synth",
     cls=Commands,
-    help="Surgical-microscope sequences of a brain surface under load, with exact force and motion.",
+    help="Synthetic microscope sequences of a brain surface under load, with exact force and motion.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
@@ -47,7 +47,7 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
 @app.command(epilog="Example: synth schema > job.schema.json")
 def schema(
     fields: Annotated[
-        bool, typer.Option("--fields", help="Instead: the fields of a sequence, with axes, type and unit.")
+        bool, typer.Option("--fields", help="Print the fields of a sequence instead: axes, type, unit.")
     ] = False,
 ) -> None:
     """Prints the JSON schema of job files, for editors."""
@@ -61,17 +61,17 @@ def schema(
 def preview(
     job: Annotated[
         str,
-        typer.Argument(help="A job file, a named job, or a brain (OBJ, STL, PLY, OFF, VTK) to be opened."),
+        typer.Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK)."),
     ],
     overrides: Overrides = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
-    radius: Annotated[float, typer.Option(min=3, max=60, help="Of a brain's openings [mm].")] = 12.0,
+    radius: Annotated[float, typer.Option(min=3, max=60, help="Radius of a brain's craniotomy [mm].")] = 12.0,
     json: Json = False,
 ) -> None:
-    """Draws a contact sheet of a job's scenarios and says what the whole job will take.
+    """Draws a contact sheet of a job's scenarios and prints the time and disk that the whole job needs.
 
-    Of a brain's surface: draws the places where it can best be opened, and prints them as a job's lines.
+    For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
     from synth.dataset.size_forecast import amount
     from synth.geometry.brain_surface import KINDS
@@ -88,11 +88,11 @@ def preview(
         write_picture(out, openings.draw_openings(Path(job), chosen, radius, fill_holes))
         places = [one.craniotomy(radius).model_dump(include={"point", "direction"}) for one in chosen]
         lines = openings.as_job(Path(job), chosen, radius, fill_holes)
-        lines = f"# {out} shows these openings, the best first\n{lines}"
-        print(json_.dumps({"sheet": str(out), "openings": places}) if json else lines)
+        text = f"# {out} shows these craniotomies, the best first\n{lines}"
+        print(json_.dumps({"sheet": str(out), "openings": places}) if json else text)
         return
     read = reader.load_job(job, overrides or [])
-    with counting("Compiling the first time, drawing, then measuring what a sequence costs") as progress:
+    with counting("Compiling the first time, drawing, then measuring the cost of a sequence") as progress:
         made = contact_sheet.draw_sheet(read, count, progress)
     write_picture(out, made.picture)
     spent_s, cpu_s = made.stages_cpu_s, sum(made.stages_cpu_s.values())
@@ -115,7 +115,7 @@ def render(
         Path, typer.Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
     ] = Path("out"),
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes at a time; one a core if not given.")
+        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
     ] = None,
     engine: Annotated[
         str,
@@ -124,21 +124,21 @@ def render(
         ),
     ] = "local",
     gpus: Annotated[
-        str, typer.Option(help="GPUs that workers take in turn: auto, none, or numbers as 0,1.")
+        str, typer.Option(help="GPUs shared by the workers: auto, none, or numbers as 0,1.")
     ] = "auto",
     memory: Annotated[
-        float | None, typer.Option(help="Memory that a process may take [GB]; a share of what is free.")
+        float | None,
+        typer.Option(help="Memory limit of each process [GB]; default: its share of free memory."),
     ] = None,
     mix_versions: Annotated[
-        bool,
-        typer.Option("--mix-versions", help="Continue a dataset that another version of this program began."),
+        bool, typer.Option("--mix-versions", help="Continue a dataset that another version of Sulcus began.")
     ] = False,
     retry: Annotated[
-        bool, typer.Option("--retry", help="Take up again what failed in this folder before.")
+        bool, typer.Option("--retry", help="Compute sequences of this folder again that failed before.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Renders the dataset of a job. Exit code 1 when some of its sequences failed."""
+    """Renders the dataset of a job. Exit code 1 if some of its sequences failed."""
     from synth.dataset.folder import Folder
     from synth.engine.progress import RunBars
     from synth.engine.run import Options, run_job
@@ -157,11 +157,11 @@ def render(
         print(f"{summary.already + summary.done} of {summary.total} sequences in {out}")
         for index, reason in summary.failed.items():
             print(f"  {index:06d} failed: {reason}", file=sys.stderr)
-    if not summary.already and read.card.authors == type(read.card)().authors:  # asked for once
+    if not summary.already and read.card.authors == type(read.card)().authors:  # in the first run only
         licence = f"its licence is {read.card.licence}" if read.card.licence else "it has no licence"
         print(
-            f"note: the card names no maker, and {licence}: say card.authors and card.licence in the job "
-            "and give the command again, which changes the card alone",
+            f"note: the card names no author, and {licence}: set card.authors and card.licence in the job "
+            "and run the command again, which changes only the card",
             file=sys.stderr,
         )
     if summary.failed:
@@ -169,13 +169,13 @@ def render(
 
 
 def _end_on_terminate() -> None:
-    """SIGTERM, which clusters send, ends a run as Ctrl-C does: workers first, then in order."""
+    """Lets SIGTERM, which clusters send, end a run as Ctrl-C does."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
-    """Says what is done, running and failed, and what is still to come in time and disk."""
+    """Shows how many sequences are done, running and failed, and the time and disk still needed."""
     from dataclasses import asdict
 
     from synth.engine.status import lines, read_status
@@ -190,17 +190,17 @@ def split_command(
     by: Annotated[
         str, typer.Option(help="anatomy, opening, family, gesture, stiffness or sequence.")
     ] = "anatomy",
-    shares: Annotated[str, typer.Option(help="For train, validation and test.")] = "0.7,0.15,0.15",
+    shares: Annotated[str, typer.Option(help="Of train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[
-        list[str] | None, typer.Option(help="An appearance family that is only for testing.")
+        list[str] | None, typer.Option(help="An appearance family that is used for testing only.")
     ] = None,
     share_anatomy: Annotated[
         bool,
-        typer.Option("--share-anatomy", help="One brain may be on all sides: for a dataset of one brain."),
+        typer.Option("--share-anatomy", help="Allow one brain on all sides: for a dataset of one brain."),
     ] = False,
     json: Json = False,
 ) -> None:
-    """Splits a dataset anew, instead of as it was made: no anatomy and no held-out family on both sides."""
+    """Replaces the split of a dataset. No anatomy is on two sides, no held-out family in training."""
     from synth.dataset import index, split
     from synth.dataset.folder import Folder
     from synth.publish.card import write_card, write_page
@@ -216,16 +216,16 @@ def split_command(
         write_page(out, page)
     counts = split.count(rows)
     if chosen.share_anatomy:
-        print("warning: one brain may be on several sides: scores say nothing of others", file=sys.stderr)
+        print("warning: sides may share a brain: test scores don't hold for other brains", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 
 @app.command(epilog="Example: synth report out --to report.html")
 def report(
     out: Out,
-    to: Annotated[Path | None, typer.Option("--to", help="The page; report.html in the dataset.")] = None,
+    to: Annotated[Path | None, typer.Option("--to", help="The page; default: report.html in OUT.")] = None,
 ) -> None:
-    """Writes what describes a dataset anew: a page for browsers, its card README.md, and croissant.json."""
+    """Writes the description of a dataset again: report.html, its card README.md, and croissant.json."""
     from synth.dataset.folder import Folder
     from synth.dataset.index import write_index
     from synth.publish import croissant
@@ -255,13 +255,13 @@ def export(
     ] = "folder",
     overlay: Annotated[
         list[str] | None,
-        typer.Option(help="Over a video: flow, recovered, force, or none; repeat for more. Flow and force."),
+        typer.Option(help="Overlays of a video: flow, recovered, force, none. [default: flow and force]"),
     ] = None,
     interval: Annotated[
-        str | None, typer.Option(help="Of a video: from one time to another, FIRST:LAST in seconds.")
+        str | None, typer.Option(help="Time range of a video: FIRST:LAST in seconds.")
     ] = None,
 ) -> None:
-    """Writes the dataset in a format of others, or as films to look at."""
+    """Exports a dataset to the format of another library, or as videos."""
     from synth.publish.export.registry import export_dataset
 
     options = {}
@@ -269,20 +269,19 @@ def export(
         drawn = [name for name in overlay or ("flow", "force") if name != "none"]
         options = {"overlays": drawn, "interval_s": _interval(interval)}
     elif overlay or interval:
-        raise UserError("--overlay and --interval are of a video: say --to video")
+        raise UserError("--overlay and --interval need --to video")
     print(f"{export_dataset(out, target, to, **options)} sequences in {target}")
 
 
 def _interval(text: str | None) -> tuple[float, float] | None:
-    """FIRST:LAST in seconds; either may be left out."""
-
+    """The times of FIRST:LAST in seconds; either may be left out."""
     if text is None:
         return None
     first, colon, last = text.partition(":")
     with as_user_error(f"--interval {text}: is not FIRST:LAST in seconds"):
         start, end = float(first or "-inf"), float(last or "inf")
         if not colon or not start <= end:
-            raise ValueError("the first is above the last" if colon else "no colon")
+            raise ValueError("FIRST is after LAST" if colon else "no colon")
     return start, end
 
 
@@ -290,11 +289,11 @@ def _interval(text: str | None) -> tuple[float, float] | None:
 def verify(
     out: Out,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Some frames of some sequences, no checksums.")
+        bool, typer.Option("--fast", help="Check some frames of some sequences, without checksums.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Checks a dataset against its own invariants. Exit code 1 when one fails."""
+    """Checks the integrity and physical consistency of a dataset. Exit code 1 if a check fails."""
     from synth.checks.verify import verify_dataset
 
     report = verify_dataset(out, fast=fast)
@@ -315,15 +314,15 @@ def view(
     ] = None,
     frame: Annotated[
         list[int] | None,
-        typer.Option("--frame", "-f", help="Frame of a picture; repeat for more. [the strongest]"),
+        typer.Option("--frame", "-f", help="Frame of a picture; repeatable; default: the largest force."),
     ] = None,
     web: Annotated[
-        bool, typer.Option("--web", help="In a browser: for a machine without a window system.")
+        bool, typer.Option("--web", help="Open a browser, on a machine without a window system.")
     ] = False,
 ) -> None:
-    """Opens a sequence in rerun, on this machine only: frame, depth, flow, traction and force by time.
+    """Opens a sequence in the viewer rerun: frames, depth, flow, traction and force over time.
 
-    A picture has frames with their flow and force map side by side, as in the README.
+    A picture shows frames with their flow and force map side by side, as in the README.
     """
     from synth.dataset import location
     from synth.dataset.store import open_sequence
@@ -333,7 +332,7 @@ def view(
 
     pictured = save is not None and save.suffix != ".rrd"
     if frame and not pictured:
-        raise UserError("--frame is of a picture: give --save a name that ends with .png or .jpg")
+        raise UserError("--frame needs --save with a name that ends with .png or .jpg")
     _end_on_terminate()
     chosen = open_sequence(location.store(out, sequence))
     if save is None:
@@ -350,10 +349,10 @@ def view(
 
 @app.command(epilog="Example: synth doctor .")
 def doctor(
-    folder: Annotated[Path, typer.Argument(help="Where datasets are to go.")] = Path(),
+    folder: Annotated[Path, typer.Argument(help="Where datasets are to be written.")] = Path(),
     json: Json = False,
 ) -> None:
-    """Says what this machine offers, and what to do about what it lacks."""
+    """Reports what this machine offers, what it lacks, and how to fix that."""
     from synth.system.doctor import diagnose, lines
 
     found = diagnose(folder)

@@ -1,4 +1,4 @@
-"""Errors that a person caused and can mend: one clear line, exit code 2, no traceback."""
+"""Errors that the user caused and can fix: one clear line, exit code 2, no traceback."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 class UserError(Exception):
-    """Something in the job, the input or the machine that the user can put right.
+    """Something in the job, the input or the machine that the user can fix.
 
     The message is complete without a traceback; several problems are several lines. Command lines print it
     to stderr and exit with code 2.
@@ -19,7 +19,7 @@ class UserError(Exception):
 
 
 class InvalidValue(UserError, ValueError):
-    """A value that can't be: of a key, it is reported where the key stands."""
+    """A value that is not allowed; for a key of a configuration it is reported with the key's line."""
 
 
 class NotFinite(UserError):
@@ -27,11 +27,11 @@ class NotFinite(UserError):
 
 
 class Caution(UserWarning):
-    """Something that the user should know, though nothing is refused; command lines print it to stderr."""
+    """A warning for the user, who can continue; command lines print it to stderr."""
 
 
 def as_path(what: str, value: object) -> Path:
-    """`value` as a path; UserError that names `what` for anything that can't be one."""
+    """`value` as a path; UserError that names `what` for any other type."""
     if not isinstance(value, (str, Path)):
         raise UserError(f"{what}: expected a path, got {type(value).__name__}")
     return Path(value)
@@ -47,16 +47,16 @@ def as_positive(what: str, value: object, largest: float = math.inf) -> float:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`; did you mean 'x'?`, or nothing where no known word is near."""
+    """`; did you mean 'x'?`, or an empty text if no known word is similar."""
     close = difflib.get_close_matches(word[:80], list(known), 1)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
 @contextmanager
 def as_user_error(label: str) -> Iterator[None]:
-    """Makes one line after `label` of whatever the block raises: for code and formats of others.
+    """Turns any exception of third-party code or formats in the block into a one-line UserError with `label`.
 
-    Their `sys.exit` too; what is too little memory stays that.
+    `sys.exit` included; a MemoryError stays one.
     """
     try:
         yield
@@ -70,5 +70,5 @@ def as_user_error(label: str) -> Iterator[None]:
 
 
 def first_line(error: object) -> str:
-    """What an error says in its first line; its name where it says nothing."""
+    """The first line of an error's message; the name of its type if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

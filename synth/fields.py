@@ -1,4 +1,4 @@
-"""The field table: every array of a sequence, declared once for writer, reader, verify, card and docs."""
+"""The field table: every array of a sequence, declared once for writer, reader, checks, card and docs."""
 
 from __future__ import annotations
 
@@ -11,32 +11,23 @@ TIME, ROW, COLUMN = "frame", "row", "column"
 
 @dataclass(frozen=True)
 class Field:
-    """One array of a sequence.
-
-    `dims` names the axes; an axis that is neither frame, row nor column is named after what it lists and
-    has the length given in `length`.
-    """
+    """One array of a sequence."""
 
     name: str
-    dims: tuple[str, ...]
+    dims: tuple[str, ...]  # names of the axes
     dtype: str
     unit: str
     meaning: str
-    length: int = 0
-    stored: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "asked"] = "always"
-    """When a sequence has it, see `STORED_WHEN`."""
-    half: bool = False
-    """Whether `store.flow: float16` stores it in half the space."""
-    packed: float = 0.1
-    """Stored size over raw size, measured on rendered sequences: for forecasts before there is one."""
-    low: float | None = None
-    """Smallest value that can be right; checked by verify."""
-    high: float | None = None
-    """Largest value that can be right; checked by verify."""
+    length: int = 0  # of the axis that is neither frame, row nor column
+    stored: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "extra"] = "always"
+    half: bool = False  # whether `store.flow: float16` stores it as float16
+    packed: float = 0.1  # stored size over raw size, measured on rendered sequences, for forecasts
+    low: float | None = None  # smallest plausible value, checked by `synth verify`
+    high: float | None = None  # largest plausible value, checked by `synth verify`
 
     @property
     def framed(self) -> bool:
-        """Whether it has one slice a frame that is as large as a picture."""
+        """Whether it has one slice per frame of the size of the picture."""
         return self.dims[:3] == (TIME, ROW, COLUMN)
 
     @property
@@ -53,12 +44,12 @@ class Field:
 STORED_WHEN = {
     "always": "always",
     "usually": "unless in `store.without`",
-    "recovered": "with an estimator of flow",
+    "recovered": "with a flow estimator",
     "stereo": "with `render.stereo_mm`",
-    "stereo recovered": "with both of these",
-    "asked": "if in `store.extra`",
+    "stereo recovered": "with `render.stereo_mm` and a flow estimator",
+    "extra": "if in `store.extra`",
 }
-"""What each value of `Field.stored` means."""
+"""When a sequence has a field, by `Field.stored`."""
 
 _STILL = (ROW, COLUMN)
 _VIDEO = (TIME, ROW, COLUMN)
@@ -76,7 +67,8 @@ _TABLE = (
           "pixels; 0 outside tissue",
           length=2, half=True, packed=0.25, low=-1e4, high=1e4),
     Field("visible", _VIDEO, "bool", "-",
-          "the rest pixel's material point is seen in this frame (not hidden by tool, tissue or edge)",
+          "whether the rest pixel's material point is visible in this frame: not hidden by the instrument "
+          "or tissue, nor outside the picture",
           packed=0.008),
     Field("tissue", _STILL, "bool", "-",
           "brain surface, in the rest frame",
@@ -94,7 +86,7 @@ _TABLE = (
           "load on the tissue per rest area, camera axes, on the rest frame's pixels",
           length=3, packed=0.025, low=-1e4, high=1e4),
     Field("area", _STILL, "float32", "mm^2",
-          "rest surface area that each rest pixel sees",
+          "surface area at rest that each pixel of the rest frame covers",
           packed=0.26, low=0.0),
     Field("force", (TIME, "xyz"), "float64", "mN",
           "total load on the tissue, camera axes",
@@ -106,54 +98,53 @@ _TABLE = (
           "the estimator's confidence in the recovered flow, 0..1",
           stored="recovered", packed=0.24, low=0.0, high=1.0),
     Field("flow_noisy", (*_VIDEO, "xy"), "float32", "px",
-          "the true motion with the published method's noise, as the job's labels ask",
-          length=2, stored="asked", packed=0.45, low=-1e4, high=1e4),
+          "the true motion with the published method's noise, as set by the job's key labels",
+          length=2, stored="extra", packed=0.45, low=-1e4, high=1e4),
     Field("intensity", _VIDEO, "float32", "mN",
           "the published method's label: size of the load, scaled to peak at the total force, with "
-          "noise as the job's labels ask; on the rest frame's pixels",
-          stored="asked", packed=0.1, low=0.0),
+          "noise as set by the job's key labels; on the rest frame's pixels",
+          stored="extra", packed=0.1, low=0.0),
     Field("flow_next", (*_VIDEO, "xy"), "float32", "px",
           "true motion from this frame to the next, on this frame's pixels; 0 off tissue, and at the "
           "end",
-          length=2, stored="asked", half=True, packed=0.4, low=-1e4, high=1e4),
+          length=2, stored="extra", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("normals", (*_VIDEO, "xyz"), "float32", "-",
-          "unit normal of what this frame's pixel sees, camera axes; 0 where nothing is hit",
-          length=3, stored="asked", packed=0.6, low=-1.001, high=1.001),
+          "unit normal of the surface at each pixel of this frame, camera axes; 0 where nothing is hit",
+          length=3, stored="extra", packed=0.6, low=-1.001, high=1.001),
     Field("blur", _VIDEO, "float32", "px",
-          "radius of the circle of confusion of what this frame's pixel sees; 0 where nothing is hit",
-          stored="asked", packed=0.5, low=0.0),
+          "radius of the circle of confusion at each pixel of this frame; 0 where nothing is hit",
+          stored="extra", packed=0.5, low=0.0),
     Field("radiance", (*_VIDEO, "rgb"), "float16", "-",
           "linear light at the sensor, before exposure and noise; 1 is a white surface under the lamps",
-          length=3, stored="asked", packed=0.9, low=0.0),
+          length=3, stored="extra", packed=0.9, low=0.0),
     Field("camera", (TIME, "to", "from"), "float64", "mm",
-          "world axes (homogeneous) to this frame's camera axes",
-          length=4, stored="asked"),
+          "transform from world axes (homogeneous) to this frame's camera axes",
+          length=4, stored="extra"),
     Field("rgb_right", (*_VIDEO, "rgb"), "uint8", "sRGB",
-          "picture of the second lens of a stereo pair, render.stereo_mm to the right",
+          "picture of the right camera, render.stereo_mm to the right of the left one",
           length=3, stored="stereo", packed=1.0),
     Field("flow_right", (*_VIDEO, "xy"), "float32", "px",
-          "as flow, in the second lens's pictures; 0 outside tissue",
+          "as flow, in the right camera's pictures; 0 outside tissue",
           length=2, stored="stereo", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("visible_right", _VIDEO, "bool", "-",
-          "as visible, in those pictures",
+          "as visible, in the right camera's pictures",
           stored="stereo"),
     Field("depth_right", _VIDEO, "float32", "mm",
-          "as depth, in the second lens's pictures",
+          "as depth, in the right camera's pictures",
           stored="stereo", packed=0.6, low=0.0),
     Field("motion", (*_VIDEO, "xyz"), "float32", "mm",
           "true motion of the material points from the rest frame to this one, camera axes (each "
           "frame's own), on the rest frame's pixels; 0 outside tissue",
           length=3, stored="stereo", packed=0.25, low=-1e4, high=1e4),
     Field("disparity", _STILL, "float32", "px",
-          "column of a rest pixel's point in the left eye less that in the right, without distortion: "
+          "column of a rest pixel's point in the left picture less that in the right, without distortion: "
           "K[0,0] B / depth - (K_right[0,2] - K[0,2]); 0 outside tissue",
           stored="stereo", packed=0.6, low=-1e4, high=1e4),
     Field("motion_recovered", (*_VIDEO, "xyz"), "float32", "mm",
-          "motion recovered from both eyes' videos as the job's flow.stereo says, camera axes",
+          "motion recovered from both cameras' videos, camera axes",
           length=3, stored="stereo recovered", packed=0.7, low=-1e4, high=1e4),
     Field("motion_deviation", (*_VIDEO, "xyz"), "float32", "mm",
-          "standard deviation of each component of motion_recovered, estimated with it; 0 outside "
-          "tissue",
+          "estimated standard deviation of each component of motion_recovered; 0 outside tissue",
           length=3, stored="stereo recovered", packed=0.7, low=0.0),
 )
 # fmt: on
@@ -163,11 +154,11 @@ FIELDS: dict[str, Field] = {field.name: field for field in _TABLE}
 
 _RIGHT = ("rgb_right", "flow_right", "visible_right", "depth_right")
 
-EXTRA = tuple(name for name, field in FIELDS.items() if field.stored == "asked" or name in _RIGHT)
-"""What a job's `store.extra` may name; the second lens's, once asked for one by one, come with it."""
+EXTRA = tuple(name for name, field in FIELDS.items() if field.stored == "extra" or name in _RIGHT)
+"""Fields that a job's `store.extra` may name; those of the right camera are stored with it in any case."""
 
 SPARED = ("depth", "flow_confidence", "flow_right", "visible_right", "depth_right")
-"""What a job's `store.without` may name: nothing else can be computed without the rest."""
+"""Fields that a job's `store.without` may name; all others are needed."""
 
 
 def stored_fields(
@@ -175,11 +166,7 @@ def stored_fields(
 ) -> tuple[str, ...]:
     """Names of the fields that a sequence holds, in the table's order.
 
-    Args:
-        extra: as the job's `store.extra`.
-        without: as the job's `store.without`.
-        recovered: whether an estimator of flow runs.
-        stereo: whether there is a second lens.
+    `extra` and `without` are the job's keys of `store`; `recovered`: a flow estimator runs.
     """
     conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": stereo and recovered}
     kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}

@@ -1,4 +1,4 @@
-"""Plug-ins: what other packages offer under a name of their own, found by entry points."""
+"""Plug-ins: flow estimators and material laws of other packages, found by entry points."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from numpy.typing import NDArray
 from synth.errors import InvalidValue, UserError, as_user_error, did_you_mean
 
 STORED = object()
-"""Context in which the job of a dataset is validated: reading it needs none of the plug-ins that made it."""
+"""Validation context of a stored job: reading a dataset needs none of the plug-ins that created it."""
 
 
 def check_answer(
     label: str, what: str, found: Any, shape: tuple[int, ...], limits: tuple[float, float] = (-3e38, 3e38)
 ) -> NDArray[np.float32]:
-    """An array that a plug-in or a caller gave, (...) float32 of that shape and within finite limits.
+    """An array returned by a plug-in or passed by a caller, as (...) float32 of that shape and within limits.
 
-    UserError that names who (`Registry.label`) and `what` of its answer for anything else.
+    Raises a UserError that begins with `label` and `what` for anything else.
     """
     with as_user_error(f"{label}: {what}"):
         array = np.asarray(found, np.float32)
         if array.shape != shape:
             raise InvalidValue(f"shape {array.shape}, expected {shape}")
         low, high = float(array.min(initial=0)), float(array.max(initial=0))
-        if not (limits[0] <= low and high <= limits[1]):  # NaN is none either
+        if not (limits[0] <= low and high <= limits[1]):  # also for NaN
             raise InvalidValue(f"from {low:g} to {high:g}, expected {limits[0]:g} to {limits[1]:g}")
     return array
 
 
 class Registry:
-    """Everything of one kind by name: ours, what `add` was given, and what installed packages offer."""
+    """Plug-ins of one kind by name: built-in ones, those passed to `add`, and those of installed packages."""
 
     def __init__(self, group: str, key: str, noun: str, own: Mapping[str, str], *further: str) -> None:
-        """`group`: of entry points; `key` and `noun`: what a job asks for it by, and what it is, in messages.
+        """`group`: of entry points; `key`: the job's key that names one; `noun`: the kind, for messages.
 
-        `own`: ours by name, `module:attribute` as an entry point has it, empty where nothing is to be loaded.
-        A plug-in doesn't take the name of one of ours. `further`: what else a job may say there.
+        `own`: built-in ones as `module:attribute`, empty where nothing is to be loaded; they take precedence
+        over plug-ins of the same name. `further`: other values of the job's key.
         """
         self.group, self.own = group, own
         self._key, self._noun, self._further = key, noun, further
         self._added: dict[str, Any] = {}
 
     def names(self) -> tuple[str, ...]:
-        """What can be named here: our own, then the others in order."""
+        """All names: the built-in ones, then the others in order."""
         return (*self.own, *sorted({*self._points(), *self._added} - set(self.own)))
 
     def check_name(self, name: str, info: Any) -> str:
-        """`name`, if it can be asked for, or `info.context` is STORED. InvalidValue else."""
+        """Returns `name` if it is known or `info.context` is STORED, else raises InvalidValue."""
         known = (*self._further, *self.names())
         if name not in known and info.context is not STORED:
             hint = did_you_mean(name, known)
@@ -58,26 +58,25 @@ class Registry:
         return name
 
     def add(self, name: str, thing: Any) -> None:
-        """Gives a thing a name in this process. UserError if the name is taken."""
+        """Registers a plug-in in this process. UserError if the name is taken."""
         if name in self.names():
             raise UserError(f"{self._key}: the name {name!r} is taken")
         self._added[name] = thing
 
     def source(self, name: str) -> str:
-        """Package and version that a plug-in comes from; empty for what no package brings."""
+        """Name and version of the package that a plug-in comes from; empty for built-in and added ones."""
         point = None if name in self.own else self._points().get(name)
         return f"{point.dist.name} {point.dist.version}" if point and point.dist else ""
 
     def label(self, name: str) -> str:
-        """How messages name it: `fem.law my-law (package.module:Law)`."""
+        """The plug-in's name in messages: `fem.law my-law (package.module:Law)`."""
         at = "" if name in self._added else f" ({self._point(name).value})"
         return f"{self._key} {name}{at}"
 
     def load(self, name: str) -> Any:
-        """What stands under `name`: the entry point's object, called without arguments if it can be called.
+        """The object registered under `name`; that of an entry point is called without arguments if callable.
 
-        Raises:
-            UserError: there is nothing of that name, or whatever a package raises in loading it.
+        Raises UserError if there is none, or for any exception of its package in loading it.
         """
         if name in self._added:
             return self._added[name]
@@ -107,4 +106,4 @@ ESTIMATORS = Registry(
     },
     "ideal",
 )
-"""Estimators of flow: an entry point is a callable without arguments that gives a `synth.flow.Estimator`."""
+"""Flow estimators: an entry point is a callable without arguments that returns a `synth.Estimator`."""

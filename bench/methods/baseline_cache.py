@@ -26,4 +26,4 @@ def cached_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str,
     key = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
     # Half a file, of a disk that was full, is no fit; nor is one of another Python.
     faults = EOFError, pickle.UnpicklingError, AttributeError, ImportError
-    return cache.kept("baselines/pickle", key, fit, pickle.dumps, pickle.loads, faults, _MOST)
+    return cache.cached("baselines/pickle", key, fit, pickle.dumps, pickle.loads, faults, _MOST)

@@ -119,7 +119,7 @@ def build(components: int, tissue: TissueKind) -> Compliance:
 def _stored(tissue: TissueKind) -> NDArray[np.float32]:
     """(3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
-    return cache.kept(
+    return cache.cached(
         "compliance/npy",
         code + f"{tissue}".encode(),
         lambda: _solved(tissue).astype(np.float32),

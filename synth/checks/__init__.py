@@ -1,1 +1,1 @@
-"""Checking a dataset against its own invariants."""
+"""Checks of a dataset's integrity and physical consistency."""

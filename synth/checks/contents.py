@@ -1,4 +1,4 @@
-"""What a store holds is what was sealed: attributes, fields, and every value, which is read once."""
+"""Checks of a store's content against its seal: attributes, fields, and all values, each read once."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ from synth.dataset.store import Sequence
 from synth.fields import FIELDS
 from synth.system.stopwatch import Stopwatch
 
-VALUES = {
-    "checksum": "Every value is the one that was written.",
+VALUES = {  # the checks of `check_values`
+    "checksum": "No value has changed since it was written.",
     "finite": "No value is NaN or infinite.",
-    "range": "Every value is in the range that the field table gives.",
+    "range": "All values are within the range in the field table.",
 }
-"""What `check_values` checks, by name."""
 
 
 def seal(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """The attributes are those that were sealed, under the name that was given."""
+    """The attributes are unchanged since the seal, and the store's name is the sequence's index."""
     yield truth(sequence.is_sealed(), "attributes were edited")
-    yield truth(sequence.path.stem == f"{sequence.index:06d}", "is another sequence than its name says")
+    yield truth(sequence.path.stem == f"{sequence.index:06d}", "its name is not its index")
 
 
 def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """The fields are those that the table declares: shape, type, unit, meaning, axes."""
+    """The fields are as declared in the field table: shape, type, unit, meaning, axes."""
     for field in FIELDS.values():
         if field.name in sequence:
             found = sequence[field.name]
@@ -42,16 +41,9 @@ def schema(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 def check_values(
     sequence: Sequence, frames: list[int], fast: bool, watch: Stopwatch
 ) -> Iterator[tuple[str, Measure]]:
-    """Measures by the name of their check in `VALUES`.
+    """Measures by the name of their check in `VALUES`; `watch` times each, and reading as `readable`.
 
-    Args:
-        sequence: an opened store.
-        frames: where to look when `fast`.
-        fast: no checksums, and of large fields only `frames`.
-        watch: takes the time of each check, and of reading as `readable`.
-
-    Raises:
-        UserError: a chunk cannot be read.
+    `fast`: no checksums, and only `frames` of large fields. UserError if a chunk cannot be read.
     """
     for name in sequence.fields:
         field, found = FIELDS[name], sequence[name]
@@ -71,8 +63,8 @@ def check_values(
                     low, high = min(low, float(values.min())), max(high, float(values.max()))
         if hasher is not None:
             good = hasher.hexdigest() == sequence.attrs["field_hashes"][name]
-            yield "checksum", truth(good, f"{name}: values are not those that were written")
-        yield "finite", truth(finite, f"{name}: holds values that are no numbers")
+            yield "checksum", truth(good, f"{name}: values were changed")
+        yield "finite", truth(finite, f"{name}: contains values that are not finite")
         if finite and field.low is not None:
             yield "range", Measure(field.low - low, 0.0, f"{name}: smallest value {low:g}", field.unit)
         if finite and field.high is not None:

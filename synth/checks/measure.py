@@ -1,4 +1,4 @@
-"""What a check finds: a number, the limit that it must keep, and where."""
+"""The result of a check: a number, its limit, and its place."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from synth.dataset.store import Sequence
 
 @dataclass(frozen=True)
 class Measure:
-    """One number that must not exceed its limit, and where it was found."""
+    """A number that must not exceed its limit, and its place in the dataset."""
 
     value: float
     limit: float
     where: str
-    unit: str = "-"
-    """Of value and limit."""
+    unit: str = "-"  # of value and limit
 
     @property
     def good(self) -> bool:
@@ -28,23 +27,22 @@ class Measure:
 
     @property
     def severity(self) -> float:
-        """Above 1 is bad; compares measures whose limits differ."""
+        """Value relative to the limit, above 1 if bad; compares measures with different limits."""
         if self.limit > 0:
             return self.value / self.limit
         return 0.0 if self.good else np.inf
 
 
-Invariant = Callable[[Sequence, list[int]], Iterator[Measure]]
-"""Measures of a sequence in the frames given."""
+Invariant = Callable[[Sequence, list[int]], Iterator[Measure]]  # measures of a sequence in some frames
 
 
 def truth(good: bool, where: str) -> Measure:
-    """A measure of what either holds or not."""
+    """A measure of a condition that holds or not."""
     return Measure(0.0 if good else 1.0, 0.0, where)
 
 
 def inner(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """The mask (H, W) without the `pixels` next to its edge and the picture's."""
+    """The mask (H, W) eroded by `pixels`, also at the edge of the picture."""
     side = 2 * pixels + 1
     core = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0)
     return np.asarray(core, bool)

@@ -1,4 +1,4 @@
-"""What must hold between camera, depth, flow and load in every sequence: they are computed apart."""
+"""Consistency of camera, depth, flow and load in every sequence: they are computed separately."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 
 def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """K, distortion and depth span the area that each pixel says it sees, at the scale stated (relative)."""
+    """The area per pixel and the scale agree with K, distortion and depth (relative)."""
     if "depth" not in sequence:
         return
     view, (height, width) = camera_of(sequence), sequence.size
@@ -34,14 +34,14 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     inside = core[1:-1, 1:-1]
     area = np.maximum(sequence["area"][:][1:-1, 1:-1][inside], 1e-12)
     off = np.abs(spanned[inside] / area - 1)
-    yield Measure(float(np.median(off)), 0.02, "area of the middle pixel")
-    yield Measure(float(np.quantile(off, 0.9)), 0.3, "area of all but a tenth of the pixels")
+    yield Measure(float(np.median(off)), 0.02, "area of the median pixel")
+    yield Measure(float(np.quantile(off, 0.9)), 0.3, "area of 90% of the pixels")
     scale = float(np.median(depth[core])) / float(np.sqrt(view.K[0, 0] * view.K[1, 1]))
     yield Measure(abs(scale / view.mm_per_px - 1), 0.08, "scale")
 
 
 def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """The middle of the load, moved by the flow, is where the camera sees the instrument's tips [mm]."""
+    """The centre of the load, moved by the flow, is at the projection of the instrument's tips [mm]."""
     instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
     if len(instruments) != 1:
         return
@@ -55,7 +55,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     for t in frames:
         size = np.linalg.norm(sequence["traction"][t], axis=-1)
         share = size * area
-        # Written so that a peak that is no number passes the frame over.
+        # `not ... >` also skips the frame if the peak is NaN.
         if (size[~inside] > 0.02 * size.max()).any() or not share.sum() > 0.05 * peak:
             continue
         share = share / share.sum()
@@ -68,7 +68,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
-    """World to camera axes in every frame, (T, 4, 4) mm: as stored, else as the scenario moves the camera."""
+    """World to camera axes in every frame, (T, 4, 4) mm: as stored, else by the scenario's camera motion."""
     if "camera" in sequence.fields:
         return np.asarray(sequence["camera"][:])
     moves = sequence.attrs["scenario"].get("camera_motion")
@@ -77,7 +77,7 @@ def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
 
 
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:
-    """The camera of a sequence, or another `lens` of its attributes; aperture and focus aren't stored."""
+    """The camera of a sequence, or that of another `lens` in its attributes, without aperture and focus."""
     lens, (height, width) = lens or sequence.attrs, sequence.size
     return cameras.Camera(
         K=np.asarray(lens["K"], np.float64),

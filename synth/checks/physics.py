@@ -1,4 +1,4 @@
-"""What must hold of motion, load and picture in every sequence, each with the limit that it must keep."""
+"""Consistency of motion, load and picture in every sequence, each with its limit."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from synth.dataset.store import Sequence
 
 Floats = NDArray[np.floating]
 
-# A point may come back so far off: tissue that is pressed together or seen at a slant lands in few pixels.
+# Error of a point moved forward and back: compressed or slanted tissue is projected to few pixels.
 _RETURN_PX = 4.0
-_COMPLIANCE_STEP = 0.25
-_PULSE_KNOWN = 0.1
+_COMPLIANCE_STEP = 0.25  # relative change from frame to frame
+_PULSE_KNOWN = 0.1  # relative uncertainty of the pulse's work
 
 
 def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
@@ -32,7 +32,7 @@ def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Traction times area, summed over the pixels, is the force (relative), where the contact is in view."""
+    """Traction times area, summed over the pixels, equals the force (relative) if the contact is in view."""
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     applied = sequence["force"][:]
     peak = np.linalg.norm(applied, axis=1).max()
@@ -47,12 +47,12 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Displacement per force changes from frame to frame no faster than the force does, plus a quarter.
+    """The compliance changes from frame to frame by no more than the force, plus a quarter.
 
-    2 energy / |force|^2 is the loaded mean of the displacement along the force, per force. With a pulse, the
-    tools' work on the motion that is theirs stands for the energy; the pulse's own work is known to a tenth
-    (a neo-Hookean law's answer to it is taken as linear). Motion with inertia or relaxation, where the past
-    counts too, is left out.
+    Compliance is 2 energy / |force|^2, the load-weighted mean of the displacement along the force, per force.
+    With a pulse, the instruments' work on the motion that they cause replaces the energy; the pulse's own
+    work is known to a tenth (the tissue's response to it is treated as linear). Motion with inertia or
+    relaxation is not checked.
     """
     mechanics = sequence.attrs.get("mechanics") or {}
     raised = mechanics.get("pulse_work_mn_mm")
@@ -61,7 +61,7 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         return
     instruments = mechanics["instruments"]
     if raised is not None and len(instruments) > 1:
-        return  # their shares of the pulse may cancel, what is not known of them does not
+        return  # the instruments' shares of the pulse may cancel, but not their uncertainties
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)
     work = np.asarray(mechanics[known], np.float64)
     pulse = np.zeros(len(work)) if raised is None else _PULSE_KNOWN * np.abs(np.asarray(raised, np.float64))
@@ -77,7 +77,7 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """No point counts as visible that has left the picture or is behind the instrument (share of pixels)."""
+    """No visible point has left the picture or is behind the instrument (share of pixels)."""
     height, width = sequence.size
     for t in frames:
         x, y = _targets(sequence["flow"][t])
@@ -92,7 +92,7 @@ def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Undoing the true motion makes a frame look like the rest frame: difference left (relative)."""
+    """A frame warped back by the true flow resembles the rest frame: remaining difference (relative)."""
     first = _contrast(sequence["rgb"][0])
     clear = sequence["tissue"][:] & ~_near(sequence["tool"][0] | sequence["glare"][0])
     for t in frames:
@@ -100,7 +100,7 @@ def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         x, y = _targets(flow)
         blocked = _near(sequence["tool"][t] | sequence["glare"][t])
         free = cv2.remap(blocked.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderValue=1) == 0
-        # Less motion hardly changes smooth tissue: what sparkles and noise are all that is left.
+        # Smaller motion hardly changes smooth tissue: differences would be highlights and noise only.
         moved = np.hypot(flow[..., 0], flow[..., 1]) > 3.0
         where = clear & sequence["visible"][t] & free & ~blocked & moved
         if where.sum() < 200:
@@ -112,7 +112,7 @@ def warp(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Forward by the flow and back, a visible point is where it was; none is seen from behind (share)."""
+    """A visible point moved forward by the flow and back returns; no surface is turned over (share)."""
     for t in frames:
         x, y = _targets(sequence["flow"][t])
         visible = sequence["visible"][t] & sequence["tissue"][:]
@@ -121,13 +121,13 @@ def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]
         _, landed, times = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
         landed, off = landed.ravel(), np.zeros(len(landed))
         for start in np.nonzero(visible):
-            # Back from a pixel of this frame: the mean of all rest pixels that came to it.
+            # Back from a pixel of this frame: the mean of all rest pixels that moved to it.
             off += (start - (np.bincount(landed, start) / times)[landed]) ** 2
-        yield Measure(float((off > _RETURN_PX**2).sum()) / count, 0.005, f"frame {t}: not where it was")
+        yield Measure(float((off > _RETURN_PX**2).sum()) / count, 0.005, f"frame {t}: points don't return")
         corners = visible[:-1, :-1] & visible[1:, :-1] & visible[:-1, 1:]
         turned = (x[:-1, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, :-1])
         turned -= (y[:-1, 1:] - y[:-1, :-1]) * (x[1:, :-1] - x[:-1, :-1])
-        yield Measure(float((corners & (turned < 0)).sum()) / count, 0.005, f"frame {t}: seen from behind")
+        yield Measure(float((corners & (turned < 0)).sum()) / count, 0.005, f"frame {t}: turned over")
 
 
 def _targets(flow: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -141,7 +141,7 @@ def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _contrast(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Brightness without its local mean and scale, so that light and shadow do not count."""
+    """Brightness normalised by its local mean and contrast, to be independent of lighting."""
     grey = cv2.GaussianBlur(rgb.mean(axis=2, dtype=np.float32), (0, 0), 1.0)
     mean = cv2.GaussianBlur(grey, (0, 0), 8.0)
     spread = np.sqrt(np.maximum(cv2.GaussianBlur((grey - mean) ** 2, (0, 0), 8.0), 1.0))

@@ -1,4 +1,4 @@
-"""What must hold between the two eyes of a stereo sequence: flows, depths and motion are stored apart."""
+"""Consistency of both cameras of a stereo sequence: flows, depths and motion are stored separately."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from synth.render.camera import camera as cameras
 
 Floats = NDArray[np.float64]
 
-_EVERY = 9  # rest pixels from one that is looked at to the next
-_FEWEST = 50  # points whose median is looked at
-_HALF_PX = 0.008  # a flow below 32 px in half floats is rounded by so much
+_EVERY = 9  # every 9th rest pixel is checked
+_FEWEST = 50  # least number of points for a median
+_HALF_PX = 0.008  # rounding of a flow below 32 px in float16
 
 
 def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Both eyes' flows and depths, rest disparity and motion in space say the same [px, relative]."""
+    """Flows and depths of both cameras, rest disparity and motion in space agree [px, relative]."""
     needed = {"motion", "disparity", "depth"}
     if any(name not in sequence for name in needed):
         return
@@ -41,7 +41,7 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         flow = cameras.to_pixels(left, moved) - pixels
         off = _worst(sequence["flow"][t][rows, columns] - flow)
         yield Measure(off, 1e-3 + half, f"frame {t}: left flow from motion", "px")
-        # Medians, for edges lie between.
+        # Medians, as interpolation is wrong at edges.
         visible = sequence["visible"][t][rows, columns]
         yield from _depth(sequence, t, "depth", cameras.to_pixels(left, moved), moved, visible)
         aside = np.array([right.translation - left.translation])
@@ -52,28 +52,24 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
                 off_px = np.abs(_sampled(sequence["flow_right"][t], start) - (end - start))[visible]
                 middle, most = np.quantile(off_px.max(axis=1), (0.5, 0.95)).tolist()
                 yield Measure(middle, 5e-3 + half, f"frame {t}: right flow from motion", "px")
-                yield Measure(most, 0.1 + half, f"frame {t}: right flow of nearly all", "px")
+                yield Measure(most, 0.1 + half, f"frame {t}: right flow of 95%", "px")
         yield from _depth(sequence, t, "depth_right", end, moved, visible)
 
 
 def right_of(sequence: Sequence) -> cameras.Camera:
-    """The second lens of a stereo sequence at rest.
-
-    Raises:
-        KeyError: the sequence has none.
-    """
+    """The right camera of a stereo sequence at rest. KeyError if there is none."""
     return optics.camera_of(sequence, sequence.attrs["right"])
 
 
 def _depth(
     sequence: Sequence, t: int, name: str, pixels: Floats, moved: Floats, visible: NDArray[np.bool_]
 ) -> Iterator[Measure]:
-    """An eye's depth at pixels (N, 2), against that of the points (N, 3) mm that it sees there."""
+    """A camera's depth at pixels (N, 2), against that of the points (N, 3) mm visible there."""
     if name in sequence and visible.sum() > _FEWEST:
         off = np.abs(_sampled(sequence[name][t], pixels) - moved[:, 2])[visible]
         middle, most = (np.quantile(off, (0.5, 0.9)) / float(sequence.attrs["translation"][2])).tolist()
         yield Measure(middle, 2e-5, f"frame {t}: {name} from motion")
-        yield Measure(most, 5e-4, f"frame {t}: {name} of nearly all")
+        yield Measure(most, 5e-4, f"frame {t}: {name} of 90%")
 
 
 def _sampled(field: NDArray[np.floating], pixels: Floats) -> NDArray[np.float32]:

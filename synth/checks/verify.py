@@ -1,4 +1,4 @@
-"""Checking a dataset against its own invariants: each named, counted, timed, with its worst offender."""
+"""`synth verify`: all checks of a dataset, each with its counts, time and worst measure."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ INVARIANTS: dict[str, Invariant] = {
         stereo.stereo,
     )
 }
-"""Every invariant of a sequence by name, in the order in which they are checked; docstrings are meanings."""
+"""All invariants of a sequence by name, in the order of their checks; docstrings are their meanings."""
 
 MEANINGS = {
-    "dataset": "the job, the index and the sequences agree",
-    "splits": "no anatomy, copy or held-out family is on a side where it may not be",
-    "readable": "every store opens and every chunk decodes",
+    "dataset": "Job, index and sequences agree.",
+    "splits": "No anatomy or copy is on two sides, no held-out family in training.",
+    "readable": "Every store can be opened and every chunk decoded.",
     **contents.VALUES,
     **{name: (function.__doc__ or "").split("\n")[0] for name, function in INVARIANTS.items()},
 }
-"""What each check says when it holds."""
+"""The condition of each check by its name."""
 
 
 @dataclass
@@ -61,12 +61,10 @@ class Check:
     bad: int = 0
     worst: float = 0.0
     limit: float = 0.0
-    unit: str = "-"
-    """Of worst and limit."""
-    offender: str = ""
+    unit: str = "-"  # of worst and limit
+    offender: str = ""  # place of the worst measure
     cpu_s: float = 0.0
-    failures: list[str] = field(default_factory=list)
-    """Every sequence with a bad measure, and its worst one."""
+    failures: list[str] = field(default_factory=list)  # places of all bad measures
 
     @property
     def good(self) -> bool:
@@ -85,7 +83,7 @@ class Check:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """The outcome for one dataset."""
+    """The results for one dataset."""
 
     root: str
     sequences: int
@@ -100,7 +98,7 @@ class VerifyReport:
         return {**asdict(self), "good": self.good}
 
     def lines(self) -> list[str]:
-        """For a person: each check and where its worst measure is, wrapped, then every failure in a line."""
+        """Lines of text: a table of the checks with their worst measures, then every failure."""
         rows = [("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")]
         for check in self.checks:
             worst = (f"{check.worst:.3g}", f"{check.limit:.3g}", check.unit) if check.offender else ("",) * 3
@@ -116,12 +114,9 @@ class VerifyReport:
 
 
 def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
-    """Checks every sequence and the dataset around them.
+    """Checks a dataset and all of its sequences. UserError if the folder contains no dataset.
 
-    Fast: some frames of some sequences, and no checksums.
-
-    Raises:
-        UserError: the folder holds no dataset.
+    `fast`: only some frames of some sequences, without checksums.
     """
     folder = Folder(root)
     described, sealed = folder.described(), folder.sealed()
@@ -144,13 +139,9 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
 def check_sequence(
     path: Path, job: str, watch: Stopwatch, *, fast: bool = False
 ) -> Iterator[tuple[str, Measure]]:
-    """Measures of one store, which belongs to the job of that identity, by name of check.
+    """Measures of one store by name of check; `job` is the dataset's identity, `watch` times each check.
 
-    Args:
-        path: the store.
-        job: the identity.
-        watch: takes the time of each check.
-        fast: some frames, and no checksums.
+    `fast`: only some frames, without checksums.
     """
 
     def without_path(error: UserError) -> str:
@@ -176,20 +167,20 @@ def check_sequence(
             broken = broken or without_path(error)
             continue
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            measures = [truth(False, f"attributes are missing or odd ({error!r})")]
+            measures = [truth(False, f"attributes are missing or invalid ({error!r})")]
         yield from ((name, measure) for measure in measures)
-    yield "readable", truth(not broken, broken or "reads")
+    yield "readable", truth(not broken, broken)
 
 
 def _frames(sequence: Sequence, fast: bool) -> list[int]:
-    """The frames to look at closely: where the load is greatest, and some between."""
+    """The frames to check: that of the largest load, and some spread over the sequence."""
     force = np.linalg.norm(sequence["force"][:], axis=1)
     spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
     return sorted({int(np.argmax(force)), *spread.tolist()})
 
 
 def _same(one: object, other: object) -> bool:
-    """Whether two cells agree. Of floats the last bits may not: Python 3.12 sums more exactly than 3.11."""
+    """Whether two cells agree, floats except for the last bits: Python 3.12 sums more exactly than 3.11."""
     if isinstance(one, float) and isinstance(other, float):
         return math.isclose(one, other, rel_tol=1e-12)
     return one == other
@@ -198,18 +189,18 @@ def _same(one: object, other: object) -> bool:
 def _dataset(
     folder: Folder, described: dict[str, Any], sealed: list[int]
 ) -> Iterator[tuple[str, str, bool, str]]:
-    """Check, whose, whether it holds, and what is wrong if it doesn't."""
+    """Yields name of check, file, whether it holds, and the message if it doesn't."""
     job = folder.job()
     makers = {provenance.word(one) for one in described.get("generators", [])}
     try:
         same = identity.identify_job(job) == described["identity"] or provenance.fingerprint() not in makers
     except UserError:
-        same = True  # the mesh or the photograph need not travel with the dataset
-    yield "dataset", "dataset.json", same, "the job is not the one that was rendered"
+        same = True  # the mesh or photograph may be missing
+    yield "dataset", "dataset.json", same, "the job was edited after rendering"
     missing = sorted(set(range(job.sequences)) - set(sealed) - set(folder.failures()))
     yield "dataset", "dataset", not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"
     surplus = [key for key in sealed if key >= job.sequences]
-    yield "dataset", "dataset", not surplus, f"sequences that the job does not have: {surplus[:3]}"
+    yield "dataset", "dataset", not surplus, f"sequences beyond those of the job: {surplus[:3]}"
     try:
         rows = {row["index"]: row for row in index.read_index(folder.root).to_pylist()}
     except UserError as error:
@@ -219,12 +210,12 @@ def _dataset(
         try:
             found = open_sequence(location.store(folder.root, key), sealed=False)
         except UserError:
-            continue  # found and named by the check of that sequence
+            continue  # reported by the check of that sequence
         row = rows.get(key, {})
         differing = [name for name, value in index.row_of(found).items() if not _same(row.get(name), value)]
         yield "dataset", index.NAME, not differing, f"row {key} differs in {', '.join(differing)}"
         known = found.attrs.get("versions", {}).get("generator") in makers
-        yield "dataset", found.path.name, known, "made by a version that dataset.json does not name"
+        yield "dataset", found.path.name, known, "its version is not in dataset.json"
     lost = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield "dataset", index.NAME, not lost, f"rows without a sequence: {lost[:3]}"
     try:

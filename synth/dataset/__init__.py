@@ -1,1 +1,1 @@
-"""The dataset on disk: stores, folder, index, split, and the ways to read them."""
+"""Datasets on disk: stores, folder, index, split, and readers."""

@@ -1,4 +1,4 @@
-"""What a sequence says of itself, read from anyone's store: types and limits, before any of it is used."""
+"""Attributes of a sequence read from an untrusted store: their types and limits are checked before use."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from synth.system.config_file import first_mistake
 
 FORMAT = "sulcus-sequence"
 
-LARGEST_BYTES = 32_000_000
-"""Of the file that holds the attributes: some 50,000 frames."""
+LARGEST_BYTES = 32_000_000  # of the file with the attributes: some 50,000 frames
 
 _Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 _Number = Annotated[float, Field(ge=-1e12, le=1e12)]
@@ -36,10 +35,9 @@ class _Scenario(BaseModel):
 
 
 class Attributes(BaseModel):
-    """Of the root of a store. What only some readers need may be missing; others may be there."""
+    """Root attributes of a store. Optional ones are needed by some readers only; further ones are allowed."""
 
-    # Numbers are numbers, not text or flags.
-    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)  # strict: no text for numbers
 
     index: Annotated[int, Field(ge=0, lt=10**12)]
     frames: Annotated[int, Field(ge=1, le=1_000_000)]
@@ -63,24 +61,19 @@ class Attributes(BaseModel):
 
 
 def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
-    """Raises UserError, with one reason, for a store that is not ours or says what can't be.
-
-    Args:
-        attrs: as Zarr gives them.
-        where: names the store in messages.
-    """
+    """Raises UserError, with the store's name `where`, if it is not a sequence or an attribute is invalid."""
     if attrs.get("format") != FORMAT:
-        raise UserError(f"{where}: is a Zarr store, but not a sequence of ours")
+        raise UserError(f"{where}: is a Zarr store, but not a sequence")
     check_format(attrs.get("format_version"), STORE, where)
     try:
         width, height = Attributes.model_validate(dict(attrs)).size
     except ValidationError as error:
-        raise UserError(f"{where}: an attribute can't be right ({first_mistake(error)})") from None
+        raise UserError(f"{where}: an attribute is invalid ({first_mistake(error)})") from None
     if width * height > LARGEST_PIXELS:
-        raise UserError(f"{where}: {width} x {height} pixels a frame is too large")
+        raise UserError(f"{where}: {width} x {height} pixels per frame is too large")
 
 
 def name_gestures(scenario: Mapping[str, Any]) -> str:
-    """Gestures of all instruments of a sequence, by its attribute `scenario`: "pull + push"; may be empty."""
+    """Gestures of all instruments in a sequence's attribute `scenario`: "pull + push"; may be empty."""
     each = [scenario.get("gesture") or {}, *(scenario.get("further") or ())]
     return " + ".join(one["kind"] for one in each if one.get("kind"))

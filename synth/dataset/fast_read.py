@@ -1,8 +1,8 @@
-"""One frame of a stored field, in the time that it takes to unpack it: Zarr adds milliseconds of bookkeeping.
+"""Fast reading of single frames of a stored field, without the milliseconds of overhead that Zarr adds.
 
-Only for fields on this machine's disk in the very layout that the writer gives them (a file of frames, each
-packed by Blosc and followed by its CRC-32C, and an index at the end of the file: zarr-specs.readthedocs.io,
-sharding codec 1.0). For anything else `open_frames` gives None, and Zarr does the reading.
+Only for fields on a local disk in the layout of the writer (a file of frames, each compressed by Blosc and
+followed by its CRC-32C, and an index at the end of the file: zarr-specs.readthedocs.io, sharding codec 1.0).
+For others `open_frames` returns None, and Zarr is used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MISSING = 2**64 - 1
 
 
 class ShardReader:
-    """Frames of one field, `reader[t]`; damage is a ValueError or an OSError."""
+    """Frames of one field, `reader[t]`. ValueError or OSError if a file is damaged."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...], shard_frames: int, dtype: np.dtype[Any]) -> None:
         self._folder, self._shape, self._dtype = folder, shape[1:], dtype
@@ -31,7 +31,7 @@ class ShardReader:
         self._entries: dict[int, NDArray[np.uint64]] = {}
 
     def __getitem__(self, t: int) -> NDArray[Any]:
-        """Frame `t`, negative from the end. IndexError outside."""
+        """Frame `t`; negative `t` count from the end."""
         if not -self._length <= t < self._length:
             raise IndexError(t)
         file, k = divmod(t % self._length, self._shard_frames)
@@ -44,24 +44,24 @@ class ShardReader:
                 raise ValueError(f"frame {t} was never written")
             packed = _checked(os.pread(opened.fileno(), length, start), length)
         values = np.empty(self._shape, self._dtype)
-        # Blosc's header states the unpacked size in bytes 4 to 7; a shorter frame would leave the rest unset.
+        # Blosc's header has the unpacked size in bytes 4 to 7; a shorter frame would leave the rest unset.
         if len(packed) < 16 or int(packed[4:8].view("<u4")[0]) != values.nbytes:
-            raise ValueError(f"frame {t} is not of the size stated")
+            raise ValueError(f"frame {t} has another size than expected")
         self._unpack.decode(packed, values)
         return values
 
     def _index(self, descriptor: int) -> NDArray[np.uint64]:
-        """(frames, 2): where each frame starts in the file, and its length."""
+        """(frames, 2): start of each frame in the file, and its length in bytes."""
         length = 16 * self._shard_frames + 4
         end = os.fstat(descriptor).st_size
         if end < length:
-            raise ValueError("the file is cut short")
+            raise ValueError("the file is truncated")
         data = _checked(os.pread(descriptor, length, end - length), length)
         return np.frombuffer(data, "<u8").reshape(-1, 2)
 
 
 def open_frames(array: zarr.Array[Any], folder: Path | None) -> ShardReader | None:
-    """The fast way to the frames of `array`, stored in `folder`; None where there is none."""
+    """A fast reader of the frames of `array`, stored in `folder`; None for another layout."""
     codecs = [type(codec).__name__ for codec in (*array.filters, array.serializer, *array.compressors)]  # type: ignore[list-item]
     if folder is None or array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:
         return None
@@ -72,7 +72,7 @@ def open_frames(array: zarr.Array[Any], folder: Path | None) -> ShardReader | No
 
 def _checked(data: bytes, length: int) -> NDArray[np.uint8]:
     if len(data) != length or length < 4:
-        raise ValueError("the file is cut short")
+        raise ValueError("the file is truncated")
     inner, stated = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")
     if google_crc32c.value(inner) != stated:
         raise ValueError("a checksum does not match")

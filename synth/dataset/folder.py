@@ -1,4 +1,4 @@
-"""The dataset's folder: whose it is, who writes to it now, what is done, what failed."""
+"""The dataset's folder: its job, the lock of the current run, finished and failed sequences."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _STATE = ".run"
 
 
 class _Described(BaseModel):
-    """What `dataset.json` holds."""
+    """The content of `dataset.json`."""
 
     format_version: int = 1
     identity: str
@@ -41,7 +41,7 @@ class _Described(BaseModel):
 
 
 class Folder:
-    """A dataset's folder. Everything here is read from the disk, so it survives any death."""
+    """A dataset's folder. All state is read from disk, so that it survives a crash."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -53,9 +53,9 @@ class Folder:
         self.turn = 0
 
     def described(self) -> dict[str, Any]:
-        """What `dataset.json` holds. UserError if this is no dataset of ours, or its format is not read."""
+        """The content of `dataset.json`. UserError if it is missing, damaged or of an unsupported format."""
         if not os.path.lexists(self.root / _NAME):
-            raise UserError(f"{self.root}: holds no dataset ({_NAME} is missing)")
+            raise UserError(f"{self.root}: is not a dataset ({_NAME} is missing)")
         found = checked_file.read_json(self.root / _NAME)
         try:
             described = _Described.model_validate(found)
@@ -65,7 +65,7 @@ class Folder:
         return described.model_dump()
 
     def job(self) -> Job:
-        """The dataset's job; the plug-ins that it names need not be installed."""
+        """The dataset's job; its plug-ins need not be installed."""
         try:
             return Job.model_validate(self.described()["job"], context=STORED)
         except ValidationError as error:
@@ -78,38 +78,37 @@ class Folder:
         return sorted(index for index in found if index is not None)
 
     def failures(self) -> dict[int, dict[str, Any]]:
-        """`{index: {"reason", "kind", "tries", "log"}}` of the sequences given up."""
+        """`{index: {"reason", "kind", "tries", "log"}}` of the failed sequences."""
         found = {}
         for path in sorted((self.state / "failed").glob("*.json")):
-            # What is cut short by a power failure, or none of ours: it is tried again.
-            with contextlib.suppress(UserError, ValueError):
+            with contextlib.suppress(UserError, ValueError):  # damaged: the sequence is computed again
                 failure = checked_file.read_json(path)
                 if isinstance(failure, dict) and isinstance(failure.get("reason"), str):
                     found[int(path.stem)] = failure
         return found
 
     def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
-        """Gives a sequence up; `synth render --retry` takes it back."""
+        """Marks a sequence as failed, until `synth render --retry`."""
         record = {"index": index, "kind": kind, "reason": reason, "tries": tries, "log": log}
         write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
         self.sweep(index)
 
     def clear_failures(self, indices: Sequence[int] | None = None) -> list[int]:
-        """Forgets failures, all if `indices` is None; returns which."""
+        """Deletes the marks of failed sequences, all if `indices` is None; returns their indices."""
         indices = sorted(self.failures()) if indices is None else list(indices)
         for index in indices:
             (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
         return indices
 
     def sweep(self, index: int) -> None:
-        """Removes what an attempt at `index` left behind."""
+        """Deletes the unfinished store of sequence `index`."""
         sealed = location.store(self.root, index)
         leftover = sealed.with_name(f"{sealed.name}.part")
         if leftover.exists() and not sealed.exists():
             shutil.rmtree(leftover)
 
     def sweep_all(self) -> None:
-        """Removes every leftover of interrupted attempts."""
+        """Deletes all files of interrupted attempts."""
         for folder in (*self.root.glob("*.zarr.part"), *self.scratch.glob("*")):
             shutil.rmtree(folder)
         places = (self.root, self.state, self.state / "failed")
@@ -118,7 +117,7 @@ class Folder:
             file.unlink()
 
     def invalidate_workers(self) -> None:
-        """Ends what other machines still do for an earlier run: they look at the turn."""
+        """Makes workers of an earlier run on other machines end, by a new turn."""
         try:
             before = int(self.turn_file.read_text())
         except (FileNotFoundError, ValueError):
@@ -127,7 +126,7 @@ class Folder:
         write_whole(self.turn_file, str(self.turn), durable=False)
 
     def discard(self) -> None:
-        """Removes the traces of a run that finished nothing."""
+        """Deletes the files of a run without a finished sequence."""
         for name in (_NAME, "job.yaml", "index.parquet"):
             (self.root / name).unlink(missing_ok=True)
         if self.state.exists():
@@ -136,18 +135,17 @@ class Folder:
 
 @contextmanager
 def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folder]:
-    """The folder for `job`, created or continued, and this process alone writes to it meanwhile.
+    """The folder for `job`, created or continued, and locked for this process.
 
-    A folder that holds something else is left as it was. More sequences than before extend the dataset.
+    A folder with other content is left unchanged. More sequences than before extend the dataset.
 
     Args:
         root: the folder.
         job: the job.
-        mix_versions: continue what another version of the program began; `dataset.json` names them all.
+        mix_versions: continue a dataset of another version of the program; `dataset.json` names all versions.
 
     Raises:
-        UserError: another job's dataset, another version's, other files, another run at work, or no
-            permission.
+        UserError: the dataset of another job or version, other files, another run, or no permission.
     """
     folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
     name = identity.identify_job(job)
@@ -164,7 +162,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
                 format_version=FOLDER, identity=name, job=job.model_dump(mode="json"), generators=makers
             )
             write_whole(root / _NAME, described.model_dump_json(indent=1) + "\n")
-            head = "# The job of this dataset, every value said.\n"
+            head = "# The job of this dataset, with all values.\n"
             write_whole(root / "job.yaml", head + writer.dump_job(job))
             folder.invalidate_workers()
             folder.sweep_all()
@@ -187,32 +185,32 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     if not root.exists():
         return
     if not root.is_dir():
-        raise UserError(f"{root}: is a file, a folder is needed")
+        raise UserError(f"{root}: is a file; choose a folder")
     if not (root / _NAME).exists():
         others = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
         if others:
-            raise UserError(f"{root}: holds other files ({others[0]}), choose an empty or new folder")
+            raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
         return
     described = folder.described()
     if described["identity"] != name:
         changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
-        raise UserError(f"{root}: holds the dataset of another job ({what}), choose another folder")
+        raise UserError(f"{root}: contains the dataset of another job ({what}); choose another folder")
     count = folder.job().sequences
     if count > job.sequences:
-        raise UserError(f"{root}: holds {count} sequences of this job, {job.sequences} are wanted")
+        raise UserError(f"{root}: contains {count} sequences of this job; sequences={job.sequences} is fewer")
 
 
 def _refuse_links(folder: Folder) -> None:
-    """A link where a run writes or sweeps leads it elsewhere."""
+    """Raises UserError for a link in a place where a run writes or deletes."""
     own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
     for place in (*own, *folder.root.glob("*.zarr.part")):
         if place.is_symlink():
-            raise UserError(f"{place}: is a link, which is not followed; remove it")
+            raise UserError(f"{place}: is a link; remove it")
 
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
-    """The versions that made the dataset, this one included. UserError when they may not mix."""
+    """The versions that created the dataset, including this one. UserError if they may not be mixed."""
     now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
     if not count:
         return [now]
@@ -228,7 +226,7 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     what = "; ".join(changes) or "several versions"
     raise UserError(
         f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "
-        "choose another folder, or --mix-versions to continue it all the same"
+        "choose another folder, or continue it with --mix-versions"
     )
 
 
@@ -245,7 +243,7 @@ def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[
 
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
-    """Holds the lock file; its descriptor goes to the workers, so it is held until the last one is gone."""
+    """Locks the file; workers inherit its descriptor, so that it is locked until the last one has ended."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     until = time.monotonic() + _LOCK_WAIT_S
     try:

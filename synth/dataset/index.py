@@ -1,4 +1,4 @@
-"""The index of a dataset: one row a sequence, in `index.parquet`, made from what is on disk."""
+"""The index of a dataset, `index.parquet`: one row per sequence, derived from the stores."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from synth.dataset.attributes import name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
-from synth.errors import UserError
+from synth.errors import UserError, first_line
 from synth.system import checked_file
 
 NAME = "index.parquet"
@@ -33,7 +33,7 @@ class IndexColumn(NamedTuple):
     unit: str = "-"
 
     def field(self) -> pa.Field:
-        """As Parquet's schema has it."""
+        """The column in a Parquet schema."""
         about = {"meaning": self.meaning} | ({} if self.unit == "-" else {"unit": self.unit})
         return pa.field(self.name, self.type, metadata=about)
 
@@ -49,37 +49,37 @@ COLUMNS = (
     IndexColumn(
         "anatomy",
         _TEXT,
-        "the geometry: a user's brain or a procedural one's seed, the same in every dataset; sequences that "
-        "share it belong on one side of a split",
+        "the geometry: a user's brain or the seed of a procedural one, the same in every dataset; sequences "
+        "that share it belong on one side of a split",
     ),
-    IndexColumn("opening", _TEXT, "where a user's brain is opened: the same place, the same name everywhere"),
+    IndexColumn("opening", _TEXT, "place of the craniotomy on a user's brain, named alike in every dataset"),
     IndexColumn("family", _TEXT, "appearance family"),
-    IndexColumn("gesture", _TEXT, "kind of gesture, of every instrument"),
+    IndexColumn("gesture", _TEXT, "kind of gesture of each instrument"),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2)"),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN"),
     IndexColumn("peak_flow_px", _REAL, "largest true motion", "px"),
-    IndexColumn("peak_motion_mm", _REAL, "the same at the craniotomy", "mm"),
-    IndexColumn("frames", _INT, "frames"),
-    IndexColumn("fps", _REAL, "frames a second"),
+    IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm"),
+    IndexColumn("frames", _INT, "number of frames"),
+    IndexColumn("fps", _REAL, "frames per second"),
     IndexColumn("width", _INT, "width of the picture", "px"),
     IndexColumn("height", _INT, "height of the picture", "px"),
     IndexColumn("scale_mm_per_px", _REAL, "scale at the craniotomy", "mm/px"),
     IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
-    IndexColumn("split", _TEXT, "train, validation or test; null where there are too few anatomies to split"),
-    IndexColumn("cpu_s", _REAL, "processor time it took", "s"),
+    IndexColumn("split", _TEXT, "train, validation or test; null if there are too few anatomies to split"),
+    IndexColumn("cpu_s", _REAL, "processor time of its creation", "s"),
 )
 
 SCHEMA = pa.schema([one.field() for one in COLUMNS])
 
 _LARGEST_BYTES = 1 << 28
 _MOST_ROWS = 2_000_000
-_REMEDY = "; `synth report` writes it anew"
+_REMEDY = "; `synth report` writes it again"
 
 
 def read_index(root: Path) -> pa.Table:
-    """The index as it was last written; `synth verify` compares its rows with the stores.
+    """The index as stored; `synth verify` compares its rows with the stores.
 
     Raises:
         UserError: missing, damaged, or of another program or version.
@@ -94,13 +94,12 @@ def read_index(root: Path) -> pa.Table:
         table = file.read(use_threads=False).cast(SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
-        why = (str(error).splitlines() or ["it takes too much memory"])[0]
-        raise UserError(f"{path}: is damaged ({why[:200]}){_REMEDY}") from error
+        raise UserError(f"{path}: is damaged ({first_line(error)}){_REMEDY}") from error
     return table
 
 
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
-    """The one split of the dataset in `root`, as stored, else as `write_index` will make it of its stores.
+    """The split of the dataset in `root`, as stored, else as `write_index` would create it.
 
     Raises:
         UserError: `required`, and there are too few groups to split.
@@ -117,8 +116,9 @@ def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
 
 
 def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
-    """Positions of a dataset's sequences by side, in the order train, validation, test; sides without any
-    are left out. All are "train" where there are too few to split. UserError if one has no side.
+    """Positions of a dataset's sequences by side, in the order train, validation, test, without empty sides.
+
+    All are "train" if there are too few to split. UserError if one has no side.
     """
     names, chosen = [one.attrs["content_hash"] for one in dataset], read_split(dataset.root, required=False)
     found = chosen.find(names, dataset.root) if chosen.sides else ["train"] * len(names)
@@ -127,10 +127,9 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
 
 
 def write_index(folder: Folder) -> list[dict[str, Any]]:
-    """Brings the index up to date with the folder; rows that it has already stay. Returns all rows.
+    """Updates the index from the folder, and creates it again if it can't be read. Returns all rows.
 
-    An index that can't be read is made anew: all that it says is in the stores. The split is stored beside
-    it; sequences that came since get a side, and the others keep theirs.
+    The split is stored next to it; new sequences are assigned a side, and the others keep theirs.
     """
     rows, stored = _rows(folder), split.read_stored(folder.root)
     sides = split.assign_if_possible(rows, stored)
@@ -143,15 +142,15 @@ def write_index(folder: Folder) -> list[dict[str, Any]]:
 
 
 def split_anew(folder: Folder, chosen: DatasetSplit) -> list[dict[str, Any]]:
-    """Splits a dataset by the rule of `chosen`, which has no sides yet, whatever its split was. Returns all
-    rows of the index. UserError as `assign_sides`."""
+    """Replaces the split of a dataset by the rule of `chosen`, which has no sides yet. Returns all rows of
+    the index. UserError as `assign_sides`."""
     rows = _rows(folder)
     split.store(folder.root, _dealt(rows, split.assign_sides(rows, chosen), chosen))
     return write_index(folder)
 
 
 def _rows(folder: Folder) -> list[dict[str, Any]]:
-    """Of all sequences; what the index has of those that are done is not read from the stores again."""
+    """Rows of all sequences; those of finished ones are taken from the index, if present."""
     known: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
         known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
@@ -164,13 +163,13 @@ def _rows(folder: Folder) -> list[dict[str, Any]]:
 def _dealt(
     rows: Iterable[Mapping[str, Any]], sides: Iterable[Side | None], chosen: DatasetSplit
 ) -> DatasetSplit:
-    """The split with the sides of some rows added."""
+    """The split with the sides of the rows added."""
     added = {row["content_hash"]: side for row, side in zip(rows, sides, strict=True) if side}
     return replace(chosen, sides={**chosen.sides, **added})
 
 
 def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes the rows; columns that a row lacks are null."""
+    """Writes the index; missing columns are null."""
     table = pa.Table.from_pylist([dict(row) for row in rows], schema=SCHEMA)
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd", write_page_checksum=True)
@@ -178,7 +177,7 @@ def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def row_of(sequence: Sequence) -> dict[str, Any]:
-    """The row of a finished sequence, from its attributes."""
+    """The index row of a finished sequence, from its attributes."""
     attrs = sequence.attrs
     scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
     height, width = sequence.size

@@ -1,4 +1,4 @@
-"""Where a store lies: a folder, or anything that fsspec opens (zip, S3, HTTP, ...)."""
+"""The location of a store: a folder, or anything that fsspec can open (zip, S3, HTTP, ...)."""
 
 from __future__ import annotations
 
@@ -14,34 +14,29 @@ from synth.errors import UserError
 
 @dataclass(frozen=True)
 class StoreLocation:
-    """The folder of one store, somewhere."""
+    """The folder of one store, local or remote."""
 
-    name: str
-    """Its path or address, for messages."""
-    store: Any
-    """What Zarr opens."""
-    size: Callable[[str], int]
-    """Bytes of a file in it, by its path from here; 0 when it is missing."""
-    folder: Path | None = None
-    """Where it is on this machine's file system."""
+    name: str  # its path or address, for messages
+    store: Any  # to be opened by Zarr
+    size: Callable[[str], int]  # bytes of a file by its path in the store; 0 if it is missing
+    folder: Path | None = None  # None if it is not on this machine's file system
 
 
 def store(root: Path, index: int) -> Path:
-    """Where sequence `index` of the dataset in `root` lies once it is sealed."""
+    """The path of the sealed sequence `index` of the dataset in `root`."""
     return root / f"{index:06d}.zarr"
 
 
 def index_of(name: str) -> int | None:
-    """The index of the sequence whose sealed store has that name; None if none's has."""
+    """The index in the name of a sealed store; None for other names."""
     found = re.fullmatch(r"([0-9]{6}|[1-9][0-9]{6,})\.zarr", name)
     return int(found[1]) if found else None
 
 
 def find_location(where: Path | str) -> StoreLocation:
-    """Of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
+    """The location of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
 
-    Raises:
-        UserError: nothing is there, or the address cannot be opened.
+    Raises UserError if it does not exist or cannot be opened.
     """
     if isinstance(where, Path) or "://" not in where:
         folder = Path(where)
@@ -83,7 +78,7 @@ def _open(where: str) -> tuple[Any, str]:
 
 
 def _absolute(where: str) -> str:
-    """A local file that ends a chain (`zip://x::out.zip`) as an address of its own, as Zarr asks."""
+    """The address with an absolute path at the end of a chain (`zip://x::out.zip`), as Zarr requires."""
     *chain, last = where.split("::")
     if chain and "://" not in last:
         last = f"file://{Path(last).resolve()}"

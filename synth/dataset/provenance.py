@@ -1,4 +1,4 @@
-"""What made a sequence: one name for the code and the packages that shape its values."""
+"""The provenance of a sequence: a hash of the code and the packages that determine its values."""
 
 from __future__ import annotations
 
@@ -11,39 +11,37 @@ from synth.formats import STORE
 from synth.system import packages
 
 HOME = Path(__file__).parents[2]
-_MAKING = tuple(f"synth/{room}" for room in ("job", "geometry", "fem", "render", "video", "flow", "sequence"))
-_OPENCV = "opencv-contrib-python-headless"
-_COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite", "xatlas")
+_MAKING = tuple(f"synth/{name}" for name in ("job", "geometry", "fem", "render", "video", "flow", "sequence"))
 
 
 @cache
 def generator() -> dict[str, str]:
-    """`{"format", "code", package: version}`: two sequences of a job are comparable when it is equal.
+    """`{"format", "code", package: version}`: sequences of a job are comparable if it is equal.
 
-    `code` is a hash of the files of the rooms that make a sequence, comments included.
+    `code` is a hash of all files of the packages that create a sequence, including comments.
     """
     return {"format": str(STORE), "code": code(*_MAKING), **_computing()}
 
 
 @cache
 def source(*folders: str) -> str:
-    """One word for the code in folders, `synth/fem`, and for the packages that compute."""
+    """A hash of the code in folders such as `synth/fem`, and of the versions of numerical packages."""
     return word({"code": code(*folders), **_computing()})
 
 
 def fingerprint() -> str:
-    """`generator()` in one word."""
+    """The hash of `generator()`."""
     return word(generator())
 
 
 def word(made_by: dict[str, str]) -> str:
-    """What `generator()` gave, here or elsewhere, in one word."""
+    """The hash of a `generator()`, of this or another version."""
     described = json.dumps(made_by, sort_keys=True).encode()
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 
 def code(*folders: str, home: Path = HOME) -> str:
-    """A hash of the names and bytes of the programs and networks in folders below `home`."""
+    """A hash of the names and bytes of the code and networks in folders below `home`."""
     total = hashlib.blake2b(digest_size=8)
     for path in sorted(path for folder in folders for path in (home / folder).rglob("*")):
         if path.suffix in (".py", ".pt", ".json"):
@@ -52,5 +50,4 @@ def code(*folders: str, home: Path = HOME) -> str:
 
 
 def _computing() -> dict[str, str]:
-    """Versions of the packages that compute."""
-    return {name: found for name, found in packages.versions().items() if name in _COMPUTING}
+    return {name: found for name, found in packages.versions().items() if name in packages.COMPUTING}

@@ -1,4 +1,4 @@
-"""What fields, sequences and a run take: disk and time, from finished sequences or the table; memory."""
+"""Forecasts of disk, time and memory of a run, from finished sequences or from the field table."""
 
 from __future__ import annotations
 
@@ -16,67 +16,50 @@ from synth.job.schema import Job
 from synth.system.checked_file import folder_bytes
 from synth.system.text_lines import hang
 
-# An estimate from the field table is this much too high, lest a run be started that cannot end.
-_MARGIN = 1.25
-# Of memory: the program with its libraries, then by pixel, by vertex and frame, by pixel and frame.
+_MARGIN = 1.25  # safety factor of estimates from the field table, so that a started run can finish
+# Memory of the program with its libraries, per pixel, per vertex and frame, per pixel and frame.
 _PROGRAM_BYTES, _STAGE_BYTES = 600e6, 2000
-_MOTION_BYTES, _FILM_BYTES, _FLOW_BYTES = 60, 10, 14
-# Kept free, so that index, card and the system's own files find room.
-_RESERVE_BYTES = 200e6
+_MOTION_BYTES, _VIDEO_BYTES, _FLOW_BYTES = 60, 10, 14
+_RESERVE_BYTES = 200e6  # disk space to leave free for index, card and system files
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Disk and processor time of what is still to be done."""
+    """Disk and processor time of the remaining sequences."""
 
     sequences: int
-    """Sequences to do."""
     bytes: float
-    cpu_s: float | None
-    """None until a sequence is finished."""
-    pilot: int
-    """Finished sequences that the forecast rests on; 0: on the field table."""
+    cpu_s: float | None  # None until a sequence is finished
+    pilot: int  # finished sequences that the forecast is based on; 0: the field table
 
 
 def forecast_rest(
     job: Job, root: Path, todo: int, done: Sequence[int], cpu_s: float | None = None
 ) -> Forecast:
-    """Forecast of what is still to do.
-
-    Args:
-        job: of the dataset.
-        root: its folder.
-        todo: how many sequences.
-        done: indices of the finished ones.
-        cpu_s: processor time of one [s], if it is known.
-    """
+    """Forecast of `todo` more sequences, from the finished ones `done`; `cpu_s`: of one sequence [s]."""
     some = pilot(done)
     each = np.mean([folder_bytes(location.store(root, key)) for key in some]) if some else estimate(job)
     return Forecast(todo, float(each) * todo, None if cpu_s is None else cpu_s * todo, len(some))
 
 
 def pilot(done: Sequence[int]) -> list[int]:
-    """Up to ten of the finished sequences, spread over the dataset, to judge the others by."""
+    """Up to ten of the finished sequences, spread over the dataset, to estimate the others from."""
     return [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
 
 
 def field_bytes(
     field: Field, frames: int, size: tuple[int, int], *, half: bool = False
 ) -> tuple[float, float]:
-    """Bytes of a field in memory, and on disk by the ratio measured on rendered sequences.
+    """Bytes of a field of `size` (height, width) in memory, and on disk by the measured compression.
 
-    Args:
-        field: of the table.
-        frames: how many.
-        size: (height, width) [px].
-        half: as `store.flow: float16`: stored in half floats if the field may be.
+    `half`: `store.flow: float16` is set.
     """
     raw = float(np.prod(field.shape(frames, size))) * np.dtype(field.dtype).itemsize
     return raw, field.packed * (raw / 2 if half and field.half else raw)
 
 
 def describe_fields() -> Iterator[str]:
-    """Every field for a terminal, two lines or more; sizes are of a frame of 640 x 480 px."""
+    """Lines of text on all fields, two or more each; sizes are of a frame of 640 x 480 px."""
     for field in FIELDS.values():
         stored = amount(field_bytes(field, 1, (480, 640))[1])
         axes = ", ".join(field.dims)
@@ -86,7 +69,7 @@ def describe_fields() -> Iterator[str]:
 
 
 def estimate(job: Job) -> float:
-    """Bytes of one sequence of `job` on disk, before any is made."""
+    """Bytes of one sequence of `job` on disk, from the field table."""
     width, height = job.render.size
     half = job.store.flow == "float16"
     total = sum(
@@ -96,31 +79,31 @@ def estimate(job: Job) -> float:
 
 
 def estimate_memory(job: Job) -> float:
-    """Bytes of memory that a worker takes for one sequence of `job`: motion and film are held as a whole.
+    """Bytes of memory that a worker needs for one sequence of `job`, whose motion and video are in memory.
 
-    Fitted to the peaks of sequences of 10 to 300 frames, 2,500 to 12,000 vertices and 64 to 320 columns,
-    and a quarter more: not beyond what was measured by half.
+    Fitted to the peaks of sequences of 10 to 300 frames, 2,500 to 12,000 vertices and 64 to 320 columns, plus
+    a quarter; at most 1.5 times the measured values.
     """
     width, height = job.render.size
     pixels = width * height * (2 if job.render.stereo_mm else 1)
-    film = _FILM_BYTES + (_FLOW_BYTES if job.flow.backend != "ideal" else 0)
-    each = _MOTION_BYTES * job.anatomy.vertices + film * pixels
+    video = _VIDEO_BYTES + (_FLOW_BYTES if job.flow.backend != "ideal" else 0)
+    each = _MOTION_BYTES * job.anatomy.vertices + video * pixels
     return _MARGIN * (_PROGRAM_BYTES + _STAGE_BYTES * pixels + each * job.frames)
 
 
 def refuse_if_too_long(job: Job, worker_bytes: int | None, workers: int) -> None:
-    """UserError when a sequence needs more memory than a worker may take; nothing where that isn't known."""
+    """Raises UserError if a sequence needs more memory than a worker has; `worker_bytes` None: unknown."""
     needed = estimate_memory(job)
     if worker_bytes is not None and needed > worker_bytes:
         fewer = ", or --workers 1" if workers > 1 else ""
         raise UserError(
-            f"a sequence of {job.frames} frames takes about {amount(needed)} of memory and each of {workers} "
-            f"workers has {amount(worker_bytes)}: fewer frames (frames=), a smaller render.size{fewer}"
+            f"a sequence of {job.frames} frames needs about {amount(needed)} of memory but each of {workers} "
+            f"workers has {amount(worker_bytes)}: use fewer frames (frames=), a smaller render.size{fewer}"
         )
 
 
 def refuse_if_too_large(forecast: Forecast, root: Path) -> None:
-    """UserError when the disk has no room for what is to be done."""
+    """Raises UserError if the disk has not enough space for the remaining sequences."""
     free = shutil.disk_usage(root).free
     if forecast.bytes + _RESERVE_BYTES > free:
         basis = f"from {forecast.pilot} finished sequences" if forecast.pilot else "estimated"

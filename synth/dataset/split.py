@@ -1,4 +1,4 @@
-"""Who may be trained on: the one split of a dataset, in which no group is on both sides."""
+"""The split of a dataset into train, validation and test: no group is on two sides."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from synth.system import checked_file
 from synth.system.config_file import first_mistake
 
 By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
-"""What must not be shared between the sides: `opening` is the place that a user's brain is opened at, else
-the anatomy; `stiffness` splits at quantiles of Young's modulus."""
+"""Groups that must not be on two sides: `opening` is the craniotomy of a user's brain, else the anatomy;
+`stiffness` splits at quantiles of Young's modulus."""
 
 Side = Literal["train", "validation", "test"]
 SIDES: tuple[Side, ...] = get_args(Side)
@@ -41,34 +41,30 @@ class DatasetSplit:
     by: By = "anatomy"
     shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
     held_out: tuple[str, ...] = ()
-    share_anatomy: bool = False
-    """Whether one brain may be on several sides: scores then say nothing of other brains."""
-    apart_mm: FiniteFloat = 0.0
-    """By opening: those of one brain that are nearer to each other show the same tissue, and are one."""
-    sides: Mapping[str, Side] = field(default_factory=dict)
-    """By content hash."""
+    share_anatomy: bool = False  # one brain may be on several sides: scores don't hold for other brains
+    apart_mm: FiniteFloat = 0.0  # by opening: those of a brain that are closer share tissue and are one group
+    sides: Mapping[str, Side] = field(default_factory=dict)  # content hash -> side
 
     @property
     def hash(self) -> str:
-        """Of who is on which side."""
+        """Hash of all sides."""
         return hashlib.blake2b(identity.canonical(dict(self.sides)), digest_size=16).hexdigest()
 
     def find(self, names: Iterable[str], where: Path | str) -> list[Side]:
-        """The sides of the sequences of a dataset by content hash; UserError if one has none."""
+        """The sides of sequences by their content hashes; UserError if one has none."""
         found = [self.sides.get(name) for name in names]
         if lost := found.count(None):
             raise UserError(
                 f"{where}: {lost} of its {len(found)} sequences have no side in {NAME}: `synth report` "
-                "places those that came since, `synth split` splits all anew"
+                "assigns new sequences, `synth split` replaces the split"
             )
         return [side for side in found if side]
 
 
 def read_stored(root: Path) -> DatasetSplit:
-    """What `split.json` of the dataset in `root` says; the default without sides if there is none.
+    """The content of `split.json` of the dataset in `root`; the default without sides if it is missing.
 
-    Raises:
-        UserError: it is no split.
+    Raises UserError if it is damaged.
     """
     if not os.path.lexists(root / NAME):
         return DatasetSplit()
@@ -80,41 +76,41 @@ def read_stored(root: Path) -> DatasetSplit:
 
 
 def store(root: Path, chosen: DatasetSplit) -> None:
-    """Makes `chosen` the split of the dataset in `root`."""
+    """Stores the split of the dataset in `root`."""
     write_whole(root / NAME, json.dumps(asdict(chosen), indent=1) + "\n")
 
 
 def parse_rule(
     by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False, apart_mm: float = 0.0
 ) -> DatasetSplit:
-    """A split without sides from the words of a command line, UserError for what is none; by opening, a brain
-    is shared."""
+    """A split without sides, parsed from a command line; `by` opening implies `share_anatomy`. May raise
+    UserError."""
     if by not in get_args(By):
         raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
     try:
         train, validation, test = (float(word) for word in shares.split(","))
     except ValueError:
-        raise UserError(f"shares {shares}: three numbers are needed, as 0.7,0.15,0.15") from None
+        raise UserError(f"shares {shares}: must be three numbers, as 0.7,0.15,0.15") from None
     shared = share_anatomy or by == "opening"
     return DatasetSplit(cast(By, by), (train, validation, test), tuple(held_out), shared, apart_mm)
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Sequences on each side."""
+    """Number of sequences on each side."""
     sides = [row.get("split") for row in rows]
     return {side: sides.count(side) for side in SIDES if side in sides}
 
 
 def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
-    """The side of every row of the index; None for a sequence that failed.
+    """The side of every row of the index; None for a failed sequence.
 
-    Who has a side keeps it, and a group that has one gives it to who joins it; the groups that are left are
-    dealt so that shares come near. Their sides depend on their names and on which groups there are, not on
-    the order of rows. Sequences of a family that is held out are always for testing; any group that they
-    share goes with them. Who would join groups of two sides has none.
+    Sequences keep the side that they have, and new ones get that of their group. The remaining groups are
+    assigned so as to approximate the shares, depending on their names but not on the order of rows. Sequences
+    of a held-out family are always in the test set, with their whole groups. A new sequence that joins groups
+    on two sides gets none.
 
     Raises:
-        UserError: a family that is not there, shares that do not sum to 1, or fewer groups than sides.
+        UserError: an unknown family, shares that do not sum to 1, or fewer groups than sides.
     """
     by, shares = chosen.by, chosen.shares
     if len(shares) != 3 or not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
@@ -124,10 +120,10 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     if unknown and not chosen.sides:
         raise UserError(f"family {', '.join(sorted(unknown))}: no sequence has it")
     if by == "stiffness" and any(row["young_kpa"] is None for row in done):
-        raise UserError("by stiffness: a sequence says nothing of its Young's modulus")
-    groups, kept = _groups(done, chosen), [chosen.sides.get(row["content_hash"]) for row in done]
+        raise UserError("by stiffness: a sequence has no Young's modulus")
+    groups, stored = _groups(done, chosen), [chosen.sides.get(row["content_hash"]) for row in done]
     on: dict[str, set[int]] = {}
-    for group, side, row in zip(groups, kept, done, strict=True):
+    for group, side, row in zip(groups, stored, done, strict=True):
         on.setdefault(group, set()).update([SIDES.index(side)] if side else [])
         on[group] |= {2} if row["family"] in chosen.held_out else set()
     fixed = {group: max(sides) for group, sides in on.items() if sides}
@@ -135,17 +131,17 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     if len(on) - len(fixed) < len(needing) and not chosen.sides:
         hint = "render more sequences (`sequences` in the job)"
         if chosen.share_anatomy and by == "opening":
-            hint = "craniotomy.also in the job lists further openings"
+            hint = "list further openings in craniotomy.also of the job"
         elif len(on) < len(done) and not chosen.share_anatomy:
             hint += ", or split within a brain by `synth split --by opening` or --share-anatomy"
         wanted = sorted(needing | set(fixed.values()))
         each = ", ".join(SIDES[k] for k in wanted)
-        few = f"{len(done)} sequences are {len(on)} groups by {by}, {len(wanted)} are needed"
+        few = f"{len(done)} sequences form {len(on)} groups by {by}, but {len(wanted)} are needed"
         raise UserError(f"{few}, one each for {each}: {hint}")
     order = sorted(on, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
     part = draw_groups(groups, shares, order, fixed)
     dealt = [SIDES[k] if len(on[group]) < 2 else None for group, k in zip(groups, part, strict=True)]
-    sides = {row["index"]: old or new for row, old, new in zip(done, kept, dealt, strict=True)}
+    sides = {row["index"]: old or new for row, old, new in zip(done, stored, dealt, strict=True)}
     return [sides.get(row["index"]) for row in rows]
 
 
@@ -155,13 +151,13 @@ def draw_groups(
     order: Sequence[Group],
     fixed: Mapping[Group, int] | None = None,
 ) -> list[int]:
-    """The part (0, 1, ...) of each member; no group is in two parts. Larger groups are dealt first.
+    """The part (0, 1, ...) of each member; no group is in two parts. Larger groups are assigned first.
 
     Args:
         groups: (N,) the group of each member.
-        shares: of each part, in any unit; a part of share 0 gets nothing.
-        order: of groups of one size.
-        fixed: parts of groups that aren't drawn.
+        shares: of each part, in any unit; a part of share 0 stays empty.
+        order: of groups of equal size.
+        fixed: parts of groups that are assigned already.
     """
     size = Counter(groups)
     part = dict(fixed or {})
@@ -171,14 +167,14 @@ def draw_groups(
     ]
     open_parts = [k for k, share in enumerate(shares) if share > 0]
     for group in sorted((one for one in order if one not in part), key=lambda one: -size[one]):
-        # The part that lacks most, in proportion, gets the next group.
+        # The part that lacks most in proportion to its share gets the next group.
         part[group] = max(open_parts, key=lambda k: (lacking[k] / max(shares[k], 1e-9), -k))
         lacking[part[group]] -= size[group]
     return [part[group] for group in groups]
 
 
 def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
-    """`assign_sides`; no sides where there are too few groups to have some on each."""
+    """As `assign_sides`; no sides if there are too few groups."""
     try:
         return assign_sides(rows, chosen)
     except UserError:
@@ -186,7 +182,7 @@ def assign_if_possible(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) 
 
 
 def misplaced(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
-    """Sequences that the index puts on another side than the split does, or on none beside others."""
+    """Messages on sequences whose side in the index is missing or differs from the split."""
     return [
         f"sequence {row['index']} is in {row['split']}, by the split in {side}"
         for row, side in zip(rows, assign_if_possible(rows, chosen), strict=True)
@@ -195,7 +191,7 @@ def misplaced(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[s
 
 
 def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit | None = None) -> list[str]:
-    """Anatomies and contents that are on more than one side, and held-out families that are trained on."""
+    """Messages on anatomies and contents on more than one side, and on held-out families in training."""
     chosen = chosen or DatasetSplit()
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
     found = [
@@ -215,7 +211,7 @@ def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit | None = None)
 
 
 def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Hashable, list[str]]:
-    """Groups that are on more than one side, and on which: there must be none. One entry a sequence."""
+    """Groups on more than one side, with those sides. `groups` and `sides` have one entry per sequence."""
     on: dict[Hashable, set[str]] = {}
     for group, side in zip(groups, sides, strict=True):
         on.setdefault(group, set()).add(side)
@@ -223,10 +219,10 @@ def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Has
 
 
 def join_groups(*keys: Sequence[Hashable]) -> list[int]:
-    """A number for each sequence, equal where two share a key or are joined by others that do.
+    """A group number for each sequence: connected components of sequences that share a key.
 
-    `keys`: of everything that must not be on two sides, one value a sequence. The number is the place of the
-    group's first sequence.
+    `keys`: properties that must not be on two sides, one value per sequence each. The number of a group is
+    the position of its first sequence.
     """
     count, known, first = len(keys[0]), dict[Hashable, int](), dict[int, int]()
     held = [(which, value) for which, values in enumerate(keys) for value in values]
@@ -238,13 +234,12 @@ def join_groups(*keys: Sequence[Hashable]) -> list[int]:
 
 
 def name_anatomy(attrs: Mapping[str, Any]) -> str:
-    """The name of a sequence's anatomy across datasets; a sequence that states none has one of its own. All
-    sequences of one user's brain are one anatomy."""
+    """The name of a sequence's anatomy, equal in all datasets; its own content hash if it has none."""
     return str(attrs.get("anatomy_id") or attrs["content_hash"])
 
 
 def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
-    """A group's name for every row; groups that share an anatomy are one unless the rule allows it."""
+    """The group of every row; groups that share an anatomy are merged unless the rule allows sharing."""
     if chosen.by == "stiffness":
         ordered = sorted(float(row["young_kpa"]) for row in rows)
         edges = [ordered[k * len(ordered) // _CLASSES] for k in range(1, _CLASSES)]
@@ -262,9 +257,9 @@ def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str
 
 
 def _join_openings(names: Sequence[str], apart_mm: float) -> list[str]:
-    """The openings of a brain that overlap under one name; `names`: as `synth.job.identity` makes them.
+    """The names of openings (of `synth.job.identity`), with one name for those of a brain that overlap.
 
-    A procedural brain, which is opened at one place, and stores that don't say where, come as an anatomy.
+    Names of anatomies, for procedural brains and stores without an opening, are unchanged.
     """
     placed = sorted({name for name in names if " at " in name})
     if not placed:

@@ -1,4 +1,4 @@
-"""The sequence store: one Zarr v3 group a sequence, written as `.part`, sealed, renamed; and the way back."""
+"""Writer and reader of sequences: one Zarr v3 group each, written as `.part`, then sealed and renamed."""
 
 from __future__ import annotations
 
@@ -23,28 +23,20 @@ from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
 
-# Raw bytes of one field that are gathered and then written as one file: a shard, its chunks being frames.
-_SHARD_BYTES = 16 << 20
+_SHARD_BYTES = 16 << 20  # uncompressed size of a file (shard) of several frames (chunks)
 
-# Vector fields whose greatest length is an attribute, in `summary`.
+# Vector fields, and the attribute in `summary` for their greatest length.
 _PEAKS = {"flow": "peak_flow_px", "traction": "peak_traction_kpa", "force": "peak_force_mn"}
 
-# What may differ between two runs that gave the same sequence.
+# Attributes that may differ between two runs with the same sequence.
 _NOT_CONTENT = {"timings", "versions", "content_hash", "seal_hash"}
 
 
 class Writer:
-    """Writes one sequence. Frames are put in order; nothing is visible under the final name before `seal`."""
+    """Writes one sequence, frames in order. The store gets its final name in `seal`."""
 
     def __init__(self, folder: Path, index: int, *, frames: int, size: tuple[int, int], job: Job) -> None:
-        """
-        Args:
-            folder: the dataset.
-            index: which sequence; names the store.
-            frames: number of frames.
-            size: (height, width) of the picture [px].
-            job: the dataset's job.
-        """
+        """Begins the store of sequence `index` in a dataset; `size`: (height, width) of the picture [px]."""
         self.path = location.store(folder, index)
         self._part = self.path.with_name(f"{self.path.name}.part")
         self._frames, self._size = frames, size
@@ -67,15 +59,15 @@ class Writer:
         }
 
     def wants(self, name: str) -> bool:
-        """Whether the job keeps that field; `put` passes over one that it does not keep."""
+        """Whether the job stores that field; `put` ignores others."""
         return _field(name).name in self._wanted
 
     def put(self, name: str, array: NDArray[Any]) -> None:
-        """Writes a whole field, of the shape that the table says for this sequence.
+        """Writes a whole field, of the shape in the field table for this sequence.
 
         Raises:
             ValueError: another shape or type.
-            NotFinite: a number is none.
+            NotFinite: a value is NaN or infinite.
         """
         if not self.wants(name):
             return
@@ -86,18 +78,14 @@ class Writer:
             self._writer(name).write(array)
 
     def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
-        """Writes frame `t` of a field, without its first axis; frames come in order. Raises as `put`."""
+        """Writes frame `t` of a field, without its first axis; frames must be in order. Raises as `put`."""
         if self.wants(name):
             self._writer(name).append(t, array)
 
     def seal(self, **attributes: Any) -> Path:
-        """Finishes the store: checks that every field is whole, adds attributes and hashes, renames.
+        """Finishes the store: checks that every field is complete, adds attributes and hashes, renames it.
 
-        Args:
-            attributes: JSON-ready; `timings` may differ between equal sequences, nothing else may.
-
-        Returns:
-            The store's final path.
+        `attributes`: JSON-ready; only `timings` may differ between equal sequences. Returns the final path.
         """
         for name in self._wanted:
             written = self._writers.get(name)
@@ -133,7 +121,7 @@ class Writer:
 
 
 class _FieldWriter:
-    """One field being written: checked, hashed, and gathered into shards."""
+    """Writes one field: checks and hashes frames, and collects them into shards."""
 
     def __init__(self, group: zarr.Group, field: Field, shape: tuple[int, ...], half: bool) -> None:
         self._field, self.shape, self.filled = field, shape, 0
@@ -155,13 +143,13 @@ class _FieldWriter:
             shards=shard,
             filters=None,
             compressors=[
-                # A ninth of the time of zstd at level 3, and half of it in reading, for 8% more bytes.
+                # Against zstd at level 3: a ninth of the time in writing, half in reading, 8% more bytes.
                 BloscCodec(cname="lz4", clevel=5, shuffle="shuffle", typesize=dtype.itemsize),
                 Crc32cCodec(),
             ],
             dimension_names=field.dims,
             attributes={"unit": field.unit, "meaning": field.meaning},
-            # With every chunk on disk a missing file is damage, never a silent zero.
+            # With every chunk on disk, a missing file is detected as damage and not read as zeros.
             config={"write_empty_chunks": True},
         )
 
@@ -170,34 +158,24 @@ class _FieldWriter:
             raise ValueError(f"{self._field.name}: is not stored by frame")
         if t != self.filled:
             raise ValueError(f"{self._field.name}: frame {t} after {self.filled} frames")
-        checked = self._checked(frame, self.shape[1:], f", frame {t}")
-        self._account(checked)
-        self._pending.append(checked)
+        self._pending.append(self._accept(frame, self.shape[1:], f", frame {t}"))
         self.filled += 1
         if len(self._pending) == self._shard_frames or self.filled == self.shape[0]:
             self._array[self.filled - len(self._pending) : self.filled] = np.stack(self._pending)
             self._pending.clear()
 
     def write(self, array: NDArray[Any]) -> None:
-        checked = self._checked(array, self.shape, "")
-        self._account(checked)
-        self._array[...] = checked
+        self._array[...] = self._accept(array, self.shape, "")
         self.filled = self.shape[0]
 
-    def _account(self, values: NDArray[Any]) -> None:
-        """Hash and greatest length."""
-        self.hash.update(values.data)
-        if self._field.name in _PEAKS:
-            squared = np.einsum("...k,...k->...", values, values, dtype=np.result_type(values, np.float32))
-            self.largest = max(self.largest, float(np.sqrt(squared.max())))
-
-    def _checked(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
+    def _accept(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
+        """A checked copy of a frame or field, as stored; adds it to the hash and the greatest length."""
         name, dtype = self._field.name, self._dtype
         array = np.asarray(array)
         if array.shape != shape:
-            raise ValueError(f"{name}{where}: shape {array.shape}, the field table says {shape}")
+            raise ValueError(f"{name}{where}: shape {array.shape}, the field table has {shape}")
         if not np.can_cast(array.dtype, dtype, "same_kind"):
-            raise ValueError(f"{name}{where}: {array.dtype}, the field table says {dtype}")
+            raise ValueError(f"{name}{where}: {array.dtype}, the field table has {dtype}")
         # A copy, since the caller may reuse its buffer before the shard is full.
         copy = np.array(array, dtype, order="C")
         if dtype.kind == "f" and not np.isfinite(copy).all():
@@ -205,11 +183,15 @@ class _FieldWriter:
             raise NotFinite(f"{name}{where}: not finite, first at {at}")
         if self._field.half and copy.dtype != array.dtype:
             self.rounding = max(self.rounding, float(np.abs(copy - array).max()))
+        self.hash.update(copy.data)
+        if name in _PEAKS:
+            squared = np.einsum("...k,...k->...", copy, copy, dtype=np.result_type(copy, np.float32))
+            self.largest = max(self.largest, float(np.sqrt(squared.max())))
         return copy
 
 
 class FieldReader:
-    """A field of a sealed sequence, read when indexed; damage is a UserError that names store and field."""
+    """A field of a sealed sequence, read when indexed. UserError, with store and field, if it is damaged."""
 
     def __init__(
         self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
@@ -217,8 +199,7 @@ class FieldReader:
         self._array, self._where = array, where
         self._shards = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
-        self.stored: np.dtype[Any] = array.dtype
-        """Type on disk; values are given in the table's."""
+        self.stored: np.dtype[Any] = array.dtype  # type on disk; values are returned in the table's type
         self.dtype: np.dtype[Any] = dtype
         self.ndim = len(self.shape)
         self.attrs: dict[str, Any] = dict(array.attrs)
@@ -234,10 +215,10 @@ class FieldReader:
             return np.asarray(values, self.dtype)
         except IndexError:
             raise
-        except Exception as error:  # zarr, its codecs and the file system have no common error for damage
+        except Exception as error:  # Zarr, its codecs and the file system raise various errors for damage
             why = "the store is damaged"
             if self._where.startswith("http"):
-                why += " or its server does not answer range requests"
+                why += " or its server does not support range requests"
             raise UserError(f"{self._where}: cannot be read, {why} ({error})") from error
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -267,30 +248,30 @@ class Sequence:
 
     @property
     def fields(self) -> list[str]:
-        """Names of the fields it holds, in the table's order."""
+        """Names of its fields, in the table's order."""
         return [name for name in FIELDS if name in self]
 
     def __contains__(self, name: str) -> bool:
         return name in self.attrs["field_hashes"]
 
     def is_sealed(self) -> bool:
-        """Whether the attributes, the fields' hashes among them, are those that were sealed."""
+        """Whether the attributes, including the hashes of fields, are unchanged since the seal."""
         try:
             return bool(self.attrs["seal_hash"] == seal_hash(self.attrs))
-        except (ValueError, RecursionError):  # a number that is none, where nobody looks; or without end
+        except (ValueError, RecursionError):  # NaN in an unchecked attribute, or unlimited nesting
             return False
 
     def read_whole(self, name: str) -> NDArray[Any]:
-        """A field without frames, as `read_sealed`."""
+        """A field without a frame axis, as `read_sealed`."""
         (values,) = self.read_sealed(name)
         return values
 
     def read_sealed(self, name: str) -> Iterator[NDArray[Any]]:
-        """A field frame by frame, in order; one without frames whole, at once.
+        """Yields a field frame by frame, or as a whole if it has no frame axis.
 
         Raises:
-            UserError: a value is outside the table's limits or no number; or, after the last one, the values
-                are not those that were sealed.
+            UserError: a value is outside the table's limits or not finite; or, after the last frame, the
+            values have changed since the seal.
         """
         field, found = _field(name), self[name]
         where = f"{self._location.name}: {name}"
@@ -302,7 +283,7 @@ class Sequence:
             hasher.update(values.astype(found.stored, copy=False).data)
             yield values
         if hasher.hexdigest() != self.attrs["field_hashes"][name]:
-            raise UserError(f"{where}: values are not those that were sealed; see `synth verify`")
+            raise UserError(f"{where}: values were changed after the seal; run `synth verify`")
 
     def __getitem__(self, name: str) -> FieldReader:
         field, where = _field(name), f"{self._location.name}: {name}"
@@ -325,7 +306,7 @@ class Sequence:
 
 
 class Dataset:
-    """A folder of sealed sequences, or an address of one: `len`, iteration, indexing, in order of names."""
+    """The sealed sequences of a folder or address, sorted by name, with `len`, iteration and indexing."""
 
     def __init__(self, root: Path | str) -> None:
         self.root = as_path("dataset", root)
@@ -338,7 +319,7 @@ class Dataset:
         else:
             self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
         if not self.paths:
-            raise UserError(f"{self.root}: holds no finished sequence")
+            raise UserError(f"{self.root}: contains no finished sequence")
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -355,10 +336,10 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
 
     Args:
         path: of the store.
-        sealed: refuse one whose attributes are not those that were sealed; `synth verify` tells more of it.
+        sealed: refuse a store whose attributes were changed after the seal.
 
     Raises:
-        UserError: missing, unfinished, foreign, truncated or edited.
+        UserError: the store is missing, unfinished, not a sequence, truncated or edited.
     """
     as_path("sequence", path)
     if str(path).partition("::")[0].endswith(".part"):
@@ -374,23 +355,23 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
         raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
     check_attributes(sequence.attrs, str(path))
     if sealed and not sequence.is_sealed():
-        raise UserError(f"{path}: its attributes are not those that were sealed; see `synth verify`")
+        raise UserError(f"{path}: its attributes were changed after the seal; run `synth verify`")
     return sequence
 
 
 def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
-    """A hasher, begun with the stored name, type and shape; it then takes the values in C order."""
+    """A hasher that has been fed the stored name, type and shape, for the values in C order."""
     described = identity.canonical([name, str(stored), list(shape)])
     return hashlib.blake2b(described, digest_size=16)
 
 
 def content_hash(attrs: Mapping[str, Any]) -> str:
-    """What names a sequence: hash of field hashes and attributes, without timings and versions."""
+    """The identity of a sequence: hash of field hashes and attributes, without timings and versions."""
     return _hash({key: value for key, value in attrs.items() if key not in _NOT_CONTENT})
 
 
 def seal_hash(attrs: Mapping[str, Any]) -> str:
-    """Hash of all root attributes besides itself: what tells an edited attribute, timings included."""
+    """Hash of all root attributes except itself, timings included, to detect edits."""
     return _hash({key: value for key, value in attrs.items() if key != "seal_hash"})
 
 
@@ -405,11 +386,11 @@ def _field(name: str) -> Field:
 
 
 def _check_limits(field: Field, values: NDArray[Any], where: str) -> None:
-    """UserError if a value is no number, or outside the table's limits."""
+    """Raises UserError if a value is not finite, or outside the table's limits."""
     if values.dtype.kind != "f" or not values.size:
         return
     low, high = float(values.min()), float(values.max())  # both are NaN where one value is
     if not np.isfinite(low + high):
-        raise UserError(f"{where}: holds values that are no numbers")
+        raise UserError(f"{where}: contains values that are not finite")
     if (field.low is not None and low < field.low) or (field.high is not None and high > field.high):
-        raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} can't be right")
+        raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} are out of range")

@@ -1,4 +1,4 @@
-"""Single frames of a dataset for training: a map-style dataset that torch's DataLoader takes as it is."""
+"""Single frames of a dataset for training: a map-style dataset for torch's DataLoader."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
 
-# Stores that one process holds open; opening one costs some milliseconds.
-_OPEN = 64
+_OPEN = 64  # stores that one process keeps open; opening one takes some milliseconds
 
 
 class TorchDataset:
     """Every frame of every sequence in `root`, as `{field: array}`.
 
-    Fields without a frame axis come whole; `index` and `frame` say where an item is from. Safe in workers
-    that are forked or spawned: a process opens its own stores.
+    Fields without a frame axis are returned whole; `index` and `frame` identify the item. Safe in forked or
+    spawned workers: each process opens its own stores.
 
         frames = TorchDataset("out", ["rgb", "flow", "traction"])
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
@@ -32,10 +31,10 @@ class TorchDataset:
         Args:
             root: the dataset.
             fields: names from the field table.
-            sequences: positions in the dataset to take frames from (one side of a split); all if not given.
+            sequences: positions in the dataset of those to use (one side of a split); default: all.
 
         Raises:
-            UserError: no dataset there, or a sequence lacks a field.
+            UserError: not a dataset, or a sequence lacks a field.
         """
         unknown = [name for name in fields if name not in FIELDS]
         if unknown:
@@ -64,7 +63,7 @@ class TorchDataset:
         return {"index": sequence.index, "frame": frame, **values}
 
     def _readers(self, position: int) -> tuple[Sequence, dict[str, FieldReader]]:
-        if self._owner != os.getpid():  # forked: the parent's handles are the parent's
+        if self._owner != os.getpid():  # forked: the parent's handles must not be used
             self._owner, self._open = os.getpid(), OrderedDict()
         if position not in self._open:
             sequence = self._dataset[position]

@@ -1,1 +1,1 @@
-"""Running a job: workers, slots, clusters, progress."""
+"""Execution of a job: workers, slots, clusters, progress."""

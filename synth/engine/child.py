@@ -1,4 +1,4 @@
-"""The engine's side of a worker process: starts it, gives it sequences, watches it, survives it."""
+"""The engine's side of a worker process: starts it, sends it sequences, monitors and replaces it."""
 
 from __future__ import annotations
 
@@ -20,85 +20,74 @@ import synth
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
-"""How an attempt ended: only `done` is good; `input` would end the same way again."""
+"""Outcome of an attempt: `done` is the only success; `input` would fail the same way again."""
 
 _TICK_S = 0.2
-_LOG_TAIL = 4000
-# A process that has computed so many is replaced, should a library leak: none was seen to, over 16 sequences
-# (731 MB after the last, 736 after the second); starting anew costs what half a sequence does.
-_SEQUENCES_A_PROCESS = 128
+_LOG_TAIL = 4000  # characters
+# A process is replaced after so many sequences, in case a library leaks memory. None did so in 16 sequences
+# (731 MB after the last, 736 after the second); a start takes as long as half a sequence.
+_SEQUENCES_PER_PROCESS = 128
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """The end of one attempt at one sequence."""
+    """The result of one attempt at one sequence."""
 
     index: int
     kind: Kind
     reason: str = ""
-    log: str = ""
-    """Last lines that the process printed."""
+    log: str = ""  # last lines printed by the process
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What every worker process of a run is started with."""
+    """Settings of all worker processes of a run."""
 
-    job: Mapping[str, Any]
-    """The job, JSON-ready, paths resolved."""
-    folder: Path
-    """The dataset; like all paths here absolute, for a worker stands elsewhere."""
+    job: Mapping[str, Any]  # the job, JSON-ready, paths resolved
+    folder: Path  # the dataset; all paths are absolute, as workers have another working directory
     logs: Path
-    scratch: Path
-    """Where a process may leave what it likes."""
-    work: str
-    """`module:function` that computes a sequence: `(job, index, folder, report)`."""
-    memory_bytes: int | None = None
-    """A process that takes more is ended."""
-    stall_s: float = 1800.0
-    """A process that reports nothing for so long is ended."""
-    lock_fd: int | None = None
-    """The lock of the dataset, which lives as long as any worker does."""
-    environment: Mapping[str, str] | None = None
-    """Added to that of the engine."""
-    generator: str = ""
-    """Version of the program that the engine has; a machine of a cluster with another one refuses."""
-    turn: int = 0
-    """Which run of the dataset this is; another number in `turn_file` says that it is over."""
+    scratch: Path  # working directories of the processes
+    work: str  # `module:function` that computes a sequence: `(job, index, folder, report)`
+    memory_bytes: int | None = None  # limit of a process
+    stall_s: float = 1800.0  # a process without a report for so long is killed
+    lock_fd: int | None = None  # the dataset's lock, inherited so that it is held until all workers end
+    environment: Mapping[str, str] | None = None  # added to that of the engine
+    generator: str = ""  # the engine's version of the program; a cluster's machine with another one refuses
+    turn: int = 0  # number of this run of the dataset; it is over when `turn_file` has another number
     turn_file: Path = Path()
 
 
 class Slot(Protocol):
-    """Where one sequence at a time is computed; the engine has a thread for every slot."""
+    """A place where one sequence at a time is computed; the engine has a thread for every slot."""
 
     def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
         """Computes one sequence; returns when it is sealed, has failed, or `stop` is set."""
         ...
 
     def close(self) -> None:
-        """Ends what the slot holds."""
+        """Releases the slot's resources."""
         ...
 
 
 class Child:
-    """A slot on this machine: a worker process, started at need and replaced when it is worn or gone."""
+    """A slot on this machine: a worker process, started when needed and replaced when used up or dead."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._process: subprocess.Popen[bytes] | None = None
 
     def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
-        """Computes one sequence, see `Slot`. After anything but "done" and "input" the process is gone."""
+        """Computes one sequence, see `Slot`. The process survives only "done" and "input"."""
         if self._process is None:
             self._process = self._start()
         attempt = self._attempt(self._process, index, report, stop)
         self._finished += attempt.kind == "done"
-        if attempt.kind not in ("done", "input") or self._finished >= _SEQUENCES_A_PROCESS:
+        if attempt.kind not in ("done", "input") or self._finished >= _SEQUENCES_PER_PROCESS:
             self.close()
         return attempt
 
     def close(self) -> None:
-        """Ends the process and what it started, at once, and lets go of its pipes."""
+        """Kills the process and those that it started, and closes its pipes."""
         if self._process is None:
             return
         with contextlib.suppress(ProcessLookupError):
@@ -120,7 +109,7 @@ class Child:
             stderr=subprocess.DEVNULL,
             pass_fds=(theirs,) if lock is None else (theirs, lock),
             env=_environment(self._setup.environment or {}),
-            # Ctrl-C in the terminal is for the engine, which then ends its workers in order.
+            # Ctrl-C in the terminal goes to the engine only, which then ends its workers in order.
             start_new_session=True,
         )
         os.close(theirs)
@@ -146,14 +135,14 @@ class Child:
             if messages is None:
                 return Attempt(index, "crash", _ending(process.wait()), self._log(index))
             if limit is not None and _memory(process.pid) > limit:
-                reason = f"took more than {limit / 1e9:.3g} GB of memory"
+                reason = f"used more than {limit / 1e9:.3g} GB of memory"
                 return Attempt(index, "memory", reason, self._log(index))
             if time.monotonic() - last > stall_s:
                 return Attempt(index, "stalled", f"reported nothing for {stall_s:.0f} s", self._log(index))
         return Attempt(index, "stopped")
 
     def _read(self) -> list[dict[str, Any]] | None:
-        """What the process says within a tick; None when it has ended."""
+        """Messages of the process within a tick; None if it has ended."""
         if not select.select([self._pipe], [], [], _TICK_S)[0]:
             return []
         text = os.read(self._pipe, 1 << 16)
@@ -170,7 +159,7 @@ class Child:
 
 def _write(process: subprocess.Popen[bytes], line: str) -> None:
     assert process.stdin is not None
-    # A process that is gone is noticed, with its reason, by `run`.
+    # `run` detects a dead process and its reason.
     with contextlib.suppress(BrokenPipeError):
         process.stdin.write(line.encode() + b"\n")
         process.stdin.flush()
@@ -179,13 +168,13 @@ def _write(process: subprocess.Popen[bytes], line: str) -> None:
 def _memory(pid: int) -> int:
     try:
         pages = Path(f"/proc/{pid}/statm").read_text().split()
-    except OSError:  # gone, or a system without /proc
+    except OSError:  # it has ended, or there is no /proc
         return 0
     return int(pages[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _environment(more: Mapping[str, str]) -> dict[str, str]:
-    """One thread a numerical library: two slow each other down, and their number must not change a sum."""
+    """One thread per numerical library: more slow each other down, and their number must not change a sum."""
     threads = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
     found = {**os.environ, **{f"{name}_NUM_THREADS": "1" for name in threads}, "PYTHONHASHSEED": "0"}
     home = str(Path(synth.__file__).resolve().parents[1])
@@ -195,7 +184,7 @@ def _environment(more: Mapping[str, str]) -> dict[str, str]:
 
 def _ending(code: int) -> str:
     if code >= 0:
-        return f"the process ended itself with code {code}"
+        return f"the process exited with code {code}"
     name = signal.Signals(-code).name
     hint = " (the system may have run out of memory)" if name == "SIGKILL" else ""
     return f"the process died of {name}{hint}"

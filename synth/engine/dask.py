@@ -1,6 +1,6 @@
-"""Slots on a Dask cluster: each of its workers keeps a worker process of its own, as the local engine does.
+"""Slots on a Dask cluster: each of its workers has a worker process of its own, like the local engine.
 
-Needs the extra `cluster`. The dataset's folder must be on a file system that all machines share.
+Requires the extra `cluster`. The dataset's folder must be on a file system that all machines share.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ _WAIT_FOR_WORKERS_S = 600
 _CONNECT = "20s"
 _LACKING = "needs the extra `cluster`: pip install '.[cluster]' in the clone"
 
-# On a Dask worker: the setup and the child of each of its threads, from sequence to sequence.
-_thread = threading.local()
+_thread = threading.local()  # on a Dask worker: setup and child of each of its threads
 
 
 @contextmanager
 def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
     """The slots of `dask://host:port`, `tls://host:port`, or of a SLURM cluster described in a YAML file.
 
-    Whoever reaches a scheduler can run code on it, so a note on stderr says where one is reached unencrypted
-    or listens on every interface. The certificates of `tls://` are those of Dask's own configuration.
+    Anyone who can connect to a scheduler can run code on it, so a note on stderr warns if the connection is
+    unencrypted or the scheduler listens on every interface. `tls://` uses the certificates in Dask's
+    configuration.
 
     Raises:
-        UserError: the extra is not installed, no scheduler answers, the file is wrong.
+        UserError: the extra is not installed, no scheduler answers, or the file is wrong.
     """
     try:
         import distributed
     except ImportError:
         raise UserError(f"a Dask engine {_LACKING}") from None
-    # The lock cannot travel; a worker sees by the turn that its run is over.
+    # The lock can't be sent to other machines; workers detect the end of their run by the turn.
     own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
-    travelling = replace(
+    sent = replace(
         setup, lock_fd=None, environment=own, memory_bytes=None, generator=provenance.fingerprint()
     )
     with _cluster(engine) as (address, expected, security):
@@ -62,8 +62,8 @@ def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
                 client.wait_for_workers(1, timeout=_WAIT_FOR_WORKERS_S)
             except TimeoutError:
                 raise UserError(f"{engine}: no worker has joined") from None
-            # One waits even where the last worker has just left.
-            yield [_DaskSlot(client, travelling)] * max(sum(client.nthreads().values()), expected, 1)
+            # At least one slot waits, even if the last worker has just left.
+            yield [_DaskSlot(client, sent)] * max(sum(client.nthreads().values()), expected, 1)
 
 
 class _DaskSlot:
@@ -89,11 +89,11 @@ class _DaskSlot:
             future.release()
 
     def close(self) -> None:
-        """The processes on the cluster end by themselves, when the turn has passed on."""
+        """Does nothing: the processes on the cluster end themselves when the turn changes."""
 
 
 def _attempt(setup: Setup, index: int) -> dict[str, Any]:
-    """One attempt, on a Dask worker. Returns the Attempt's fields, which need no class of ours to be read."""
+    """One attempt, on a Dask worker. Returns the Attempt's fields as a dict of plain values."""
     from distributed import get_worker
 
     stop, ended = threading.Event(), threading.Event()
@@ -121,9 +121,9 @@ def _child(setup: Setup, threads: int) -> Child:
 
 
 def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Event) -> None:
-    """Sets `stop` when another run has its turn at the dataset: this one's engine is gone."""
+    """Sets `stop` when another run of the dataset has begun: the engine of this one is gone."""
     while not ended.wait(_TICK_S):
-        with suppress(OSError, ValueError):  # being rewritten, or the file system is away for a moment
+        with suppress(OSError, ValueError):  # being rewritten, or the file system is briefly unavailable
             if int(setup.turn_file.read_text()) != setup.turn:
                 stop.set()
                 return
@@ -131,7 +131,7 @@ def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Even
 
 @contextmanager
 def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
-    """(address of the scheduler, slots to come, certificates where Dask's configuration has none)."""
+    """Yields the scheduler's address, the expected number of slots, and certificates if not configured."""
     if engine.startswith(("dask://", "tls://")):
         _note(open_to(engine))
         yield engine.replace("dask://", "tcp://", 1), 0, None
@@ -146,23 +146,22 @@ def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
     try:
         cluster = SLURMCluster(**described)  # no job is submitted yet
     except (TypeError, ValueError) as error:
-        raise UserError(f"{engine}: is not what dask-jobqueue takes ({error})") from error
+        raise UserError(f"{engine}: is not accepted by dask-jobqueue ({error})") from error
     with cluster:
         cluster.scale(jobs=jobs)
         yield cluster.scheduler_address, jobs * int(described["cores"]), cluster.security
 
 
 def open_to(cluster: str | dict[str, Any]) -> str:
-    """Who could run code on a cluster, an address or what `read_slurm` gives; empty where that is guarded.
+    """A warning if others could run code on a cluster (an address or the dict of `read_slurm`), else empty.
 
-    Raises:
-        UserError: an address without a host or a port.
+    Raises UserError for an address without a host or a port.
     """
     if isinstance(cluster, str):
         kind, _, place = cluster.partition("://")
         host, _, port = place.rpartition(":")
         if not host or not (port.isascii() and port.isdigit()):
-            raise UserError(f"{cluster}: an address is written {kind}://host:port")
+            raise UserError(f"{cluster}: write the address as {kind}://host:port")
         local = host in ("localhost", "[::1]") or host.startswith("127.")
         return "" if kind == "tls" or local else f"{host} is reached unencrypted (tls://... is not)"
     scheduler = cluster.get("scheduler_options")
@@ -176,17 +175,17 @@ def open_to(cluster: str | dict[str, Any]) -> str:
 
 def _note(who: str) -> None:
     if who:
-        print(f"note: {who}: whoever is in that network can run code there", file=sys.stderr)
+        print(f"note: {who}: anyone in that network can run code there", file=sys.stderr)
 
 
 def read_slurm(path: Path) -> dict[str, Any]:
-    """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file that does not say so."""
+    """`jobs` and the arguments of dask_jobqueue.SLURMCluster. UserError for a file without them."""
     if not os.path.lexists(path):
         raise UserError(f"{path}: is neither local, dask://host:port, tls://host:port nor a file")
     found = checked_file.read_yaml(path)
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
-        raise UserError(f"{path}: must say how many `jobs` to ask for")
+        raise UserError(f"{path}: must contain `jobs`, the number of jobs to submit")
     missing = {"cores", "memory"} - found.keys()
     if missing:
-        raise UserError(f"{path}: must say {' and '.join(sorted(missing))} of a job")
+        raise UserError(f"{path}: must contain {' and '.join(sorted(missing))} of a job")
     return dict(found)

@@ -1,4 +1,4 @@
-"""How a run stands: kept in a file for `synth status`, and reported to whoever watches."""
+"""The state of a run: stored in a file for `synth status`, and reported to watchers."""
 
 from __future__ import annotations
 
@@ -14,21 +14,19 @@ from synth.engine.child import Attempt
 
 FILE = "progress.json"
 _EVERY_S = 2.0
-_LATEST = 32  # sequences that say how fast it goes
+_LATEST = 32  # sequences that the rate is estimated from
 
 
 @dataclass(frozen=True)
 class RunProgress:
     """A run at one moment."""
 
-    left_s: float | None = None
-    """To the end, at the latest sequences' rate; None until enough are finished."""
-    in_flight: dict[str, list[Any]] = field(default_factory=dict)
-    """Stage, steps done and steps in all of the sequences being computed."""
+    left_s: float | None = None  # to the end, at the latest sequences' rate; None until enough are finished
+    in_flight: dict[str, list[Any]] = field(default_factory=dict)  # sequence -> stage, steps done, all steps
 
 
 class Watcher:
-    """Called with what happens in a run, from the main thread only; by itself it does nothing."""
+    """Callbacks for the events of a run, called from the main thread only; this class ignores them."""
 
     def begin(self, total: int, already: int, failed: int) -> None:
         """A run begins."""
@@ -40,11 +38,11 @@ class Watcher:
         """An attempt at a sequence has ended."""
 
     def account(self, progress: RunProgress) -> None:
-        """How the run stands, every two seconds at most; before the event that it follows from."""
+        """Progress of the run, at most every two seconds, before the event that caused it."""
 
 
 class Journal(Watcher):
-    """Writes down how the run stands, and reports it."""
+    """Writes the progress of a run to a file, and reports it."""
 
     def __init__(self, folder: Folder, workers: int, report: Callable[[RunProgress], None]) -> None:
         self._path, self._report = folder.state / FILE, report
@@ -70,13 +68,13 @@ class Journal(Watcher):
         self._write()
 
     def pace(self, at_s: float) -> None:
-        """A sequence ended. The first of each worker only start the clock, as they also compile."""
+        """Records the end of a sequence, without the first of each worker, which includes compilation."""
         self._cold -= 1
         if self._cold <= 0:
             self._ends.append(at_s)
 
     def left_s(self) -> float | None:
-        """Seconds to the end, by the latest sequences; None while there are first ones only."""
+        """Seconds to the end, by the latest sequences; None until there are enough."""
         count = len(self._ends) - 1
         return (self._ends[-1] - self._ends[0]) / count * self._left if count > 0 else None
 

@@ -1,4 +1,4 @@
-"""Progress of a run on the terminal: what is being done, how far it is, how long it will take."""
+"""Progress of a run on the terminal: stages, sequences done, time left."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from synth.engine.journal import RunProgress, Watcher
 from synth.engine.status import clock
 from synth.system.terminal import ProgressBars
 
-# Without a terminal a line is printed at most so often.
-_QUIET_S = 10.0
+_QUIET_S = 10.0  # least time between two lines without a terminal
 
 
 class RunBars(ProgressBars, Watcher):
-    """A bar for the dataset and one for every sequence in work; plain lines where nothing can be drawn.
+    """A bar for the dataset and one for every sequence in work; plain lines without a terminal.
 
-    What is left is the run's own estimate: rich knows nothing of workers whose first sequences also compile.
+    The time left is the run's estimate: that of rich would include the compilation in first sequences.
     """
 
     def __init__(self) -> None:
@@ -30,8 +29,8 @@ class RunBars(ProgressBars, Watcher):
     def begin(self, total: int, already: int, failed: int) -> None:
         self.reset(self._dataset, total=total, completed=already + failed)
         if already or failed:
-            hint = f", {failed} failed (`--retry` takes them up again)" if failed else ""
-            self._print(f"{already} of {total} sequences are there already{hint}")
+            hint = f", {failed} failed (`--retry` computes them again)" if failed else ""
+            self._print(f"{already} of {total} sequences are done already{hint}")
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         if index not in self._bars:
@@ -44,7 +43,7 @@ class RunBars(ProgressBars, Watcher):
         if attempt.kind == "stopped":
             return
         if attempt.kind != "done":
-            what = "is tried again" if again else "failed"
+            what = "is retried" if again else "failed"
             self._print(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
         if again:
             return

@@ -1,4 +1,4 @@
-"""Running a job: sequences handed to worker processes, none lost, order without effect."""
+"""Execution of a job: sequences are distributed to worker processes, and their order has no effect."""
 
 from __future__ import annotations
 
@@ -23,38 +23,29 @@ from synth.job.schema import Job
 from synth.publish import card, croissant, sequence_video
 from synth.render.camera import camera as cameras
 
-_TRIES = 3
-# So many first sequences failing on the job's own account, and none succeeding, condemn the job.
-_VERDICT = 5
+_TRIES = 3  # attempts per sequence
+_VERDICT = 5  # the job is refused if so many sequences fail because of it before any succeeds
 
 _Event = Callable[[Watcher], None]
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to run; none of it changes a byte of the dataset."""
+    """Options of a run; none of them changes a byte of the dataset."""
 
-    engine: str = "local"
-    """`local`, `dask://host:port`, `tls://host:port`, or a YAML file that describes a SLURM cluster."""
-    workers: int | None = None
-    """Processes at a time; default one a core."""
-    gpus: str = "auto"
-    """GPUs of this machine that the workers share: `auto`, `none`, or their numbers, `0,1`."""
-    memory_gb: float | None = None
-    """Memory that one process may take; default what is available now, shared out."""
-    stall_s: float = 1800.0
-    """Patience with a process that reports nothing."""
-    work: str = "synth.sequence.pipeline:render_sequence"
-    """`module:function` that computes one sequence."""
-    environment: Mapping[str, str] = field(default_factory=dict)
-    """Added to the environment of the workers."""
-    mix_versions: bool = False
-    """Continue a dataset that another version of the program began."""
+    engine: str = "local"  # or dask://host:port, tls://host:port, a YAML file that describes a SLURM cluster
+    workers: int | None = None  # number of processes; None: one per core
+    gpus: str = "auto"  # GPUs of this machine that the workers share: `auto`, `none`, or their numbers, `0,1`
+    memory_gb: float | None = None  # limit of one process; None: an equal share of the available memory
+    stall_s: float = 1800.0  # a process without a report for so long is killed
+    work: str = "synth.sequence.pipeline:render_sequence"  # `module:function` that computes one sequence
+    environment: Mapping[str, str] = field(default_factory=dict)  # added to the environment of the workers
+    mix_versions: bool = False  # continue a dataset that another version of the program began
 
 
 @dataclass(frozen=True)
 class Summary:
-    """The end of a run."""
+    """The result of a run."""
 
     total: int
     already: int
@@ -70,15 +61,15 @@ class Summary:
 def render_job(
     job: Job | str | Path, out: str | Path, *, progress: bool | Watcher = False, **options: Any
 ) -> Summary:
-    """Renders the dataset of a job into a folder; one that is there for the same job is continued.
+    """Renders the dataset of a job into a folder; an existing one of the same job is continued.
 
-    Sequences are computed in processes of their own, so this works from a notebook too. A sequence that fails
-    doesn't end the run: `Summary.failed` has its reason.
+    Sequences are computed in separate processes, so this works from a notebook too. A failed sequence does
+    not end the run: `Summary.failed` has its reason.
 
     Args:
-        job: the job, or what `load_job` knows it by.
+        job: the job, or a path or name for `load_job`.
         out: the folder.
-        progress: True draws bars, in a terminal or a notebook; a `Watcher` is called with what happens.
+        progress: True draws bars, in a terminal or a notebook; a `Watcher` is called with the run's events.
         options: as the command's: `workers`, `engine`, `gpus`, `memory_gb`, `mix_versions`.
 
     Raises:
@@ -99,11 +90,11 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
     Raises:
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out at all
             (then nothing is left behind).
-        KeyboardInterrupt: after the workers are ended; what is sealed stays, the next run goes on.
+        KeyboardInterrupt: after the workers have ended; sealed sequences stay, the next run continues.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
     share = machine.share_of_memory(workers) if memory is None else int(memory * 1e9)
-    if options.engine == "local" and options.work == Options.work:  # a stand-in takes what it takes
+    if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)
     cameras.refuse_unfit(job.render)
     gpus = machine.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
@@ -145,7 +136,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 
 @contextmanager
 def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
-    """A folder for scenes of one's own, written by `write_scene`; index, preview and card follow at the end.
+    """A folder for custom scenes, written by `write_scene`; index, preview and card are written at the end.
 
     Example:
         with synth.open_dataset("out", job) as folder:
@@ -169,7 +160,7 @@ def _publish(folder: Folder) -> None:
 
 
 class _Pool:
-    """Threads, each with a slot of its own, and the queue that they take sequences from."""
+    """Threads, each with its own slot, and the queue of sequences to compute."""
 
     def __init__(self, folder: Folder, slots: Sequence[Slot], todo: list[int]) -> None:
         self._folder, self._slots = folder, slots
@@ -177,7 +168,7 @@ class _Pool:
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
-        # For the main thread: what watchers are called with, an error, or None when a thread ends.
+        # For the main thread: calls of watchers, an error, or None when a thread ends.
         self._events: queue.SimpleQueue[_Event | BaseException | None] = queue.SimpleQueue()
         self._done = 0
         self._refused: list[Attempt] = []
@@ -223,7 +214,7 @@ class _Pool:
             self._events.put(None)
 
     def _take(self) -> tuple[int, int] | None:
-        """The next (sequence, try); waits while others may still give one back; None at the end."""
+        """The next (sequence, attempt); waits while others may still be retried; None at the end."""
         with self._change:
             self._change.wait_for(lambda: self._stop.is_set() or self._todo or not self._busy)
             if self._stop.is_set() or not self._todo:
@@ -261,14 +252,14 @@ class _Pool:
             left = self._done + len(self._todo) + self._busy - 1
             hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
         if hopeless and not self._folder.sealed():
-            # The job itself is at fault: nothing of it stays.
+            # The job itself is at fault: leave nothing behind.
             self._folder.clear_failures([refused.index for refused in self._refused])
             raise UserError("\n".join(sorted({refused.reason for refused in self._refused})))
 
 
 @contextmanager
 def _slots(engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> Iterator[Sequence[Slot]]:
-    """Where sequences are computed; each of this machine's slots sees one of `gpus` in turn, or all."""
+    """The slots of an engine; each of this machine's has one of `gpus` in turn, or all."""
     if engine == "local":
         names = ["" if not gpus else gpus[k % len(gpus)] for k in range(workers)]
         own = [{} if gpus is None else {"CUDA_VISIBLE_DEVICES": name} for name in names]

@@ -1,4 +1,4 @@
-"""How a dataset stands: done, running, failed and why, how long and how much is still to come."""
+"""The status of a dataset: sequences done, running and failed, and the time and disk still needed."""
 
 from __future__ import annotations
 
@@ -28,18 +28,13 @@ class Status:
 
     total: int
     done: int
-    failed: dict[str, int]
-    """How many failed for each reason."""
-    running: bool
-    """Whether a run is writing to it now."""
-    in_flight: dict[str, list[Any]]
-    """Stage, steps done and steps in all of the sequences being computed."""
-    left_s: float | None
-    """Time to the end, at the rate of the run at work."""
+    failed: dict[str, int]  # reason -> number of sequences
+    running: bool  # whether a run is writing to it now
+    in_flight: dict[str, list[Any]]  # stage, steps done and steps in all of the sequences being computed
+    left_s: float | None  # time to the end, at the rate of the current run
     ahead: Forecast
-    disk_free: int
-    stages_cpu_s: dict[str, float]
-    """CPU-seconds a sequence by stage, mean of up to ten finished ones."""
+    disk_free: int  # bytes
+    stages_cpu_s: dict[str, float]  # CPU time per sequence by stage, mean of up to ten finished ones
 
 
 def read_status(root: Path) -> Status:
@@ -64,29 +59,29 @@ def read_status(root: Path) -> Status:
 
 
 def lines(status: Status) -> list[str]:
-    """The same for a person."""
+    """The status as lines of text."""
     count = sum(status.failed.values())
     found = [f"{status.done} of {status.total} sequences done, {count} failed"]
     found += [f"  {number} x {reason}" for reason, number in list(status.failed.items())[:10]]
     if count:
-        found.append("  `synth render --retry` takes the failed ones up again")
+        found.append("  `synth render --retry` computes the failed ones again")
     if status.running:
         left = "" if status.left_s is None else f", {clock(status.left_s)} left"
-        found.append(f"a run is at work{left}")
+        found.append(f"a run is in progress{left}")
         found += [
             f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
         ]
     elif status.ahead.sequences:
-        found.append("no run is at work; `synth render` with the same job and folder goes on")
+        found.append("no run is in progress; `synth render` with the same job and folder continues")
     if status.stages_cpu_s:
         each = ", ".join(f"{name} {seconds:.1f}" for name, seconds in status.stages_cpu_s.items())
-        found.append(f"CPU-seconds a sequence: {each}")
+        found.append(f"CPU-seconds per sequence: {each}")
     if status.ahead.sequences:
         ahead = status.ahead
         basis = f"from {ahead.pilot} finished" if ahead.pilot else "estimated"
         time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
         found.append(
-            f"still to come: {ahead.sequences} sequences, "
+            f"remaining: {ahead.sequences} sequences, "
             f"{size_forecast.amount(ahead.bytes)}{time} ({basis}); "
             f"the disk has {size_forecast.amount(status.disk_free)} free"
         )
@@ -94,7 +89,7 @@ def lines(status: Status) -> list[str]:
 
 
 def _progress(folder: Folder) -> RunProgress | None:
-    """What the run at work says of itself; None when none is at work."""
+    """Progress of the current run; None if there is none."""
     try:
         descriptor = os.open(folder.state / "lock", os.O_RDONLY | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -105,7 +100,7 @@ def _progress(folder: Folder) -> RunProgress | None:
     except BlockingIOError:
         try:
             return TypeAdapter(RunProgress).validate_python(checked_file.read_json(folder.state / FILE))
-        except (UserError, ValidationError):  # it has only just begun, or is of another version
+        except (UserError, ValidationError):  # it has just begun, or is of another version
             return RunProgress()
     finally:
         os.close(descriptor)
@@ -127,7 +122,7 @@ def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
     total: Counter[str] = Counter()
     read = 0
     for key in pilot:
-        with suppress(UserError):  # `synth verify` is for damage
+        with suppress(UserError):  # damage is reported by `synth verify`
             timings = open_sequence(location.store(root, key)).attrs.get("timings", {})
             total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
             read += 1

@@ -1,8 +1,8 @@
-"""The process that computes sequences, one after another, and says on a pipe how it goes.
+"""The process that computes sequences, one after another, and reports its progress on a pipe.
 
 Run as `python -m synth.engine.worker FD`, where FD is the pipe to write to. It reads lines of JSON from
-standard input: first the setup, then one index at a time. What it and its libraries print
-goes to the sequence's log.
+standard input: first the setup, then one index at a time. Its output and that of its libraries goes to the
+sequence's log.
 """
 
 from __future__ import annotations
@@ -25,15 +25,14 @@ from typing import Any
 from synth.dataset import location
 from synth.errors import UserError
 
-# From <linux/prctl.h>: the signal this process gets when the engine dies, however it dies.
-_PR_SET_PDEATHSIG = 1
+_PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal sent to this process when the engine dies
 
 
 def main(pipe: int) -> None:
-    """Serves until standard input ends."""
+    """Computes sequences until standard input ends."""
     _die_with_parent()
     setup = json.loads(sys.stdin.readline())
-    # Libraries that drop files where they stand must not meet one another's, nor litter the user's folder.
+    # Libraries that write files to the working directory must not share it, nor use the user's folder.
     with tempfile.TemporaryDirectory(dir=setup["scratch"]) as scratch:
         os.chdir(scratch)
         _log_to(Path(setup["logs"]) / f"worker-{os.getpid()}.log")
@@ -48,7 +47,7 @@ def _serve(pipe: int, setup: dict[str, Any]) -> None:
         log = Path(setup["logs"]) / f"{index:06d}.log"
         _log_to(log)
         try:
-            # It is there already if a cluster lost sight of an attempt that had just sealed it.
+            # It exists already if a cluster lost the result of an attempt that had just sealed it.
             if not location.store(folder, index).exists():
                 if render is None:
                     _send(pipe, stage="start", done=0, of=1)
@@ -56,7 +55,7 @@ def _serve(pipe: int, setup: dict[str, Any]) -> None:
                 render(index, folder, lambda stage, done, of: _send(pipe, stage=stage, done=done, of=of))
         except UserError as error:
             _send(pipe, failed="input", reason=str(error))
-        except Exception as error:  # whatever it is, it costs this sequence and not the run
+        except Exception as error:  # any error fails this sequence only, not the run
             traceback.print_exc()
             kind, first = "error", (str(error).splitlines() or [""])[0]
             if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
@@ -69,14 +68,14 @@ def _serve(pipe: int, setup: dict[str, Any]) -> None:
             _send(pipe, sealed=index)
         gc.collect()
         if render is not None and not settled:
-            # Libraries hold a million objects that never go: walking over them three times a sequence, in
-            # search of what a scene left, took 0.7 s of it.
+            # Libraries hold a million permanent objects: scanning them in three collections per sequence
+            # took 0.7 s.
             gc.freeze()
             settled = True
 
 
 def _prepare(setup: dict[str, Any]) -> Callable[..., None]:
-    """What computes a sequence, given its job. UserError if the engine is of another version."""
+    """The function that computes a sequence of the job. UserError if the engine has another version."""
     from synth.dataset import provenance
     from synth.job.schema import Job
 
@@ -105,7 +104,7 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
-        # When memory runs out, the kernel is to take this process and not the engine.
+        # If memory runs out, the kernel shall kill this process and not the engine.
         Path("/proc/self/oom_score_adj").write_text("800")
 
 

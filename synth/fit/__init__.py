@@ -1,1 +1,1 @@
-"""The camera of one photograph, measured, and the family of the job that is nearest."""
+"""Estimation of a photograph's camera parameters and of its nearest appearance family."""

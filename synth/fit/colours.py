@@ -1,4 +1,4 @@
-"""Matrix and tone curves by which light from rendered tissue takes the colours of a photograph's."""
+"""Colour matrix and tone curves that map rendered tissue to the colours of a photograph."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from synth.render.camera.colour_processing import PLAIN, ColourProcessing
 Floats = npt.NDArray[np.float64]
 
 _PIXELS, _DIRECTIONS, _QUANTILES = 6000, 48, 100
-_OFF_DIAGONAL = -0.6, 0.2  # as published cameras have them
-_KNOWN, _NEUTRAL = 0.1, 0.3  # weights of plain colours, and of curves that are alike, against the distance
+_OFF_DIAGONAL = -0.6, 0.2  # range in published cameras
+_KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
 
 
 def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> tuple[ColourProcessing, float]:
-    """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and that.
+    """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and the cost.
 
     Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011). Directions in
-    which the photograph varies little count more: hue would drown in lightness.
+    which the photograph varies little have more weight, as lightness would dominate hue.
 
     Args:
         light: (N, 3) of rendered tissue, white-balanced, 1 at full scale.
@@ -55,7 +55,7 @@ def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> tuple[ColourPr
 
 
 def _colours(free: Floats) -> ColourProcessing:
-    """Of 6 off-diagonal elements plus 1, and 12 log steps between a curve's knots, against its last."""
+    """Colours from 6 off-diagonal elements plus 1, and 12 log steps of curves relative to the last."""
     matrix, off = np.eye(3), ~np.eye(3, dtype=bool)
     matrix[off] = free[:6] - 1
     matrix[~off] = 2 - matrix.sum(axis=1)

@@ -1,4 +1,4 @@
-"""A photograph in, a look out: the nearest family, and the camera that the photograph was taken with."""
+"""Fit of the appearance family and of the camera parameters to a photograph."""
 
 from __future__ import annotations
 
@@ -35,25 +35,22 @@ _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]]
         lambda px: {"blur": max(px, 0.0), "sharpening": _USUAL.sharpening + max(-px, 0.0)},
     ),
 }
-"""Of each figure: values that are tried, in the order in which it rises, and the sensor's keys for them."""
+"""By statistic: values to try, in the order in which it rises, and the sensor's keys for a value."""
 
 
 class TissueFrame(NamedTuple):
-    """A rendered frame before its sensor."""
+    """A rendered frame before the camera's sensor."""
 
-    radiance: Map
-    """(H, W, 3) linear."""
-    usable: Mask
-    """(H, W) tissue."""
-    sensor: CameraSensor
-    """The usual one, exposed and white-balanced as the sequence's own is."""
+    radiance: Map  # (H, W, 3) linear
+    usable: Mask  # (H, W) tissue
+    sensor: CameraSensor  # default sensor with the sequence's exposure and white balance
 
     def record(self, keys: dict[str, Any]) -> Picture:
-        """The picture (H, W, 3) sRGB that the sensor with these keys takes."""
+        """The picture (H, W, 3) sRGB recorded by the sensor with these keys."""
         return camera_sensor.record(self.radiance, replace(self.sensor, **keys), np.random.default_rng(0))
 
     def light(self, keys: dict[str, Any]) -> Map:
-        """(N, 3) that its chip measures of tissue, white-balanced, 1 at full scale."""
+        """The sensor's signal (N, 3) on tissue, white-balanced, 1 at full scale."""
         rng = np.random.default_rng(0)
         return balanced_light(self.radiance, replace(self.sensor, **keys), rng)[self.usable]
 
@@ -61,9 +58,9 @@ class TissueFrame(NamedTuple):
 def fit_camera(given: Photograph) -> dict[str, Any]:
     """Sections of a job with the photograph's family and camera.
 
-    Frames of a default job of that family are rendered as wide as the photograph, then recorded and packed
-    with rising vignette, noise and blur: those are taken with which they measure what the photograph does.
-    Colours are fitted to the light that such a camera measures.
+    Frames of a default job of that family are rendered at the photograph's width, then recorded and
+    compressed with rising vignette, noise and blur, whose values are chosen so that the statistics of the
+    photograph are reproduced. Colours are fitted to the signal of that camera.
     """
     theirs, family = measure(given.rgb, given.usable), nearest_family(given)
     widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
@@ -96,14 +93,14 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
 
 
 def nearest_family(given: Photograph) -> Family:
-    """The family whose tissue some camera's colours bring nearest to the photograph's."""
+    """The family whose tissue, with fitted colours, is closest to the photograph's."""
     video, width = given.rgb[given.usable] / 255, min(_CHOOSING_PX, given.rgb.shape[1] // 4 * 4)
     light = {name: render(name, width, given.mm_per_px, 0).light({}) for name in FAMILIES}
     return min(FAMILIES, key=lambda name: fit_colours(light[name], video)[1])
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
-    """A default frame without instruments: the anatomy, view and light of sequence `index`."""
+    """A frame of a default job without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
     appearance = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False}

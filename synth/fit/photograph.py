@@ -1,4 +1,4 @@
-"""A photograph of cortex at the scale of a job's pictures: what of it can be measured, how it was packed."""
+"""A photograph of cortex, resampled to the scale of a job's pictures; its usable region and compression."""
 
 from __future__ import annotations
 
@@ -18,24 +18,22 @@ from synth.render.camera import video_link
 from synth.system import checked_file
 
 _SMALLEST_PX, _LEAST_MM2 = 160, 60.0  # of a picture's sides, and of cortex
-_UNSEEN_DB = 46.0  # a loss below this is less than rounding to 8 bits of a noisy picture
+_INVISIBLE_DB = 46.0  # PSNR above which a loss is smaller than rounding a noisy picture to 8 bits
 _BITRATES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # Mbit/s of a video of so many pixels
 _VIDEO_PX = 640 * 480
 _SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 
 
 class Compression(NamedTuple):
-    """How a picture file was packed."""
+    """The compression of a picture file."""
 
-    tables: list[list[int]]
-    """JPEG's quantisation of light and colour, 64 steps each; empty: none."""
+    tables: list[list[int]]  # JPEG's quantisation of luma and chroma, 64 steps each; empty: not a JPEG
     chroma: str
-    finer: float
-    """Pixels of the file over those of the scale that is measured at."""
+    finer: float  # resolution of the file relative to the measurement's
 
     @classmethod
     def of_file(cls, data: bytes, finer: float) -> Compression:
-        """As the head of the file has it."""
+        """The compression stated in the header of a file."""
         with Image.open(io.BytesIO(data)) as image:
             if not isinstance(image, JpegImagePlugin.JpegImageFile):
                 return cls([], "4:4:4", finer)
@@ -43,7 +41,7 @@ class Compression(NamedTuple):
             return cls(tables[:2], _SAMPLING[max(0, JpegImagePlugin.get_sampling(image))], finer)
 
     def apply(self, rgb: Picture) -> Picture:
-        """A picture (H, W, 3) packed so at the file's own size, and brought back."""
+        """A picture (H, W, 3) compressed alike at the file's resolution, and resampled back."""
         if not self.tables:
             return rgb
         height, width = rgb.shape[:2]
@@ -54,51 +52,49 @@ class Compression(NamedTuple):
         return np.asarray(cv2.resize(back, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     def bitrate_mbps(self, rgb: Picture) -> float | None:
-        """The rate, for 640 x 480, at which H.264 takes as much from a rendered frame; None: nothing seen."""
+        """The bitrate, for 640 x 480, at which H.264 has the same loss on a frame; None: it is invisible."""
         lost = cv2.PSNR(rgb, self.apply(rgb))
-        if lost > _UNSEEN_DB:
+        if lost > _INVISIBLE_DB:
             return None
         noise = np.random.default_rng(0).normal(0, 2, (5, *rgb.shape))
-        film = np.clip(rgb + noise, 0, 255).astype(np.uint8)
+        video = np.clip(rgb + noise, 0, 255).astype(np.uint8)
         left = []
         for rate in np.array(_BITRATES) * (rgb[..., 0].size / _VIDEO_PX):
             sensor = SensorSection.model_validate({"bitrate_mbps": rate, "chroma": self.chroma})
-            back = video_link.recorded(film, sensor, 25.0)
-            left.append(np.mean([cv2.PSNR(*pair) for pair in zip(film, back, strict=True)]))
+            back = video_link.recorded(video, sensor, 25.0)
+            left.append(np.mean([cv2.PSNR(*pair) for pair in zip(video, back, strict=True)]))
         return float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
 
 
 class Photograph(NamedTuple):
-    """What a look is measured in."""
+    """A photograph for the measurement of appearance and camera."""
 
-    rgb: Picture
-    """(H, W, 3) sRGB."""
-    usable: Mask
-    """(H, W) cortex, without instruments."""
+    rgb: Picture  # (H, W, 3) sRGB
+    usable: Mask  # (H, W) cortex, without instruments
     mm_per_px: float
     compression: Compression
 
     @property
     def cortex_mm2(self) -> float:
-        """Area that can be measured."""
+        """Area of the usable cortex."""
         return float(self.usable.sum()) * self.mm_per_px**2
 
 
 def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograph:
-    """The photograph at the scale of a default job's pictures, or at its own where that is coarser.
+    """The photograph at the scale of a default job's pictures, or at its own if that is coarser.
 
-    `width_mm` is what its width spans at the cortex, `mask` a picture of the same size, white where there is
-    cortex to be measured, which is found if not given. UserError: it cannot be used.
+    `width_mm` is its width at the cortex; `mask` a picture of the same size, white on usable cortex, which is
+    detected if it is None. UserError if it cannot be used.
     """
     rgb = np.ascontiguousarray(np.asarray(checked_file.read_picture(path), np.uint8)[..., ::-1])
     if min(rgb.shape[:2]) < _SMALLEST_PX:
-        raise UserError(f"{path}: smaller than {_SMALLEST_PX} pixels")
+        raise UserError(f"{path}: is smaller than {_SMALLEST_PX} pixels; use a larger picture")
     own, usual = width_mm / rgb.shape[1], RenderSection()
     finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
     painted = None if mask is None else np.asarray(checked_file.read_picture(mask, 0)) > 127
     usable = mask_detection.cortex(rgb, own) if painted is None else painted
     if usable.shape != rgb.shape[:2]:
-        raise UserError(f"{mask}: is of another size than the photograph")
+        raise UserError(f"{mask}: has another size than the photograph")
     small = {"dsize": None, "fx": 1 / finer, "fy": 1 / finer, "interpolation": cv2.INTER_AREA}
     rgb = np.asarray(cv2.resize(rgb, **small), np.uint8)
     usable = np.asarray(cv2.resize(usable.astype(np.float32), **small) > 0.99)
@@ -107,6 +103,6 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
     if found.cortex_mm2 < _LEAST_MM2:
         raise UserError(
             f"{path}: {found.cortex_mm2:.0f} mm2 of cortex in a width of {width_mm:g} mm, {_LEAST_MM2:g} are "
-            "needed; mark it with --mask, or say with --width-mm what the picture spans"
+            "needed; mark the cortex with --mask, or correct the picture's width with --width-mm"
         )
     return found

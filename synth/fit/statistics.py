@@ -1,4 +1,4 @@
-"""What one photograph tells of its camera: vignette, noise and sharpness."""
+"""Statistics of a photograph that depend on its camera: vignette, noise and sharpness."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _LAPLACIAN = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 
 
 def measure(rgb: Picture, usable: Mask, reach: float = 1.0) -> dict[str, float]:
-    """Figures of one picture, by which a photograph and a rendered frame of another cortex can be compared.
+    """Statistics by which a photograph can be compared with a rendered frame of another cortex.
 
     `vignette`: loss of light in the corners, a logarithm. `noise`: standard deviation in grey levels where
-    tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave against two octaves
-    on, both without the noise.
+    tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave relative to two
+    octaves coarser, both without the noise.
 
     Args:
         rgb: (H, W, 3) sRGB.
         usable: (H, W) tissue, without instruments.
-        reach: share of the whole photograph's width that this picture, of its middle, is.
+        reach: width of this picture, the centre of a photograph, relative to that of the photograph.
     """
     tissue, clear = (usable & ~mask_detection.glare(rgb, grown) for grown in (2, 4))
     levels = np.arange(256, dtype=np.float32) / 255
@@ -52,9 +52,9 @@ def measure(rgb: Picture, usable: Mask, reach: float = 1.0) -> dict[str, float]:
 
 
 def _vignette(red: Map, tissue: Mask, reach: float) -> float:
-    """How much less light there is in the corners: of red, which blood hardly darkens, on a log scale.
+    """Loss of red light, which blood hardly absorbs, in the corners, on a log scale.
 
-    Lamps light one side more than the other: a slope over the picture is no vignette.
+    A linear slope over the picture, from lamps at one side, is not part of the vignette.
     """
     at, middle = np.argwhere(tissue), (np.array(tissue.shape) - 1) / 2
     away = reach**2 * ((at - middle) ** 2).sum(axis=1) / (middle**2).sum()

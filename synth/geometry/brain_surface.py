@@ -1,4 +1,4 @@
-"""A user's brain surface, as it comes, placed in world axes."""
+"""Reading of a user's brain surface and its placement in world axes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.errors import Caution, UserError
+from synth.errors import Caution, UserError, first_line
 from synth.geometry.triangles import Shape
 from synth.geometry.vtk import read_vtk
 from synth.job import identity
@@ -20,11 +20,9 @@ from synth.system import checked_file
 
 Floats = NDArray[np.float64]
 
-KINDS = ("obj", "stl", "ply", "off", "vtk")
-"""Endings of the files that are read."""
+KINDS = ("obj", "stl", "ply", "off", "vtk")  # suffixes of the files that can be read
 
-_OPEN = 0.25
-"""Share of a surface's area from which on what is missing is no hole: a hemisphere lacks a half."""
+_OPEN = 0.25  # missing share of a surface's area above which it counts as open: a hemisphere lacks a half
 
 
 @dataclass(frozen=True)
@@ -32,10 +30,8 @@ class Brain:
     """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
 
     shape: Shape
-    origin: Floats
-    """(3,) mm, the craniotomy's centre in the file's axes."""
-    attachments: tuple[AttachmentSection, ...]
-    """Where it is held inside, in world axes."""
+    origin: Floats  # (3,) mm, the craniotomy's centre in the file's axes
+    attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
 
 
 def load_brain(
@@ -44,18 +40,18 @@ def load_brain(
     attachments: Sequence[AttachmentSection] = (),
     fill_holes: bool = False,
 ) -> Brain:
-    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges what belongs together, and places it.
+    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges its vertices, and places it.
 
     Args:
         path: the file, coordinates in mm.
         craniotomy: point and direction in the file's axes.
         attachments: in the file's axes.
-        fill_holes: as of `read_brain`.
+        fill_holes: as in `read_brain`.
 
     Raises:
         UserError: the file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
     """
-    assert craniotomy.point is not None  # with a mesh a job needs both
+    assert craniotomy.point is not None  # the job requires both with a mesh
     assert craniotomy.direction is not None
     vertices, faces = read_brain(path, fill_holes)
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
@@ -85,14 +81,12 @@ def load_brain(
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np.int64]]:
     """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3).
 
-    `fill_holes`: every hole is closed by a fan of triangles, so that each edge has two faces.
-
-    Raises:
-        UserError: the file cannot be read, encloses no volume, or a hole can't be filled.
+    `fill_holes`: every hole is closed by a fan of triangles, so that each edge has two faces. UserError: the
+    file can't be read, encloses no volume, or a hole can't be filled.
     """
     vertices, faces = _read(path)
     if not np.isfinite(vertices).all():
-        raise UserError(f"anatomy.mesh: {path.name} holds coordinates that are no numbers")
+        raise UserError(f"anatomy.mesh: {path.name} has coordinates that are not finite")
     if fill_holes:
         faces = _filled(vertices, faces, path.name)
     span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
@@ -100,17 +94,17 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
     if (open_share := _open_share(vertices, faces)) > _OPEN:
-        said = f"{path.name} is open: what would close it has {100 * open_share:.0f}% of its area"
         warnings.warn(
-            f"anatomy.mesh: {said}; motion may be a third off: anatomy.fill_holes=true closes flat holes",
+            f"anatomy.mesh: {path.name} is open, {100 * open_share:.0f}% of its area is missing; motion may "
+            "be wrong by a third: anatomy.fill_holes=true closes flat holes",
             Caution,
-            stacklevel=1,  # said once
+            stacklevel=1,  # so that it is printed only once
         )
     return vertices, faces
 
 
 def axes(out: Floats) -> Floats:
-    """World axes in a mesh's own, (3, 3) rows x, y, z with z = `out`; x as near to the mesh's x as can be."""
+    """World axes in a mesh's axes, (3, 3) rows x, y, z with z = `out` and x close to the mesh's x."""
     z = out / np.linalg.norm(out)
     helper = np.eye(3)[0] if abs(z[0]) < 0.9 else np.eye(3)[1]
     x = helper - z * (helper @ z)
@@ -119,7 +113,7 @@ def axes(out: Floats) -> Floats:
 
 
 def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
-    """Where the z axis passes the faces, mm."""
+    """Heights at which the z axis intersects the faces [mm]."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], axis=1)
     whole = parts.sum(axis=1)
@@ -130,28 +124,28 @@ def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
 def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in KINDS:
-        raise UserError(f"anatomy.mesh: {path.name} is none of {', '.join(KINDS)}")
+        raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(KINDS)}")
     try:
         data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
     except UserError as error:
         raise UserError(f"anatomy.mesh: {error}") from None
-    import trimesh  # here: a tenth of what a worker imports, and most jobs have no such file
+    import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     try:
         if kind == "vtk":
             return _merged(*read_vtk(data))
-        # Given bytes, trimesh has no folder in which to look for further files that this one names.
+        # From bytes, trimesh can't open further files that are named in this one.
         mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False)
-    except Exception as error:  # each format's reader raises what it likes
-        said = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise UserError(f"anatomy.mesh: {path.name} is no surface that can be read ({said})") from error
+    except Exception as error:  # readers of formats raise anything
+        why = first_line(error)
+        raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({why})") from error
     if not isinstance(mesh, trimesh.Trimesh):
-        raise UserError(f"anatomy.mesh: {path.name} holds no surface")
+        raise UserError(f"anatomy.mesh: {path.name} contains no surface")
     return _merged(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
 def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
-    """One vertex a place, one face three vertices; faces without area and vertices without face left out."""
+    """The surface without duplicate vertices and faces, faces without area, and vertices without faces."""
     if len(vertices) == 0 or len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     step = 1e-6 * max(float(np.ptp(vertices, axis=0).max()), 1e-12)
@@ -165,25 +159,25 @@ def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray
 
 
 def _filled(vertices: Floats, faces: NDArray[np.int64], name: str) -> NDArray[np.int64]:
-    """The faces, and a fan over each hole."""
+    """The faces, with a fan of triangles over each hole."""
     import trimesh
 
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     if not trimesh.repair.fill_holes(mesh, use_fan=True):
         odd = len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
         why = f"{odd} edges stay open" if odd else "edges have more than two faces"
-        raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); mend it in a mesh editor")
+        raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); repair it in a mesh editor")
     return np.asarray(mesh.faces, np.int64)
 
 
 def _open_share(vertices: Floats, faces: NDArray[np.int64]) -> float:
-    """Area of the flat lid that would close the surface, over the surface's own: 0 if closed, below 1."""
+    """Area of the flat lid that would close the surface over the surface's area: 0 if closed, below 1."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    areas = np.cross(b - a, c - a)  # twice; of a closed surface they cancel
+    areas = np.cross(b - a, c - a)  # doubled; their sum is 0 for a closed surface
     return float(np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum())
 
 
 def _volume(vertices: Floats, faces: NDArray[np.int64]) -> float:
-    """Volume by the divergence theorem about the centroid; a hole makes it inexact, not meaningless."""
+    """Volume by the divergence theorem about the centroid; approximate if there are holes."""
     corner = (vertices - vertices.mean(axis=0))[faces]
     return float(abs(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6))

@@ -15,14 +15,12 @@ Floats = npt.NDArray[np.float64]
 class Shape(NamedTuple):
     """A triangle mesh, world axes."""
 
-    vertices: Floats
-    """(V, 3) mm."""
-    faces: npt.NDArray[np.int32]
-    """(F, 3)."""
+    vertices: Floats  # (V, 3) mm
+    faces: npt.NDArray[np.int32]  # (F, 3)
 
 
 def joined(*shapes: Shape) -> Shape:
-    """Several meshes as one, in their order."""
+    """One mesh of several, in their order."""
     first = np.cumsum([0] + [len(shape.vertices) for shape in shapes])
     faces = [shape.faces + at for shape, at in zip(shapes, first, strict=False)]
     vertices = np.concatenate([shape.vertices for shape in shapes])
@@ -32,7 +30,7 @@ def joined(*shapes: Shape) -> Shape:
 def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] = "") -> npt.NDArray[np.int32]:
     """Faces of a grid of vertices, row by row: both halves of its cells, (2, cells, 3).
 
-    `closed`: the last of these is joined to the first.
+    `closed`: the last row or column is joined to the first.
     """
     cells = np.arange(rows - (closed != "rows")), np.arange(columns - (closed != "columns"))
     row, column = (index.ravel() for index in np.meshgrid(*cells, indexing="ij"))
@@ -42,7 +40,7 @@ def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] =
 
 
 def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Length (...) of short vectors (..., C): the bytes of `norm`, which takes ten times as long."""
+    """Length (...) of short vectors (..., C): bit-identical to `norm`, but ten times as fast."""
     total = vectors[..., 0] * vectors[..., 0]
     for k in range(1, vectors.shape[-1]):
         total += vectors[..., k] * vectors[..., k]
@@ -50,9 +48,9 @@ def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def normals(shape: Shape) -> Floats:
-    """Unit normals (V, 3) of vertices, faces weighted by area; z where faces have none.
+    """Unit normals (V, 3) of vertices, faces weighted by area; the z axis if the area is 0.
 
-    Summed in the faces' own order: the renderer's own sum over threads would not be the same twice.
+    Summed in the order of the faces: the renderer's own sum over threads is not reproducible.
     """
     total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), shape.faces)
     length = lengths(total)[:, None]
@@ -64,7 +62,7 @@ def normals(shape: Shape) -> Floats:
 
 def _area_weighted_loop(vertices, faces):  # type: ignore[no-untyped-def]
     total = np.zeros_like(vertices)
-    # A corner at a time: rounding is then that of a sum over all first corners, all second and all third.
+    # One corner after the other, to round like a sum over all first corners, all second and all third.
     for corner in range(3):
         for f in range(len(faces)):
             a, b, c = faces[f]

@@ -1,4 +1,4 @@
-"""Which dataset a job is: a hash that is equal exactly when the sequences are."""
+"""The identity of a job: a hash that is equal exactly if the sequences are equal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FILES: dict[tuple[str, str], int] = {
     ("appearance", "photo"): checked_file.LARGEST_PICTURE,
     ("render", "calibration"): 1 << 20,
 }
-"""Paths in a job, as places in it, and the bytes that such a file may have."""
+"""Keys of a job that are paths, as (section, key), and the largest size of such a file in bytes."""
 
 
 def canonical(value: Any) -> bytes:
@@ -24,10 +24,10 @@ def canonical(value: Any) -> bytes:
 
 
 def identify_job(job: Job) -> str:
-    """Hash of everything that a sequence of `job` depends on besides its index.
+    """Hash of everything that a sequence of `job` depends on except its index.
 
-    Files count by content and not by path, and what the card says does not count. Nor does the number of
-    sequences: sequence 3 is the same in a dataset of 24 and of 48, so a dataset can be extended.
+    Files enter by content, not by path. The card and the number of sequences don't enter: sequence 3 is the
+    same in a dataset of 24 and of 48, so a dataset can be extended.
     """
     described = job.model_dump(mode="json")
     del described["sequences"], described["card"]
@@ -37,16 +37,16 @@ def identify_job(job: Job) -> str:
 
 
 def identify_anatomy(job: Job, seed: int) -> str:
-    """Which geometry a sequence shows, across datasets: a user's brain, or the seed of a procedural one.
+    """Name of a sequence's geometry, equal in all datasets: a user's brain, or the seed of a procedural one.
 
-    A brain is one anatomy wherever it is opened and whatever vessels are drawn on it.
+    A brain is one anatomy for all its craniotomies and for all vessels drawn on it.
     """
     mesh = _digest(job.anatomy.mesh, FILES["anatomy", "mesh"])
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
 
 
 def identify_opening(job: Job, index: int) -> str | None:
-    """Which place of a user's brain a sequence shows, across datasets; None of a procedural one."""
+    """Name of the craniotomy of a user's brain, equal in all datasets; None for a procedural brain."""
     where = job.anatomy.opened(index).craniotomy
     if job.anatomy.mesh is None or where.point is None:
         return None

@@ -1,6 +1,7 @@
-"""Material laws that a job can name, how far each holds, and which one `auto` takes.
+"""Material laws that a job can name, the loads up to which each is valid, and the choice made by `auto`.
 
-Plain numbers and plug-ins, so that reading a job needs no compiler; our laws themselves are `synth.fem.laws`.
+Numbers and plug-ins only, so that reading a job needs no compiler; the laws themselves are in
+`synth.fem.laws`.
 """
 
 from __future__ import annotations
@@ -21,28 +22,26 @@ LARGEST_LOAD = {"linear": 0.2, "corotational": 0.2, "neo-hookean": 0.4}
 """Largest P = F/(E a^2) at which a law is accepted: its worst error there is 6.0%, and a straight push of the
 default mesh holds det F over 0.5. Neo-Hookean is what the others are measured against."""
 
-LAW_ERROR = {
+LAW_ERROR = {  # largest displacement error by law: (P, relative error)
     "linear": ((0.02, 0.0051), (0.05, 0.0133), (0.1, 0.0275), (0.15, 0.0429), (0.2, 0.0597)),
     "corotational": ((0.02, 0.0048), (0.05, 0.0118), (0.1, 0.0234), (0.15, 0.0371), (0.2, 0.0570)),
 }
-"""Load and error against neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; from
+"""Relative to neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; measured by
 `python -m evidence.fem.pareto` (docs/results/fem/pareto)."""
 
 CHEAPEST_FIRST = ("linear", "neo-hookean", "corotational")
 """Laws by CPU time a frame, from the same measurement."""
 
-LEAST_JACOBIAN = 0.2
-"""Smallest det F a frame may hold; below it, elements are about to turn inside out."""
+LEAST_JACOBIAN = 0.2  # smallest det F allowed in a frame; below it, elements are about to turn inside out
 
-_TOLERANCE = 0.05
-"""Error against neo-Hookean that `law: auto` accepts, as a part of the displacement."""
+_TOLERANCE = 0.05  # displacement error relative to neo-Hookean that `law: auto` accepts
 
 LAWS = Registry("sulcus.law", "fem.law", "law", dict.fromkeys(LARGEST_LOAD, ""), "auto")
-"""Laws by name: an entry point is a `Law`, or a callable without arguments that makes one."""
+"""Laws by name: an entry point is a `Law`, or a callable without arguments that returns one."""
 
 
 class Law(Protocol):
-    """An energy density of tissue, and its slope."""
+    """The energy density of a material, and its derivative."""
 
     largest_load: float
     """Largest P = F/(E a^2) at which jobs are accepted with it."""
@@ -53,7 +52,7 @@ class Law(Protocol):
         Args:
             f: (n, 3, 3) deformation gradients; J = det F may be negative while a solution is searched.
             mu: Lame's mu [kPa]; at rest the law is Hooke's of mu and lam.
-            lam: Lame's lambda [kPa], or what of it acts at points: most acts on elements' means.
+            lam: Lame's lambda [kPa], or the part of it that acts at points: most acts on element means.
 
         Returns:
             (n,) kPa, infinite where the law has no value, and (n, 3, 3) kPa, its derivative by F.
@@ -62,9 +61,9 @@ class Law(Protocol):
 
 
 def add_law(name: str, law: Law) -> None:
-    """Makes a law a job's `fem.law` in this process: to try it before it is in a package.
+    """Registers a law under a name for `fem.law` in this process, to try it before it is packaged.
 
-    `simulate` then knows it; the processes of `render` don't, they need the package.
+    `simulate` can then use it; the worker processes of `render` can't, they need an installed package.
 
     Raises:
         UserError: the name is taken.
@@ -74,23 +73,21 @@ def add_law(name: str, law: Law) -> None:
 
 @dataclass(frozen=True)
 class LoadRange:
-    """What the peak load of an instrument is drawn from."""
+    """The ranges that the peak load of an instrument is drawn from."""
 
-    load: tuple[float, float]
-    """P = F/(E a^2), where no force is given."""
+    load: tuple[float, float]  # P = F/(E a^2), where no force is given
     force_mn: tuple[float, float] | None
-    footprint_mm: tuple[float, float]
-    """Radius a of the contact."""
+    footprint_mm: tuple[float, float]  # radius a of the contact
 
     def largest(self, young_kpa: float) -> float:
-        """Largest P on tissue of at least that modulus."""
+        """Largest P on tissue with a Young's modulus of at least `young_kpa`."""
         if self.force_mn is None:
             return self.load[1]
         return self.force_mn[1] / (young_kpa * self.footprint_mm[0] ** 2)
 
 
 def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -> None:
-    """`check_load` of the largest load on the softest tissue; `label` comes before what it says."""
+    """`check_load` of the largest load on the softest tissue; `label` begins the message."""
     load, radius = loads.largest(young_kpa), loads.footprint_mm[0]
     if loads.force_mn is None:
         check_load(law, load, f"{label}load {load:g} is")
@@ -103,16 +100,9 @@ def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -
 
 
 def check_load(law: str, load: float, what: str, per_load: float = 1.0) -> None:
-    """Refuses a load past what a law is known to describe.
+    """Raises InvalidValue for a load P = F/(E a^2) above the largest at which the law is valid.
 
-    Args:
-        law: its name.
-        load: P = F/(E a^2).
-        what: beginning of the message.
-        per_load: what the largest valid load is multiplied by in the message.
-
-    Raises:
-        InvalidValue: it is.
+    `what` begins the message; `per_load` converts the largest valid load to the unit of the message.
     """
     largest = largest_load(law)
     if load > largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
@@ -122,11 +112,7 @@ def check_load(law: str, load: float, what: str, per_load: float = 1.0) -> None:
 
 @cache
 def load_law(name: str) -> Law:
-    """The law that a plug-in offers under a name.
-
-    Raises:
-        UserError: no such law, or its package does not load or gives something else.
-    """
+    """The law of a plug-in. UserError if there is none of that name, or its package can't be loaded."""
     law: Law = LAWS.load(name)
     with as_user_error(LAWS.label(name)):
         good = callable(law.stress) and 0 < float(law.largest_load) < 10
@@ -141,7 +127,7 @@ def largest_load(name: str) -> float:
 
 
 def law_error(law: str, load: float) -> float:
-    """Error of a law at P = `load` as a part, between the lines of `LAW_ERROR`; infinite past its end."""
+    """Relative error of a law at P = `load`, interpolated in `LAW_ERROR`; infinite beyond its last entry."""
     if law == "neo-hookean":
         return 0.0
     loads, errors = np.transpose([(0.0, 0.0), *LAW_ERROR[law]])
@@ -149,9 +135,9 @@ def law_error(law: str, load: float) -> float:
 
 
 def choose_law(law: str, load: float) -> tuple[str, str]:
-    """The law to use up to P = `load`, and why; `auto` takes the cheapest one within 5%."""
+    """The law to use up to P = `load`, and the reason; `auto` selects the cheapest one within 5%."""
     if law != "auto":
-        return law, "asked for"
+        return law, "named in the job"
     name = next(name for name in CHEAPEST_FIRST if law_error(name, load) <= _TOLERANCE)
     error = law_error(name, load)
     return name, f"cheapest law within {_TOLERANCE:.1%} up to P = {load:g}: measured error {error:.1%}"

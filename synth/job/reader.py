@@ -1,4 +1,4 @@
-"""Reading a job: its file, overrides, files it names, schema; mistakes named at their place."""
+"""Reading a job: its file, overrides and the files it names; errors are reported with their line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from synth.system.config_file import ConfigFile, Mistake
 
 
 def names() -> list[str]:
-    """Jobs that come with the program."""
+    """Names of the jobs in this package."""
     jobs = (resources.files("synth.job") / "named").iterdir()
     return sorted(entry.name.removesuffix(".yaml") for entry in jobs if entry.name.endswith(".yaml"))
 
@@ -24,12 +24,12 @@ def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
     Args:
-        source: path of a job file, or one of `names()`. A path wins when it exists.
-        overrides: `section.key=value`, the value in YAML. Relative paths in them start at the working
-            directory, those in a file at the file.
+        source: path of a job file, or one of `names()`. A path wins when it exists. overrides:
+        `section.key=value`, the value in YAML. Paths in them are relative to the working directory, those in
+        a job file to the file.
 
     Raises:
-        UserError: one line for every mistake, `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
+        UserError: one line for each error, `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
     """
     as_path("job", source)
     text, label, folder = read_source(str(source))
@@ -37,32 +37,34 @@ def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
 
 
 def as_job(job: Job | str | Path) -> Job:
-    """The job itself, or what `load_job` reads; errors as there."""
+    """The job itself, or the one that `load_job` reads; raises as `load_job`."""
     return job if isinstance(job, Job) else load_job(job)
 
 
 def read_source(source: str) -> tuple[str, str, Path]:
-    """Text of a job file or named job, its name in messages, and where its relative paths start."""
+    """Text of a job file or named job, its name in messages, and the folder of its relative paths."""
     if os.path.lexists(source):
         text = checked_file.read_text(Path(source), checked_file.LARGEST_YAML)
         return text, source, Path(source).resolve().parent
     if source not in names():
-        shown = [name for name in names() if name != "mission"]  # made the networks that come along
-        hint = did_you_mean(source, names()) or f"; nor a job called so ({', '.join(shown)})"
+        shown = [
+            name for name in names() if name != "mission"
+        ]  # the training data of the pretrained networks
+        hint = did_you_mean(source, names()) or f", and no named job ({', '.join(shown)})"
         raise UserError(f"{source[:80]}: no such file{hint}")
     text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
     return text, f"{source} (a named job)", Path.cwd()
 
 
 def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()) -> Job:
-    """The job in `text`; `label` names it in messages and its relative paths start at `folder`."""
+    """The job in `text`; `label` names it in messages, relative paths in it start at `folder`."""
     config = ConfigFile(text, label)
     config.change(overrides)
     return config.validate(Job, _find_files(config, folder))
 
 
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
-    """Makes the names of files absolute; what is wrong with one of them."""
+    """Makes the paths in a job absolute; yields the errors of those that can't be used."""
     for at, largest in identity.FILES.items():
         block = config.values.get(at[0])
         name = block.get(at[1]) if isinstance(block, dict) else None
@@ -74,5 +76,5 @@ def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
             config.values[at[0]][at[1]] = str(path)
         except UserError as error:
             yield Mistake(at, str(error))
-        except (RuntimeError, ValueError, OSError):  # no such home, a NUL, a circle of links, too long
-            yield Mistake(at, f"{name[:80]!r} is no name of a file")
+        except (RuntimeError, ValueError, OSError):  # no such home, a NUL, a loop of links, too long
+            yield Mistake(at, f"{name[:80]!r} is not a valid path")

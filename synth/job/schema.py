@@ -1,4 +1,4 @@
-"""The job: everything one dataset depends on, as one validated object (`synth.job.reader` reads it)."""
+"""The job: all settings of one dataset, as one validated object (`synth.job.reader` reads it)."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ class CraniotomySection(Section):
     radius_mm: Positive = 12.0
     """Radius of the opening [mm]."""
     also: Annotated[tuple[PlaceSection, ...], Field(max_length=100)] = ()
-    """Further places on the same mesh, each with point and direction: sequences take them in turn, the first
-    being `point`. `synth split --by opening` then tells openings apart, though not brains."""
+    """Further places on the same mesh, each with point and direction: sequences use them in turn, beginning
+    with `point`. `synth split --by opening` separates these places, although the brain is the same."""
 
 
 class AttachmentSection(Section):
-    """A region in which tissue is held: falx, tentorium, an adhesion. The skull holds it in any case."""
+    """A region in which tissue is fixed: falx, tentorium, an adhesion. The skull holds it in any case."""
 
     point: Vector
-    """Its middle [mm], in the mesh's own axes; for the block, from the opening's centre with z outwards."""
+    """Its centre [mm], in the mesh's own axes; for the block, from the opening's centre with z outwards."""
     radius_mm: Positive
-    """How far it reaches from its middle [mm]."""
+    """Its radius [mm]."""
     normal: Direction | None = None
-    """Of a sheet (falx, tentorium) through the middle, in the same axes. Empty: a ball."""
+    """Normal of a sheet (falx, tentorium) through the centre, in the same axes. Empty: a ball."""
     thickness_mm: Positive = 3.0
     """Thickness of a sheet [mm]."""
 
@@ -63,32 +63,32 @@ class AnatomySection(Section):
     mesh: Path | None = None
     """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: a procedural block."""
     fill_holes: bool = False
-    """Whether holes of the mesh are closed, each by a fan of triangles. What can't be closed is refused."""
+    """Whether holes of the mesh are closed, each by a fan of triangles; an error if that is not possible."""
     dome_mm: Positive = 70.0
     """Procedural block: radius of curvature of the brain surface [mm]."""
     gyrus_mm: Range[Positive] = (10.0, 15.0)
     """Procedural relief: spacing of the gyri [mm]."""
     sulcus_mm: Range[NonNegative] = (1.6, 2.8)
-    """Procedural relief: depth of the sulci below the crowns, as seen from outside [mm]."""
+    """Procedural relief: visible depth of the sulci below the crests of the gyri [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
-    """Vertices of the fine surface that is loaded, moved and rendered. Not given: one for four pixels of the
+    """Vertices of the fine surface that is loaded, moved and rendered. Not given: one per four pixels of the
     picture, at least 6000 and at most 40,000."""
     craniotomy: CraniotomySection = CraniotomySection()
     """Where the skull is open."""
     attachments: tuple[AttachmentSection, ...] = ()
-    """Regions in which the tissue is held inside, such as the falx: a list of {point, radius_mm, normal,
-    thickness_mm}, normal for a sheet. Empty: the skull alone holds it."""
+    """Regions inside in which the tissue is fixed, such as the falx: a list of {point, radius_mm, normal,
+    thickness_mm}, normal for a sheet. Empty: only the skull holds it."""
 
     @model_validator(mode="after")
     def _mesh_is_placed(self) -> AnatomySection:
         if self.mesh is not None and (self.craniotomy.point is None or self.craniotomy.direction is None):
             raise ValueError("a mesh needs craniotomy.point and craniotomy.direction")
         if self.mesh is None and self.craniotomy.also:
-            raise ValueError("craniotomy.also is for a mesh; a procedural block is opened in its middle")
+            raise ValueError("craniotomy.also needs a mesh; a procedural block is opened in its centre")
         return self
 
     def opened(self, index: int) -> AnatomySection:
-        """The section with the place that sequence `index` is opened at as its only one."""
+        """The section with only the craniotomy of sequence `index`."""
         where = self.craniotomy
         if not where.also:
             return self
@@ -102,7 +102,7 @@ Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 
 class AppearanceSection(Section):
-    """How the surface looks."""
+    """The appearance of the surface."""
 
     families: tuple[Family, ...] = ("healthy",)
     """Appearance families that sequences are drawn from, in equal shares."""
@@ -111,14 +111,15 @@ class AppearanceSection(Section):
     cottonoid: Share = 0.2
     """Share of sequences with a cotton patty on the rim."""
     blood: Range[Share] | None = None
-    """Blood on the rim, from none (0) to soaked (1). Empty: as the family has it."""
+    """Blood on the rim, from none (0) to soaked (1). Empty: that of the family."""
 
 
 class FlowSection(Section):
-    """Recovering displacement from the video."""
+    """Recovery of flow from the video."""
 
     backend: Annotated[PlugInName, AfterValidator(ESTIMATORS.check_name)] = "tvl1"
-    """Estimator: tvl1, opencv-tvl1, dis or an installed plug-in's; `ideal` computes no recovered flow."""
+    """Flow estimator: tvl1, opencv-tvl1, dis or that of an installed plug-in; `ideal`: no flow is
+    recovered."""
 
 
 def _among(known: tuple[str, ...]) -> AfterValidator:
@@ -132,41 +133,42 @@ def _among(known: tuple[str, ...]) -> AfterValidator:
 
 
 class StoreSection(Section):
-    """What is kept of every sequence. `synth schema --fields` lists the fields and what they take."""
+    """The fields stored of every sequence. `synth schema --fields` lists them with their sizes."""
 
     extra: Annotated[tuple[str, ...], _among(fields.EXTRA)] = ()
-    """Fields to keep besides the usual ones."""
+    """Fields to store in addition to the usual ones."""
     without: Annotated[tuple[str, ...], _among(fields.SPARED)] = ()
-    """Fields to leave out, of those that can be spared: depth, flow_confidence, and of a second lens
-    flow_right, visible_right, depth_right."""
+    """Fields not to store: any of depth, flow_confidence, and of the right camera flow_right, visible_right,
+    depth_right."""
     flow: Literal["float32", "float16"] = "float32"
-    """Type of both flows stored; float16 rounds motion below 16 px by at most 0.004 px, below 32 by 0.008."""
+    """Stored type of true and recovered flow; float16 rounds motion below 16 px by at most 0.004 px, below 32
+    by 0.008."""
 
 
 class CardSection(Section):
-    """What a person says of the dataset, for its card. Changes no sequence."""
+    """Texts of the dataset's card. They change no sequence."""
 
     title: str = "Synthetic neurosurgical sequences with ground-truth force"
     """Name of the dataset."""
     summary: str | None = None
-    """What it was made for, in your words."""
+    """The purpose of the dataset."""
     licence: str | None = "cc-by-4.0"
-    """Licence under which you share it, as an SPDX name. Empty: none is given."""
+    """Licence under which you share it, as an SPDX name. Empty: none."""
     authors: tuple[str, ...] = ("made with Sulcus, maker not named",)
-    """Who made it."""
+    """Authors of the dataset."""
 
 
 class Job(Section):
     """One dataset."""
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Root of every random draw. Same job, same bytes."""
+    """Seed of all random draws. The same job gives the same bytes."""
     sequences: Annotated[int, Field(ge=1, le=1_000_000)] = 24
     """Number of sequences."""
     frames: Annotated[int, Field(ge=3, le=10_000)] = 24
-    """Frames a sequence; the first is the rest frame, the last is released."""
+    """Frames per sequence; the first is the rest frame, in the last the tissue is released."""
     fps: Positive = 25.0
-    """Frames a second of the recorded video."""
+    """Frames per second of the recorded video."""
     anatomy: AnatomySection = AnatomySection()
     appearance: AppearanceSection = AppearanceSection()
     light: LightSection = LightSection()
@@ -176,8 +178,9 @@ class Job(Section):
     flow: FlowSection = FlowSection()
     store: StoreSection = StoreSection()
     labels: Literal["published", "none"] = "none"
-    """Noise on the labels of the field `intensity`: the published method's first stage, or none, as its code
-    ships. Its second stage is in `intensity` and `flow_noisy` either way; see `store.extra`."""
+    """Noise on the field `intensity`: that of the published method's first stage, or none, as in its
+    published code. `intensity` and `flow_noisy` have that of its second stage in any case; see
+    `store.extra`."""
     card: CardSection = CardSection()
 
     @model_validator(mode="after")
@@ -186,32 +189,32 @@ class Job(Section):
             width, height = self.render.size
             fine = min(max(width * height // 4, 6000), self.anatomy.vertices)
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
-            anatomy.model_fields_set.discard("vertices")  # another size of the picture asks for others
+            anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
         return self
 
     @model_validator(mode="after")
-    def _second_lens_exists(self) -> Job:
+    def _right_camera_exists(self) -> Job:
         right = [name for name in self.store.extra if name.endswith("_right")]
         if right and self.render.stereo_mm == 0:
-            raise ValueError(f"store.extra: {right[0]} needs a second lens; set render.stereo_mm")
+            raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")
         return self
 
     @model_validator(mode="after")
-    def _instruments_are_in_the_opening(self) -> Job:
+    def _contacts_are_inside_the_opening(self) -> Job:
         radius = self.anatomy.craniotomy.radius_mm
         for k, one in enumerate(self.fem.instrument_list):
             least = self.fem.load_range(one).footprint_mm[0]
             if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:
                 raise ValueError(
-                    f"fem.instrument_list[{k}].place: {math.hypot(*one.place):.3g} mm from the middle, a "
+                    f"fem.instrument_list[{k}].place: {math.hypot(*one.place):.3g} mm from the centre, a "
                     f"contact of {least:g} mm radius reaches under the rim of an opening of {radius:g} mm"
                 )
         return self
 
     @property
     def stored_fields(self) -> tuple[str, ...]:
-        """Names of the fields that its sequences hold."""
+        """Names of the fields in its sequences."""
         return fields.stored_fields(
             self.store.extra,
             self.store.without,

@@ -1,4 +1,4 @@
-"""What the job's sections are made of: a base class, and numbers, ranges and directions with their limits."""
+"""Types of the job's sections: a base class, and numbers, ranges and directions with their limits."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ Number = TypeVar("Number")
 
 
 class Section(BaseModel):
-    """One block of the job file. Unknown keys are errors; text under a field is its documentation."""
+    """One block of the job file. Unknown keys are errors; the text below a field is its documentation."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
 
 def _pair(value: Any) -> Any:
-    """A single number stands for the range that holds only it."""
+    """A range; a single number is both of its ends."""
     return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
@@ -28,13 +28,13 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 
 def _rising(value: tuple[float, ...]) -> tuple[float, ...]:
     if list(value) != sorted(value) or value[0] == value[-1]:
-        raise ValueError("levels of a tone curve have to rise")
+        raise ValueError("levels of a tone curve must rise")
     return value
 
 
 def _long(value: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(value):
-        raise ValueError("a direction of no length")
+        raise ValueError("a direction must not be zero")
     return value
 
 
@@ -44,6 +44,7 @@ Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Share = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Distortion = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 _Weight = Annotated[FiniteFloat, Field(ge=-8, le=8)]
 Weights = tuple[_Weight, _Weight, _Weight]
 Curve = Annotated[
@@ -51,5 +52,5 @@ Curve = Annotated[
 ]
 Direction = Annotated[Vector, AfterValidator(_long)]
 MembraneState = Literal["stripped", "unknown", "intact"]
-"""What is known of the tissue's membrane (pia): taken off, nothing, left on."""
+"""Knowledge of the tissue's membrane (pia): removed, unknown, or present."""
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

@@ -20,13 +20,13 @@ _WIDTH = 100
 def commented(job: Job | None = None) -> str:
     """A job file with every key, its meaning and its range, and the values of `job` (default: the defaults).
 
-    Reading it back gives the same job.
+    Reading it returns the same job.
     """
     job = job or Job()
     lines = [
-        "# A job: everything a dataset depends on. Every key may be left out; these are the defaults.",
+        "# A job: all settings of a dataset. Every key may be left out; these are the defaults.",
         "# Render it:            synth render THIS_FILE -o OUT",
-        "# Change it in passing: synth render THIS_FILE -o OUT render.spp=8 sequences=100",
+        "# Override keys:         synth render THIS_FILE -o OUT render.spp=8 sequences=100",
         "# Help in editors:      synth schema > job.schema.json",
         "# yaml-language-server: $schema=job.schema.json",
         "",
@@ -43,7 +43,7 @@ def schema() -> dict[str, Any]:
 
 
 def dump_job(job: Job) -> str:
-    """The job as a plain YAML file: what a dataset keeps of it."""
+    """The job as a plain YAML file, as stored in a dataset."""
     out = io.StringIO()
     writer = YAML(typ="safe")
     writer.default_flow_style = None
@@ -74,10 +74,10 @@ def section_lines(section: BaseModel, indent: str = "") -> list[str]:
 
 
 def limits(model: type[BaseModel], key: str) -> str:
-    """What a key may hold, in words: "(> 0)", "(linear | stable)"; empty where anything goes."""
+    """The values that a key allows: "(> 0)", "(linear | stable)"; empty if there is no limit."""
     described = model.model_json_schema()["properties"][key]
     signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-    if "anyOf" in described:  # it may be empty: only its choices are listed
+    if "anyOf" in described:  # an optional key: only its choices are listed
         described, signs = described["anyOf"][0], {}
     described = (described.get("prefixItems") or [described.get("items", described)])[0]
     if "enum" in described:
@@ -88,7 +88,7 @@ def limits(model: type[BaseModel], key: str) -> str:
 
 
 def scalar(value: Any) -> str:
-    """A value as YAML in one line; empty for none."""
+    """A value as YAML in one line; empty for None."""
     if value is None:
         return ""
     if isinstance(value, Path) or (isinstance(value, str) and not value.replace("-", "_").isidentifier()):

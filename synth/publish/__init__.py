@@ -1,1 +1,1 @@
-"""What is made of a finished dataset: card, exports, pictures, views."""
+"""Products of a finished dataset: card, exports, pictures, viewer."""

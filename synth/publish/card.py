@@ -1,4 +1,4 @@
-"""What describes a dataset to a person: its card README.md with pictures, and a page for browsers."""
+"""Descriptions of a dataset for people: its card README.md with pictures, and an HTML page."""
 
 from __future__ import annotations
 
@@ -25,16 +25,15 @@ QUANTITIES = {
     "peak_motion_mm": ("Peak motion", "mm"),
     "load": ("Load F/(E a²)", "1"),
 }
-"""Columns of the index that card and page draw: title and unit."""
+"""Columns of the index that are drawn in card and page: title and unit."""
 
 _THUMBNAILS, _THUMBNAIL_PX = 24, 320
 _FILES = ("README.md", "preview.mp4", "job.yaml", index.NAME)
-_FEWEST_DRAWN = 5
-"""Of less a histogram says nothing that the table of ranges doesn't, and drawing takes a second."""
+_FEWEST_DRAWN = 5  # a histogram of fewer sequences adds nothing to the table of ranges
 
 
 def write_card(folder: Folder) -> Path:
-    """Writes README.md and the pictures it shows, from the index and the sequences. Returns its path."""
+    """Writes README.md and its pictures, from the index and the sequences. Returns its path."""
     about = facts(folder)
     done, pictures = about["done"], folder.root / "card"
     pictures.mkdir(exist_ok=True)
@@ -66,7 +65,7 @@ def write_card(folder: Folder) -> Path:
 
 
 def write_page(root: Path, target: Path) -> Path:
-    """Writes a page about the dataset in `root` that any browser opens; all that it shows is inside it."""
+    """Writes a self-contained HTML page about the dataset in `root`. Returns its path."""
     about = facts(Folder(root))
     done = about["done"]
     chosen = np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]
@@ -78,7 +77,7 @@ def write_page(root: Path, target: Path) -> Path:
 
 
 def facts(folder: Folder) -> dict[str, Any]:
-    """What card and page both say of a dataset, from its job and its index."""
+    """Values for the templates of card and page, from the dataset's job and index."""
     rows, job = index.read_index(folder.root).to_pylist(), folder.job()
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]
@@ -105,7 +104,7 @@ def facts(folder: Folder) -> dict[str, Any]:
 
 
 def limits(folder: Folder) -> list[str]:
-    """What a reader must know before trusting the data, given how it was made."""
+    """The known limits of the dataset, which depend on its job."""
     job = folder.job()
     text: str = template("limits.jinja").render(
         job=job,
@@ -116,18 +115,18 @@ def limits(folder: Folder) -> list[str]:
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
-    """The numbers of one column that are there, (n,)."""
+    """The values (n,) of one column, without missing ones."""
     return np.array([row[name] for row in rows if row.get(name) is not None], np.float64)
 
 
 def share(rows: Iterable[Mapping[str, Any]], name: str) -> str:
-    """How often each value of a column occurs: "pull 12, push 9"."""
+    """Counts of the values of a column: "pull 12, push 9"."""
     counts = Counter(str(row[name]) for row in rows if row.get(name) is not None)
     return ", ".join(f"{value} {count}" for value, count in sorted(counts.items())) or "-"
 
 
 def template(name: str) -> Any:
-    """A page of this room, ready to render; what is put into HTML is escaped."""
+    """A template of this package; values are escaped in HTML."""
     import jinja2
 
     text = (Path(__file__).parent / name).read_text("utf-8")
@@ -138,23 +137,23 @@ def template(name: str) -> Any:
 
 
 def _range(rows: list[dict[str, Any]], name: str) -> list[str]:
-    """Name, least, median and greatest."""
+    """Name, minimum, median and maximum."""
     values, (title, unit) = column(rows, name), QUANTITIES[name]
     ends = np.quantile(values, (0, 0.5, 1)).tolist() if len(values) else []
     return [f"{title} [{unit}]", *([f"{value:.3g}" for value in ends] or ["-"] * 3)]
 
 
 def _thumbnail(root: Path, row: dict[str, Any]) -> dict[str, str] | None:
-    """A sequence at its greatest load; None of one that was moved away or is damaged."""
+    """A sequence at its greatest load; None if it is missing or damaged."""
     from PIL import Image
 
-    # Not by the path in the table, which may lead anywhere.
+    # Not the path in the table, which is untrusted.
     path = location.store(root, int(row["index"]))
     try:
         sequence = open_sequence(path)
         image = Image.fromarray(sequence["rgb"][picture.strongest(sequence)])
     except UserError:
-        return None  # `synth verify` is for that
+        return None  # damage is reported by `synth verify`
     image.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
     file = io.BytesIO()
     image.save(file, "JPEG", quality=80)

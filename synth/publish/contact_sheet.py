@@ -1,4 +1,4 @@
-"""A contact sheet of a job: some of its scenarios, and what the whole of it will cost."""
+"""A contact sheet of a job: some of its scenarios, and a forecast of its cost."""
 
 from __future__ import annotations
 
@@ -24,32 +24,27 @@ from synth.sequence import pipeline, scenario
 from synth.sequence.scene import at_rest
 
 _TILE_PX = 320
-_OPENING_MM = 1.0  # two tips closer than this would be one
-_PROBES = 3  # sequences that are carried out in short, after one for what is compiled once
-_SHORT, _LONG = 3, 9  # frames: the difference is what a further frame takes
+_OPENING_MM = 1.0  # least distance of the two tips of forceps
+_PROBES = 3  # sequences that are computed with few frames, after one for the compilation
+_SHORT, _LONG = 3, 9  # frames: their difference is the cost of further frames
 
 
 @dataclass(frozen=True)
 class ContactSheet:
-    """What a job looks like and what it will take."""
+    """Scenarios of a job and the cost of the whole dataset."""
 
     picture: Rgb
-    stages_cpu_s: dict[str, float]
-    """Processor time of the whole job by stage, without what each worker takes to start."""
+    stages_cpu_s: dict[str, float]  # of the whole job by stage, without the start of workers
     disk_bytes: float
-    """The whole dataset."""
 
 
 def draw_sheet(
     job: Job, count: int, report: Callable[[int, int], None] = lambda done, of: None
 ) -> ContactSheet:
-    """Draws `count` scenarios spread over the job, each in the moment before its load.
+    """Draws `count` scenarios spread over the job, each just before its load. UserError: an impossible job.
 
-    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. What the job costs
-    is measured on a few of its sequences, carried out in short. `report`: parts done, of how many.
-
-    Raises:
-        UserError: the job cannot be carried out.
+    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. The cost of the job
+    is measured on a few of its sequences with few frames. `report`: parts done and parts in all.
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int))
     width, height = job.render.size
@@ -75,7 +70,7 @@ def draw_sheet(
 
 
 def _draw_scenario(job: Job, index: int) -> Rgb:
-    """A scenario's picture, (H, W, 3); of a stereo job the left eye's, then the right's."""
+    """A scenario's picture, (H, W, 3); for a stereo job those of the left and right camera side by side."""
     scene = at_rest(job, index)
     gestures = scene.scenario.gestures
     ready = [poised(gesture, scene.surface) for gesture in gestures]
@@ -98,10 +93,10 @@ def poised(gesture: Gesture, surface: CortexSurface) -> tuple[NDArray[np.float64
 
 
 def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
-    """Processor time [s] of the whole job by stage, without what each worker takes to start.
+    """Processor time [s] of the whole job by stage, without the start of workers.
 
-    A sequence's gesture is the same however many frames it is cut into, so a frame of a shorter one is as
-    dear, but for the larger step to it. `step` is called after each part.
+    The gesture is the same for any number of frames, so frames of a short sequence cost as much, except for
+    the larger load steps. `step` is called after each part.
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, _PROBES).round().astype(int)).tolist()
     total: dict[str, float] = {}
@@ -120,7 +115,7 @@ def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
 
 
 def _stages(job: Job, index: int, frames: int, folder: str) -> dict[str, float]:
-    """Processor time [s] of a sequence with so many frames, by stage."""
+    """Processor time [s] of a sequence with that number of frames, by stage."""
     short = job.model_copy(update={"frames": frames})
     path = pipeline.render_sequence(short, index, Path(folder), lambda stage, done, of: None)
     timings = open_sequence(path).attrs["timings"]

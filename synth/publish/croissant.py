@@ -1,4 +1,4 @@
-"""The dataset described for machines: Croissant 1.1 (mlcommons.org/croissant) with Responsible AI fields."""
+"""Machine-readable description of a dataset: Croissant 1.1 (mlcommons.org/croissant) and Responsible AI."""
 
 from __future__ import annotations
 
@@ -16,25 +16,22 @@ from synth.job.schema import CardSection
 from synth.publish import card
 
 NAME = "croissant.json"
-_CONTEXT = (
-    Path(__file__).parent / "croissant_context.json"
-)  # as the specification gives it, and the prefix rai
+_CONTEXT = Path(__file__).parent / "croissant_context.json"  # of the specification, plus the prefix rai
 
-STATED = {"creator": "authors", "license": "licence"}
-"""What only a person can say, and the key of the job's `card` that says it."""
+STATED = {"creator": "authors", "license": "licence"}  # Croissant key -> key of the job's `card`
 
 _TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:Text"}
 
 
 def write_croissant(folder: Folder) -> Path:
-    """Writes `croissant.json` beside the index. Returns its path."""
+    """Writes `croissant.json` next to the index. Returns its path."""
     path = folder.root / NAME
     write_whole(path, json.dumps(describe(folder), indent=1, ensure_ascii=False) + "\n")
     return path
 
 
 def describe(folder: Folder) -> dict[str, Any]:
-    """The description, JSON-LD. Everything is taken from the dataset; prose is what its job's card says."""
+    """The description, JSON-LD, from the dataset and the card in its job."""
     job, rows = folder.job(), index.read_index(folder.root).to_pylist()
     done = [row for row in rows if row["status"] == "done"]
     about, (width, height) = job.card, job.render.size
@@ -72,7 +69,7 @@ def describe(folder: Folder) -> dict[str, Any]:
 
 
 def _stated(about: CardSection) -> dict[str, Any]:
-    """What was not stated is left out rather than made up."""
+    """Authors and licence, if stated."""
     found = {key: getattr(about, name) for key, name in STATED.items()}
     found["creator"] = [{"@type": "sc:Person", "name": name} for name in about.authors]
     return {key: value for key, value in found.items() if value}
@@ -85,7 +82,7 @@ def _distribution(folder: Folder) -> list[dict[str, Any]]:
             "@type": "cr:FileObject",
             "@id": "index",
             "name": "index",
-            "description": "One row a sequence.",
+            "description": "One row per sequence.",
             "contentUrl": index.NAME,
             "contentSize": f"{len(data)} B",
             "encodingFormat": "application/x-parquet",
@@ -95,7 +92,7 @@ def _distribution(folder: Folder) -> list[dict[str, Any]]:
             "@type": "cr:FileSet",
             "@id": "stores",
             "name": "stores",
-            "description": "Zarr v3 groups, one a sequence; column path of the index names them.",
+            "description": "Zarr v3 groups, one per sequence; the column path of the index has their names.",
             "encodingFormat": "application/vnd.zarr",
             "includes": "*.zarr/**",
         },

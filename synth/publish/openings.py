@@ -1,4 +1,4 @@
-"""Where a user's brain can be opened: the evenest places of its surface, drawn, and as lines of a job."""
+"""Suggested craniotomies of a user's brain: even places of its surface, drawn and as lines of a job."""
 
 from __future__ import annotations
 
@@ -21,52 +21,46 @@ from synth.sequence import mechanics, scenario
 Floats = NDArray[np.float64]
 
 _PLACES = 250
-_PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # every pixel of the surface then holds some
+_PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # samples on the surface: some in every pixel of the height map
 _PIXEL_MM = 2.0
-_UNDER_SKULL_MM = 8.0  # how far below its convex hull the surface may lie and still be reached from outside
-_LEAST_SURFACE = 0.97  # of the opening itself must be surface
-_STEEPEST_MM = 4.0  # rms departure from a dome; a cleft in the opening has more
-_FLAT = 0.01  # of the radius, median from the best plane: over a dome of 70 mm radius it is twice as much
-_APART = 2.0  # radii between two places: nearer ones would show the same tissue
+_UNDER_SKULL_MM = 8.0  # greatest depth below the convex hull of a place that is accessible from outside
+_LEAST_SURFACE = 0.97  # share of the opening with surface
+_STEEPEST_MM = 4.0  # rms deviation from a dome; larger with a cleft in the opening
+_FLAT = 0.01  # median distance from the best plane over the radius: twice as much for a dome of 70 mm radius
+_APART = 2.0  # least distance of two places in radii: closer ones would show the same tissue
 _TILE_PX, _BLUE = 360, (11, 83, 148)
 
 
 @dataclass(frozen=True)
 class Opening:
-    """One place; coordinates are the file's [mm]."""
+    """A suggested craniotomy, in the file's coordinates [mm]."""
 
-    point: Floats
-    """(3,) on the surface."""
-    direction: Floats
-    """(3,) unit vector outwards: the normal of the surface's mean plane in the opening."""
-    relief_mm: float
-    """Departure of the surface from a smooth dome over the opening, rms: its gyri and sulci."""
-    flat: bool
-    """Most of it is: a wall that the surface was cut at."""
+    point: Floats  # (3,) on the surface
+    direction: Floats  # (3,) unit vector outwards: the normal of the surface's mean plane in the opening
+    relief_mm: float  # rms deviation of the surface from a smooth dome over the opening: its gyri and sulci
+    flat: bool  # mostly flat: a plane where the surface was cut off
 
     def craniotomy(self, radius_mm: float) -> CraniotomySection:
-        """The job's section."""
+        """The section of a job."""
         x, y, z = np.round(self.point, 2).tolist()
         u, v, w = np.round(self.direction, 3).tolist()
         return CraniotomySection(point=(x, y, z), direction=(u, v, w), radius_mm=radius_mm)
 
 
 def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = False) -> list[Opening]:
-    """At most `count` openings, the evenest first, apart from one another; each was tried as a job would.
+    """At most `count` separate openings, the most even first; each has been meshed as in a job.
 
-    `fill_holes`: as `anatomy.fill_holes`.
-
-    Raises:
-        UserError: the file cannot be used, or nowhere on it an opening of that radius works.
+    `fill_holes`: as `anatomy.fill_holes`. UserError if the file cannot be used, or no opening of that radius
+    works.
     """
     chosen: list[Opening] = []
-    why = "the surface fills it nowhere"
+    why = "the surface is too small or too steep"
     for one in sorted(_judged(mesh, radius_mm, fill_holes), key=lambda one: (one.flat, one.relief_mm)):
         if any(np.linalg.norm(one.point - other.point) < _APART * radius_mm for other in chosen):
             continue
         where = one.craniotomy(radius_mm)
         section = AnatomySection(mesh=mesh.resolve(), fill_holes=fill_holes, vertices=2500, craniotomy=where)
-        job = Job(anatomy=section, fem=FemSection(tets=400))  # whether it meshes, not how well
+        job = Job(anatomy=section, fem=FemSection(tets=400))  # a coarse mesh, to test whether it is possible
         try:
             mechanics.build(job, scenario.draw_scenario(job, 0))
         except UserError as error:
@@ -76,17 +70,17 @@ def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = F
         if len(chosen) == count:
             break
     if not chosen:
-        raise UserError(f"{mesh.name}: no opening of {radius_mm:g} mm radius works ({why}); lower --radius")
+        raise UserError(f"{mesh.name}: no opening of {radius_mm:g} mm radius works ({why}); reduce --radius")
     return chosen
 
 
 def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False) -> str:
-    """Lines of a job with the first opening; the others are commented out under `also`."""
+    """Lines of a job with the first opening, and the others as a comment below `also`."""
     first, *others = (one.craniotomy(radius_mm).model_dump(mode="json") for one in chosen)
     lines = ["anatomy:", f"  mesh: {writer.scalar(mesh)}", *(["  fill_holes: true"] if fill_holes else [])]
     lines += ["  craniotomy:", f"    radius_mm: {radius_mm:g}"]
     lines += [f"    point: {first['point']}", f"    direction: {first['direction']}"]
-    lines += ["    # also:  # the next best; sequences take them in turn"] if others else []
+    lines += ["    # also:  # the next best; sequences use them in turn"] if others else []
     lines += [f"    #   - {{point: {one['point']}, direction: {one['direction']}}}" for one in others]
     return "\n".join(lines)
 
@@ -94,7 +88,7 @@ def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: 
 def draw_openings(
     mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False
 ) -> NDArray[np.uint8]:
-    """(H, W, 3): the brain from six sides, with each opening's ring and its number from 1."""
+    """Picture (H, W, 3) of the brain from six sides, with the outline and number (from 1) of each opening."""
     vertices, faces = read_brain(mesh, fill_holes)
     corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     scale = 0.9 * _TILE_PX / np.ptp(vertices, axis=0).max()
@@ -110,12 +104,12 @@ def draw_openings(
             return np.asarray(np.rint((where - middle) @ flat + _TILE_PX / 2), np.int32)
 
         tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)
-        order = np.argsort(corners.mean(axis=1) @ side)  # the farthest is drawn first
+        order = np.argsort(corners.mean(axis=1) @ side)  # back to front
         shade = 60 + 170 * np.abs(normal @ side)[order]
         for triangle, grey in zip(pixel(corners[order]), shade.tolist(), strict=True):
             cv2.fillConvexPoly(tile, triangle, (grey, 0.85 * grey, 0.8 * grey))
         for number, one in enumerate(chosen, 1):
-            if one.direction @ side > 0.15:  # else on the far side, or edge on
+            if one.direction @ side > 0.15:  # facing this side
                 cv2.polylines(tile, [pixel(one.point + circle @ axes(one.direction)[:2])], True, _BLUE, 2)
                 x, y = pixel(one.point).tolist()
                 cv2.putText(tile, str(number), (x - 6, y + 6), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _BLUE, 2)
@@ -126,8 +120,8 @@ def draw_openings(
 
 
 def _judged(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]:
-    """Places under the skull, for which the convex hull stands, where a brain can be opened."""
-    import trimesh  # here: most jobs have no mesh
+    """Openings at random places close to the convex hull, which approximates the skull."""
+    import trimesh  # here, as most jobs have no mesh
 
     surface = trimesh.Trimesh(*read_brain(mesh, fill_holes), process=False)
     count = int(np.clip(_PER_MM2 * surface.area, 2_000, _MOST_SAMPLES))
@@ -143,7 +137,7 @@ def _judged(mesh: Path, radius_mm: float, fill_holes: bool) -> Iterator[Opening]
 
 
 def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm: float) -> Opening | None:
-    """The opening at a point (3,), looked into from about `out` (3,); None where it can't be opened."""
+    """The opening at a point (3,) with an initial direction `out` (3,); None if it is not suitable."""
     half = radius_mm + MARGIN_MM
     near = points[tree.query_ball_point(point, 2.5 * half)]
     for turned in (True, True, False):
@@ -169,9 +163,10 @@ def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm:
 
 
 def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
-    """x, y and the highest point (n, n) mm of each pixel of a square; NaN where there is none.
+    """x, y and greatest height (n, n) mm in each pixel of a square; NaN where there is no point.
 
-    As the renderer takes a brain: what lies deeper than three quarters of the square's side is its far side.
+    As in the renderer, points deeper than three quarters of the square's side belong to the far side of the
+    brain.
     """
     count = int(np.ceil(2 * half / _PIXEL_MM))
     cell = np.floor((placed[:, :2] / half + 1) / 2 * count).astype(np.int64)

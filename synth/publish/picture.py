@@ -1,4 +1,4 @@
-"""Pictures of a sequence for a person: frame, flow and force map side by side."""
+"""Pictures of a sequence: frame, flow and force map side by side."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Sequence as Sequence_
 from synth.errors import UserError
 
-Rgb = NDArray[np.uint8]
-"""(H, W, 3) uint8, sRGB."""
+Rgb = NDArray[np.uint8]  # (H, W, 3) uint8, sRGB
 
 INK = (40, 40, 40)
 _CAPTION_PX = 26
@@ -21,14 +20,10 @@ _WIDE_PX = 480
 
 
 def flow_colours(flow: NDArray[np.floating], largest_px: float) -> Rgb:
-    """Flow as colour: hue is direction, saturation is length; white does not move.
+    """Flow (H, W, 2) px as colour: hue is direction, saturation is length, full at `largest_px`; white is 0.
 
     The convention of Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011),
-    on the HSV circle instead of their wheel.
-
-    Args:
-        flow: (H, W, 2) px.
-        largest_px: length shown at full saturation.
+    with the hues of HSV instead of their colour wheel.
     """
     length = np.hypot(flow[..., 0], flow[..., 1]) / max(largest_px, 1e-9)
     angle = np.arctan2(flow[..., 1], flow[..., 0]) % (2 * np.pi)
@@ -40,19 +35,19 @@ def flow_colours(flow: NDArray[np.floating], largest_px: float) -> Rgb:
 
 
 def heat(values: NDArray[np.floating], largest: float) -> Rgb:
-    """Non-negative values as colour, black (0) to yellow (`largest`). values: (H, W)."""
+    """Non-negative values (H, W) as colour, black (0) to yellow (`largest`)."""
     grey = np.round(255 * np.clip(values / max(largest, 1e-12), 0, 1)).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
 def overlay(base: Rgb, colours: Rgb, weight: NDArray[np.floating]) -> Rgb:
-    """`colours` over `base`; weight: (H, W) in 0..1."""
+    """`colours` blended over `base`; weight: (H, W) in 0..1."""
     blend = base + weight[..., None] * (colours.astype(np.float32) - base)
     return np.round(blend).astype(np.uint8)
 
 
 def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], gain: float) -> Rgb:
-    """Flow as arrows on a grid, 24 across, lengthened by `gain`. flow: (H, W, 2) px; where: (H, W)."""
+    """Flow (H, W, 2) px as arrows on a grid, 24 across, lengthened by `gain`, in the mask `where` (H, W)."""
     picture = base.copy()
     height, width = where.shape
     step_px = max(width // 24, 8)
@@ -66,20 +61,20 @@ def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], gain
 
 
 def arrow_gain(width_px: int, largest_px: float) -> int:
-    """Whole number by which arrows are lengthened so that the longest about spans the grid."""
+    """Integer factor by which the longest arrow becomes about as long as the grid's spacing."""
     return max(1, int(width_px / 24 / max(largest_px, 1e-9))) if largest_px > 0.05 else 1
 
 
 def legible(picture: Rgb) -> Rgb:
-    """The picture (H, W, 3), each pixel repeated so that a line of text has room on it."""
+    """The picture (H, W, 3), enlarged by an integer factor so that a line of text fits."""
     times = -(-_WIDE_PX // picture.shape[1])
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
 def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
-    """The picture (H, W, 3) with a line of text, readable on any ground, that stands on a row."""
+    """The picture (H, W, 3) with a line of outlined white text, whose baseline is `row`."""
     canvas = np.ascontiguousarray(picture)
-    around = [(across, down, 0) for across in (-1, 0, 1) for down in (-1, 0, 1)]  # bold letters are wider
+    around = [(across, down, 0) for across in (-1, 0, 1) for down in (-1, 0, 1)]  # the outline
     for across, down, level in (*around, (0, 0, 255)):
         at = (4 + across, row + down)
         cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (level,) * 3, 1, cv2.LINE_AA)
@@ -87,25 +82,23 @@ def caption(picture: Rgb, text: str, row: int = 14) -> Rgb:
 
 
 def tile(pictures: Sequence[Rgb]) -> Rgb:
-    """Pictures (H, W, 3) of one size in as square a grid as they make, the rest of it black."""
+    """Pictures (H, W, 3) of one size in a nearly square grid, empty cells black."""
     columns = int(np.ceil(np.sqrt(len(pictures))))
     full = [*pictures, *[np.zeros_like(pictures[0])] * (-len(pictures) % columns)]
     return np.vstack([np.hstack(full[k : k + columns]) for k in range(0, len(full), columns)])
 
 
 def side_by_side(sequence: Sequence_, t: int) -> Rgb:
-    """Frame t (H, W, 3); of a stereo sequence (H, 2W, 3), the left eye beside the right."""
+    """Frame t (H, W, 3); for a stereo sequence (H, 2W, 3), left and right picture side by side."""
     left = sequence["rgb"][t]
     return np.hstack([left, sequence["rgb_right"][t]]) if "rgb_right" in sequence else left
 
 
 def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
-    """Some frames of a sequence on common scales, a row each under its captions: (h, w, 3).
+    """Picture (h, w, 3) of some frames of a sequence on common scales, a row each.
 
-    A row is the frame, its flow from the rest frame, and the traction that caused it, both on the rest frame.
-
-    Raises:
-        UserError: a frame is not in the sequence.
+    A row is the frame, its flow from the rest frame, and the traction, both on the rest frame. UserError if a
+    frame is not in the sequence.
     """
     for t in frames:
         if not 0 <= t < sequence.frames:
@@ -125,14 +118,14 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
         panels = {
             f"frame {t}, {time[t]:.2f} s": sequence["rgb"][t],
             f"flow, {most_px:.1f} px at most (arrows x{gain})": moved,
-            f"traction, {total_mn:.1f} mN in all (yellow: {largest_kpa:.2g} kPa)": loaded,
+            f"traction, {total_mn:.1f} mN in total (yellow: {largest_kpa:.2g} kPa)": loaded,
         }
         rows.append(np.hstack([framed(panel, text) for text, panel in panels.items()]))
     return np.vstack(rows)[:, _GAP_PX:]
 
 
 def in_grey(picture: Rgb) -> Rgb:
-    """The picture (H, W, 3) without its colours."""
+    """The picture (H, W, 3) in grey."""
     return np.repeat(picture.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
 
 
@@ -142,7 +135,7 @@ def strongest(sequence: Sequence_) -> int:
 
 
 def framed(panel: Rgb, text: str) -> Rgb:
-    """A panel (H, W, 3) with white above and to its left, and a line of text on that."""
+    """A panel (H, W, 3) with a white margin above and left, and a caption."""
     canvas = cv2.copyMakeBorder(panel, _CAPTION_PX, 0, _GAP_PX, 0, cv2.BORDER_CONSTANT, value=(255,) * 3)
     cv2.putText(canvas, text, (_GAP_PX + 4, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, INK, 1, cv2.LINE_AA)
     return np.asarray(canvas, np.uint8)

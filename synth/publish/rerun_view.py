@@ -1,4 +1,4 @@
-"""A sequence on one timeline in the viewer rerun: frame, depth, flows, traction and force. Extra `view`."""
+"""A sequence in the viewer rerun: frames, depth, flows, traction and force over time. Extra `view`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,7 @@ _JPEG_QUALITY = 90
 
 
 def save_recording(sequence: Sequence, path: Path) -> None:
-    """Writes a sequence as a rerun recording file.
-
-    Raises:
-        UserError: rerun is not installed, the file cannot be written.
-    """
+    """Writes a sequence as a rerun recording. UserError: no rerun installed, or the file can't be written."""
     rerun = _rerun()
     try:
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
@@ -44,18 +40,13 @@ def save_recording(sequence: Sequence, path: Path) -> None:
 def show_sequence(sequence: Sequence, *, web: bool) -> None:
     """Opens a sequence in the viewer and returns when it is closed; it listens on this machine only.
 
-    Args:
-        sequence: what to show.
-        web: in a browser, for a machine without a window system.
-
-    Raises:
-        UserError: rerun is not installed or cannot start.
+    `web`: in a browser. UserError if rerun is not installed or cannot start.
     """
-    print("rerun sends its makers anonymous usage counts until `rerun analytics disable`", file=sys.stderr)
+    print("rerun sends anonymous usage data to its makers until `rerun analytics disable`", file=sys.stderr)
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "sequence.rrd"
         save_recording(sequence, path)
-        # Bound to localhost, in a group of its own: it starts a process in its turn, which must not stay.
+        # Bound to localhost, and in its own process group, as it starts a process that must be ended too.
         words = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto"]
         viewer = subprocess.Popen([*words, *["--serve-web"] * web, str(path)], start_new_session=True)
         try:
@@ -78,7 +69,7 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         longest, strongest = float(summary["peak_flow_px"]), float(summary["peak_traction_kpa"])
         left = optics.camera_of(sequence)
     except (KeyError, TypeError) as error:
-        raise UserError(f"{sequence.path}: says nothing of {error}, which a view needs") from error
+        raise UserError(f"{sequence.path}: has no attribute {error}, which the viewer needs") from error
     force, time, tissue = sequence["force"][:], sequence["time"][:], sequence["tissue"][:]
     grey = picture.in_grey(sequence["rgb"][0])
     stream.log("/", rerun.ViewCoordinates.RDF, static=True)
@@ -97,7 +88,7 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         if "rgb_right" in sequence:
             image("right/frame", sequence["rgb_right"][t])
         if "depth" in sequence:
-            # Shown as a surface in space, for the camera is known; unit of space: mm.
+            # rerun shows it as a surface in space, by the pinhole above; the unit of length is mm.
             stream.log("camera/depth", rerun.DepthImage(sequence["depth"][t], meter=1.0))
         for name in {"flow", "flow_recovered"} & set(sequence.fields):
             colours = picture.flow_colours(sequence[name][t], longest)

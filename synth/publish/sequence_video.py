@@ -1,4 +1,4 @@
-"""Films: a dataset's preview, a sequence with force and flow drawn over it, and how they are encoded."""
+"""Videos: a dataset's preview, and sequences with overlays of force and flow."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from synth.publish import picture as drawing
 from synth.publish.picture import Rgb
 from synth.video.write import encode_video
 
-OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}
-"""What can be drawn over a film, and the field that it is of."""
+OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}  # overlay -> its field
 
 _PREVIEW_PX, _PREVIEW_TILES = 1280, 9
 _QUALITY = 18
 _CURVE_PX, _LEFT_PX = 64, 4
-_TURNS = 5
+_ITERATIONS = 5
 _LINE = (200, 60, 20)
 
 
 def write_preview(root: Path) -> None:
-    """`preview.mp4` of up to nine sequences spread over a dataset, side by side; none if there is none."""
+    """Writes `preview.mp4` of up to nine sequences spread over a dataset; nothing if there is none."""
     if not any(root.glob("[0-9]*.zarr")):
         return
     dataset = Dataset(root)
@@ -51,16 +50,16 @@ def write_videos(
     overlays: Several[str] = ("flow", "force"),
     interval_s: tuple[float, float] | None = None,
 ) -> None:
-    """`NNNNNN.mp4` a sequence.
+    """Writes `NNNNNN.mp4` for each sequence.
 
     Args:
         dataset: the sequences.
         target: the folder.
-        overlays: of `OVERLAYS`; none: the film as it is.
-        interval_s: first and last time [s]; all if not given.
+        overlays: names in `OVERLAYS`.
+        interval_s: first and last time [s]; None: the whole sequence.
 
     Raises:
-        UserError: no such overlay, no frame in that time, or a field that a sequence lacks.
+        UserError: an unknown overlay, no frame in the interval, or a sequence without the field.
     """
     unknown = [name for name in overlays if name not in OVERLAYS]
     if unknown:
@@ -74,7 +73,7 @@ def write_videos(
 def draw_video(
     sequence: Sequence, overlays: Several[str], interval_s: tuple[float, float] | None = None
 ) -> Iterator[Rgb]:
-    """The frames of that time, (h, w, 3) each; with `force` its curve is below. Raises as above."""
+    """The frames of the interval, (h, w, 3), with the curve of `force` below. Raises as `write_videos`."""
     for name in overlays:
         if OVERLAYS[name] not in sequence:
             raise UserError(f"{sequence.path}: holds no {OVERLAYS[name]}")
@@ -111,26 +110,22 @@ def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: di
 
 
 def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Values on the rest frame's pixels, drawn where their points are now.
+    """Values (H, W) on the rest frame's pixels, warped to a frame by its flow from there (H, W, 2) px.
 
-    The way back is found by iteration, which is enough for motion that is smooth over its own length.
-
-    Args:
-        values: (H, W).
-        flow: (H, W, 2) px from the rest frame.
+    The flow is inverted by fixed-point iteration, which converges for smooth motion.
     """
     height, width = values.shape
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
     flow = flow.astype(np.float32)
     back = flow
-    for _ in range(_TURNS):
+    for _ in range(_ITERATIONS):
         back = cv2.remap(flow, columns - back[..., 0], rows - back[..., 1], cv2.INTER_LINEAR)
     x, y = columns - back[..., 0], rows - back[..., 1]
     return np.asarray(cv2.remap(values.astype(np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
 def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
-    """The picture with values over it, from clear (0) to yellow (`largest`). values: (H, W), not negative."""
+    """The picture with non-negative values (H, W) as overlay, from transparent (0) to yellow (`largest`)."""
     share = np.clip(values / max(largest, 1e-12), 0, 1)
     return drawing.overlay(
         picture, drawing.heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0)
@@ -138,7 +133,7 @@ def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
 
 
 def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], width_px: int) -> Rgb:
-    """A strip (h, width_px, 3) with force over time, gaps where it is NaN. Both (T,)."""
+    """A strip (h, width_px, 3) with force (T,) over time (T,), with gaps at NaN."""
     strip = np.full((_CURVE_PX, width_px, 3), 255, np.uint8)
     sure = np.isfinite(force_mn)
     top = max(float(force_mn[sure].max()), 1e-9) if sure.any() else 1.0
@@ -153,7 +148,7 @@ def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], wid
 
 
 def mark(curve: Rgb, k: int, count: int) -> Rgb:
-    """The strip (h, w, 3) with a line at the k-th of `count` values."""
+    """The strip (h, w, 3) with a cursor at the k-th of `count` values."""
     marked = curve.copy()
     marked[16:, _columns(count, curve.shape[1])[k]] = drawing.INK
     return marked

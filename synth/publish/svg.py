@@ -1,4 +1,4 @@
-"""Charts by matplotlib as small SVG text: same data, same bytes, whoever's settings; text stays text."""
+"""Charts by matplotlib as small, reproducible SVG, independent of the user's settings; text stays text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STYLE: Any = {
     "font.sans-serif": ["DejaVu Sans"],
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
-    # Gridlines stand for ticks: one line less a tick in the file.
+    # Gridlines instead of ticks: one line less per tick in the file.
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.color": "#e6e8eb",
@@ -40,7 +40,7 @@ _LONG = re.compile(r"\d+\.\d{3,}")
 
 
 def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
-    """What `draw` puts on an empty figure of so many points (1/72 inch), as the text of an SVG element."""
+    """The figure drawn by `draw`, of that size in points (1/72 inch), as the text of an SVG element."""
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -55,7 +55,7 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
 
 
 def histogram(values: NDArray[np.floating], title: str, unit: str, bins: int = 24) -> str:
-    """Histogram of (N,) values as SVG; the title says how many there are."""
+    """Histogram of (N,) values as SVG; the title contains their number."""
     values = values[np.isfinite(values)]
     counts, edges = np.histogram(values, bins)
 
@@ -71,10 +71,10 @@ def histogram(values: NDArray[np.floating], title: str, unit: str, bins: int = 2
 
 
 def _slim(text: str) -> str:
-    """Half as long: without prologue, comments and metadata, numbers to a tenth of a point.
+    """The SVG at half its size: no prologue, comments and metadata, numbers rounded to a tenth of a point.
 
-    Where numbers are cut lies beside the round ones, as the layout's last bits differ from run to run. Names
-    of parts are made from the content, so that several pictures may stand in one page.
+    Rounding is offset from round numbers, as the layout's last bits differ from run to run. Names of parts
+    are derived from the content, so that several pictures can be on one page.
     """
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' transform="rotate\(-0 [^"]*"|(?<=<g) id="[^"]*"', "", text)

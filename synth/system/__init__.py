@@ -1,1 +1,1 @@
-"""The machine underneath: LLVM, compiled code, clocks, how commands end."""
+"""System services: LLVM, compiled code, files, configuration, timing, and errors of commands."""

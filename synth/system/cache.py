@@ -1,4 +1,4 @@
-"""What is kept between runs, compiled or computed: folders of our own, bounded, that can be written."""
+"""The cache of compiled and computed results between runs: private, writable folders of bounded size."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from synth.system.checked_file import write_whole
 
 T = TypeVar("T")
 
-LIMIT_BYTES = 512 * 1024**2
-"""What the renderer's compiled kernels may take; the least recently used go first."""
+LIMIT_BYTES = 512 * 1024**2  # of the renderer's compiled kernels; the least recently used are deleted first
 
 
 @functools.cache
 def folder(name: str) -> Path:
-    """A folder for one kind of compiled code, made if it isn't there.
+    """The cache folder of that name, created if necessary.
 
-    `SULCUS_CACHE` is asked first, then the user's cache (`XDG_CACHE_HOME`, else ~/.cache); where neither can
-    be written (no home, read-only), a folder of this user's own in the system's temporary one.
+    It is in `SULCUS_CACHE`, else in the user's cache (`XDG_CACHE_HOME`, else ~/.cache); if neither is
+    writable (no home, read-only), in a private folder of this user in the system's temporary one.
 
     Raises:
-        OSError: nothing can be written, or the temporary folder is one that others made or may write to: what
-            is kept here is code that will be run.
+        OSError: no folder is writable, or others own or may write to the temporary one: cached code is
+        executed.
     """
     user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
     places = [
@@ -53,7 +52,7 @@ def folder(name: str) -> Path:
     return mine / name
 
 
-def kept(
+def cached(
     file: str,
     key: bytes,
     make: Callable[[], T],
@@ -62,16 +61,16 @@ def kept(
     faults: tuple[type[Exception], ...],
     most: int,
 ) -> T:
-    """What `make` gives, from this user's cache if it was made before; who wants what is being made waits.
+    """The result of `make`, from this user's cache if possible; concurrent calls of one key compute it once.
 
     Args:
-        file: folder and ending, `compliance/npy`.
-        key: of all that it is made of.
-        make: computes it.
-        dump: to the bytes of a file.
-        load: of these.
-        faults: what `load` raises of half a file, of a disk that was full, or one that others wrote.
-        most: files that are kept, the newest.
+        file: folder and suffix in the cache, `compliance/npy`.
+        key: identifies all inputs of `make`.
+        make: computes the result.
+        dump: encodes it as the bytes of a file.
+        load: decodes these.
+        faults: exceptions of `load` for a truncated or corrupted file.
+        most: number of files to store; older ones are deleted.
     """
     name, ending = file.split("/")
     word = hashlib.sha256(key).hexdigest()[:32]
@@ -79,7 +78,9 @@ def kept(
     with contextlib.suppress(OSError, *faults):
         return load(place.read_bytes())
     with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):  # few locks, for they stay; two that share one only wait longer
+        with contextlib.suppress(
+            OSError
+        ):  # few locks, as they are never deleted; sharing one only costs time
             fcntl.flock(held.enter_context((place.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
         with contextlib.suppress(OSError, *faults):
             return load(place.read_bytes())

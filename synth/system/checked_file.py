@@ -1,4 +1,4 @@
-"""Files: others' are read within limits and run no code, ours are there whole or not at all."""
+"""File access: untrusted files are read within limits and run no code; writing is atomic."""
 
 from __future__ import annotations
 
@@ -23,12 +23,10 @@ from ruamel.yaml.error import MarkedYAMLError
 from synth.errors import UserError, as_user_error, first_line
 
 LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 20, 200_000, 1 << 20
-"""Bytes of a file of that kind that is read."""
-LARGEST_PIXELS = 40_000_000
-"""Of a still or of a frame of a video."""
+"""Size limits of files by kind [bytes]."""
+LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
-PART = ".part"
-"""How the names of files end that are being written, `.NAME.RANDOM.part`."""
+PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
 def open_file(path: Path, largest: int) -> BufferedReader:
@@ -46,46 +44,46 @@ def open_file(path: Path, largest: int) -> BufferedReader:
 
 
 def check_file(path: Path, largest: int) -> None:
-    """`open_file`, for a library that opens it by its name."""
+    """Raises as `open_file`; for libraries that open a file by its path."""
     open_file(path, largest).close()
 
 
 def read_bytes(path: Path, largest: int) -> bytes:
-    """What is in a file. Raises as `open_file`."""
+    """The bytes of a file. Raises as `open_file`."""
     with open_file(path, largest) as file:
         return file.read(largest)
 
 
 def read_text(path: Path, largest: int, encoding: str = "utf-8") -> str:
-    """The text of a file. UserError for what is none."""
+    """The text of a file. UserError if it is not text of that encoding."""
     data = read_bytes(path, largest)
-    with as_user_error(f"{path}: is no text"):
+    with as_user_error(f"{path}: is not text"):
         return data.decode(encoding)
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> Any:
-    """What a JSON file holds. UserError for what is none."""
+    """The values of a JSON file. UserError if it is not JSON."""
     text = read_text(path, largest)
-    with as_user_error(f"{path}: is no JSON"):
+    with as_user_error(f"{path}: is not JSON"):
         return json.loads(text)
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by name, of any shape (A, ...), numbers and truth values only. UserError else."""
+    """The arrays of an .npz by name, of any shape (A, ...), numbers or Booleans. UserError for others."""
     with open_file(path, _LARGEST_ARRAYS) as file, as_user_error(f"{path}: cannot be read as .npz"):
         with np.load(file, allow_pickle=False) as held:
             found = {name: held[name] for name in held.files}
         for name, array in found.items():
             if array.dtype.kind not in "biuf":
-                raise ValueError(f"{name} is no array of numbers")
+                raise ValueError(f"{name} is not an array of numbers")
         return found
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
-    """A still as OpenCV has it: (H, W, 3) uint8 BGR, upright, or as `flags` (cv2.IMREAD_...) ask.
+    """A still image read by OpenCV: (H, W, 3) uint8 BGR, upright, or as set by `flags` (cv2.IMREAD_...).
 
     Raises:
-        UserError: no regular file, no picture, or one beyond 40 megapixels.
+        UserError: not a regular file, not a picture, or larger than 40 megapixels.
     """
     data = read_bytes(path, LARGEST_PICTURE)
     with as_user_error(f"{path}: not a readable picture"):
@@ -93,41 +91,38 @@ def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
 
 
 def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
-    """The same (H, W, 3) from the bytes of a file; its size is read before it is decoded. ValueError."""
+    """As `read_picture`, from the bytes of a file; raises ValueError. The size is checked before decoding."""
     import cv2
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's own limit is above ours
+            warnings.simplefilter("ignore")  # Pillow's own limit is higher
             with Image.open(BytesIO(data)) as picture:
                 refuse_large(*picture.size)
         found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except Exception as error:  # each format's reader raises what it likes: SyntaxError, struct.error, ...
-        raise ValueError(f"no picture that is read: {first_line(error)}") from error
+    except Exception as error:  # readers of formats raise anything: SyntaxError, struct.error, ...
+        raise ValueError(f"unknown format: {first_line(error)}") from error
     if found is None:
         raise ValueError("it is damaged")
     return np.asarray(found)
 
 
 def refuse_large(width: int, height: int) -> None:
-    """ValueError for a picture of no pixels, or of more than 40 million."""
+    """Raises ValueError for a picture without pixels, or with more than 40 million."""
     if width < 1 or height < 1 or width * height > LARGEST_PIXELS:
-        raise ValueError(f"{width} x {height} pixels, at most {LARGEST_PIXELS // 10**6} million are read")
+        raise ValueError(f"{width} x {height} pixels, at most {LARGEST_PIXELS // 10**6} million are allowed")
 
 
 def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
-    """Matrices (float64 arrays) and numbers at the top of an OpenCV FileStorage: YAML, XML or JSON.
-
-    UserError for what is none.
-    """
+    """Matrices (float64 arrays) and numbers at the top level of an OpenCV FileStorage: YAML, XML or JSON."""
     import cv2
 
     text = read_text(path, largest)
-    with as_user_error(f"{path}: is no OpenCV calibration"):
+    with as_user_error(f"{path}: is not an OpenCV calibration"):
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()  # it and its nodes live as long as the storage
-        nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is no dictionary
+        nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is not a dict
         return {
             key: node.mat() if node.isMap() else node.real()
             for key, node in nodes.items()
@@ -141,10 +136,9 @@ def read_yaml(path: Path) -> Any:
 
 
 def load_yaml(text: str, label: str, *, places: bool = False) -> Any:
-    """The values of YAML 1.2, a date as its text; with `places`: `ruamel.yaml`'s tree, comments too.
+    """The values of YAML 1.2, dates as text; with `places`, `ruamel.yaml`'s tree of them with their lines.
 
-    Raises:
-        UserError: `label:line:column: not YAML: ...`.
+    Raises UserError: `label:line:column: not YAML: ...`.
     """
     yaml = YAML(typ="rt" if places else "safe", pure=True)
     if not places:
@@ -155,24 +149,24 @@ def load_yaml(text: str, label: str, *, places: bool = False) -> Any:
         mark = error.problem_mark or error.context_mark
         where = f"{label}:{mark.line + 1}:{mark.column + 1}" if mark else label
         raise UserError(f"{where}: not YAML: {first_line(error.problem or error.context)}") from None
-    except Exception as error:  # the reader raises bare ValueErrors and others for odd scalars and tags
+    except Exception as error:  # the parser raises ValueError and others for odd scalars and tags
         raise UserError(f"{label}: not YAML: {first_line(error)}") from error
 
 
 class _Plain(SafeConstructor):
-    """Values whose dates stay text."""
+    """A constructor that leaves dates as text."""
 
 
 _Plain.add_constructor("tag:yaml.org,2002:timestamp", SafeConstructor.construct_yaml_str)
 
 
 def folder_bytes(path: Path) -> int:
-    """What the files under a folder take on disk."""
+    """Total size of the files below a folder [bytes]."""
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
 
 
 def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
-    """Writes a small file so that it is there in full or not at all; `durable`: after a power failure too."""
+    """Writes a small file as a whole or not at all; `durable`: even after a power failure."""
     with part_of(path) as part, part.open("wb") as file:
         file.write(text.encode() if isinstance(text, str) else text)
         if durable:
@@ -181,7 +175,7 @@ def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Writes (H, W, 3) sRGB in the format that the name ends with. UserError where that can't be."""
+    """Writes (H, W, 3) sRGB in the format of the name's suffix. UserError if it can't be written."""
     import cv2
 
     if not cv2.haveImageWriter(path.name):
@@ -193,9 +187,9 @@ def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
 
 @contextmanager
 def part_of(path: Path) -> Iterator[Path]:
-    """A new file beside `path` to write, which takes its name when the block ends well and else is gone.
+    """A new file next to `path`, renamed to it if the block succeeds and else deleted.
 
-    It is created exclusively: no link that lies there is followed. One that lies at `path` is replaced.
+    It is created exclusively, so no existing link is followed. A link at `path` is replaced.
     """
     part = _part_name(path)
     part.touch(exist_ok=False)
@@ -205,7 +199,7 @@ def part_of(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[Path]:
-    """The same for a new folder. UserError if something is at `path`, or its own folder can't be made."""
+    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created."""
     if os.path.lexists(path):
         raise UserError(f"{path}: exists already")
     make_folder(path.absolute().parent)
@@ -228,23 +222,23 @@ def _replacing(path: Path, part: Path) -> Iterator[None]:
         raise
 
 
-def make_folder(path: Path, room_bytes: int = 0) -> None:
-    """Makes a folder. UserError if it can't be, can't be written, or its disk has not that much room."""
+def make_folder(path: Path, space_bytes: int = 0) -> None:
+    """Creates a folder. UserError if it is not writable, or its disk has less than `space_bytes` free."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path) as file:
-            if room_bytes:
-                os.posix_fallocate(file.fileno(), 0, room_bytes)  # quotas count too
+            if space_bytes:
+                os.posix_fallocate(file.fileno(), 0, space_bytes)  # respects quotas
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from None
 
 
 @contextmanager
-def made_folder(path: Path, room_bytes: int = 0) -> Iterator[None]:
-    """`make_folder`; what it made and the block left empty is gone again if the block fails."""
+def made_folder(path: Path, space_bytes: int = 0) -> Iterator[None]:
+    """As `make_folder`; if the block fails, the created folders that are still empty are deleted."""
     fresh = [one for one in (path, *path.parents) if not os.path.lexists(one)]
     try:
-        make_folder(path, room_bytes)
+        make_folder(path, space_bytes)
         yield
     except BaseException:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""How every command ends: bad input is one line and exit code 2, Ctrl-C is 130, a closed pipe is quiet."""
+"""Errors and exit codes of all commands: bad input is one line and code 2, Ctrl-C is 130, a closed pipe 0."""
 
 from __future__ import annotations
 
@@ -15,26 +15,24 @@ from typer.core import TyperGroup
 
 from synth.errors import Caution, UserError
 
-# What the state of the machine is to blame for, and no mistake of the program.
-_MACHINE = {
+_MACHINE = {  # errors caused by the state of the machine, not by a bug
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR,
     errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
 }  # fmt: skip
 
-_EXTRAS = {"sklearn": "bench"}
-"""Packages that commands import and a plain installation lacks, and the extra that brings them."""
+_EXTRAS = {"sklearn": "bench"}  # imported packages that a plain installation lacks -> the extra with them
 
 
 def printable(text: str) -> str:
-    """A message with control characters spelt out: what a file is called must not steer a terminal."""
+    """A message with control characters escaped: the name of a file must not control the terminal."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 class Commands(TyperGroup):
-    """A typer group (`typer.Typer(cls=Commands)`) that turns UserError into its line and exit code 2."""
+    """A typer group (`typer.Typer(cls=Commands)`) that turns a UserError into its message and exit code 2."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The commands with all of their first sentences, wrapped where click would cut them off."""
+        """Writes the commands with their whole first sentences, which click would truncate."""
         commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
         rows = [(name, one.get_short_help_str(1000)) for name, one in commands if one and not one.hidden]
         if rows:
@@ -46,45 +44,43 @@ class Commands(TyperGroup):
             with _cautions():
                 return super().invoke(ctx)
         except UserError as error:
-            typer.echo(f"error: {printable(str(error))}", err=True)
-            raise typer.Exit(2) from None
+            message = str(error)
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
             extra = _EXTRAS[package]
-            how = f"pip install '.[{extra}]' in the clone"
-            typer.echo(f"error: this needs the package {package}, of the extra {extra}: {how}", err=True)
-            raise typer.Exit(2) from None
+            message = f"package {package} is missing: pip install '.[{extra}]' in the clone"
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
             raise typer.Exit(130) from None
         except BrokenPipeError:
-            # The reader has gone (`| head`): what is still buffered must not raise again at exit.
+            # The reading process has ended (`| head`): buffered output must not raise again at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except OSError as error:
             if error.errno not in _MACHINE:
                 raise
-            where = f"{error.filename}: " if error.filename is not None else ""
-            typer.echo(f"error: {printable(where)}{error.strerror}", err=True)
-            raise typer.Exit(2) from None
+            message = (
+                f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror)
+            )
         except MemoryError:
-            typer.echo("error: the memory of this machine is not enough for that", err=True)
-            raise typer.Exit(2) from None
+            message = "out of memory: use a smaller size or fewer workers"
+        typer.echo(f"error: {printable(message)}", err=True)
+        raise typer.Exit(2)
 
 
 @contextmanager
 def _cautions() -> Iterator[None]:
-    """Shows a `Caution` as a line; other warnings as ever."""
+    """Prints each `Caution` as a line; other warnings are unchanged."""
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def say(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        def print_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if issubclass(category, Caution):
                 typer.echo(f"note: {printable(str(message))}", err=True)
             else:
                 show(message, category, *where, **more)
 
-        warnings.showwarning = say
+        warnings.showwarning = print_warning
         yield

@@ -1,4 +1,4 @@
-"""Configuration by pydantic models: YAML text and `section.key=value` changes, each mistake at its place."""
+"""Configuration by pydantic models: YAML text and `section.key=value` overrides, errors with their line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from synth.system import checked_file
 
 Model = TypeVar("Model", bound=BaseModel)
 
-Loc = tuple[str | int, ...]
-"""A place in a configuration: keys and positions from the top."""
+Loc = tuple[str | int, ...]  # path of a value in a configuration: keys and list positions
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """Something in a configuration that can't be."""
+    """An error in a configuration."""
 
     at: Loc
     what: str
@@ -31,19 +30,18 @@ class Mistake:
 
 
 class ConfigFile:
-    """The values of a YAML text, changes made to them, and where each of them stands."""
+    """The values of a YAML text, overrides of them, and the line of each."""
 
     def __init__(self, text: str, label: str) -> None:
-        """Raises UserError for what is no YAML, or no block of keys. `label` names the text in messages."""
+        """Raises UserError if `text` is not a YAML mapping. `label` names it in messages."""
         self.values: dict[str, Any] = checked_file.load_yaml(text, label)
         if not isinstance(self.values, dict):
             raise UserError(f"{label}:1:1: a block of `key: value` lines is needed")
         self._label, self._tree = label, checked_file.load_yaml(text, label, places=True)
-        self.changes: dict[Loc, str] = {}
-        """The text of the change that gave a place its value."""
+        self.changes: dict[Loc, str] = {}  # the override that set a value, as text
 
     def change(self, changes: Iterable[str]) -> None:
-        """Replaces values by `section.key=value`, the value in YAML. UserError for what is none of that."""
+        """Replaces values by `section.key=value`, the value in YAML. UserError for other text."""
         for text in changes:
             key, equals, value = text.partition("=")
             at: Loc = tuple(key.strip().split("."))
@@ -58,10 +56,10 @@ class ConfigFile:
             self.changes[at] = text
 
     def validate(self, model: type[Model], further: Iterable[Mistake] = ()) -> Model:
-        """The model of the values.
+        """The validated model of the values.
 
         Raises:
-            UserError: a line for each mistake, and each of the `further` ones, in the order of the file:
+            UserError: a line for each error and each of the `further` ones, in the order of the file:
                 `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
         """
         mistakes, made = list(further), None
@@ -75,7 +73,7 @@ class ConfigFile:
         return made
 
     def _place(self, at: Loc) -> tuple[float, str]:
-        """Order and text of where a mistake stands: in a change, or at a line and column of the file."""
+        """Sorting key and text of an error's place: an override, or a line and column of the file."""
         block, line, column, missing = self._tree, 0, 0, False
         for step in at:
             positions = getattr(getattr(block, "lc", None), "data", None) or {}
@@ -84,7 +82,7 @@ class ConfigFile:
                 break
             line, column = positions[step][:2]
             block = block[step]
-        for place, text in self.changes.items():  # of an unknown section: a part of a change
+        for place, text in self.changes.items():  # for an unknown section: a part of an override
             if at[: len(place)] == place or (missing and place[: len(at)] == at):
                 return math.inf, f"'{text}': "
         return line, f"{self._label}:{line + 1}:{column + 1}: " if self._label else ""
@@ -93,7 +91,7 @@ class ConfigFile:
 def override(settings: Model, changes: Iterable[str]) -> Model:
     """`settings` with `key=value` or `section.key=value` replaced, the value in YAML.
 
-    Raises UserError: one line for every mistake, `'batch=many': batch: Input should be a valid integer ...`.
+    Raises UserError: one line for each error, `'batch=many': batch: Input should be a valid integer ...`.
     """
     config = ConfigFile("{}", "")
     config.values = settings.model_dump(exclude_unset=True)
@@ -102,7 +100,7 @@ def override(settings: Model, changes: Iterable[str]) -> Model:
 
 
 def first_mistake(error: ValidationError) -> str:
-    """The first thing that is wrong in a file that a program wrote, in one line."""
+    """The first error in a file that a program wrote, in one line."""
     found = error.errors(include_url=False)[0]
     return first_line(Mistake(found["loc"], found["msg"]))
 
@@ -110,12 +108,12 @@ def first_mistake(error: ValidationError) -> str:
 def _find_mistakes(
     error: ValidationError, model: type[BaseModel], values: dict[str, Any]
 ) -> Iterator[Mistake]:
-    """pydantic's messages at their places in `values`; an unknown key with the one that was meant."""
+    """pydantic's messages with their paths in `values`; for an unknown key with a suggestion."""
     found: dict[Loc, list[str]] = {}
     for one in error.errors(include_url=False):
         block: Any = values
         at: Loc = ()
-        for step in one["loc"]:  # pydantic adds names of validators and of what a union may be
+        for step in one["loc"]:  # in which pydantic includes names of validators and members of unions
             steps = range(len(block)) if isinstance(block, list | tuple) else block
             if isinstance(steps, range | dict) and step in steps:
                 at, block = (*at, step), block[step]
@@ -128,7 +126,7 @@ def _find_mistakes(
 
 
 def _meant(at: Loc, model: type[BaseModel]) -> str:
-    """Which key an unknown one may stand for: one of its block, or the same in another block."""
+    """A suggestion for an unknown key: a similar one in its block, or the same in another block."""
     known = places(model)
     elsewhere = [dotted(place) for place in known if place[-1] == at[-1]]
     hint = did_you_mean(str(at[-1]), [str(place[-1]) for place in known if place[:-1] == at[:-1]])
@@ -136,7 +134,7 @@ def _meant(at: Loc, model: type[BaseModel]) -> str:
 
 
 def section_of(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field's type is (or may be), if any."""
+    """The model in a field's type (also if optional), if any."""
     for option in (annotation, *typing.get_args(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel):
             return option
@@ -144,7 +142,7 @@ def section_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def places(model: type[BaseModel], at: Loc = ()) -> list[Loc]:
-    """Every key of a model, from the top: ("seed",), ("render",), ("render", "spp"), ... but not in lists."""
+    """All keys of a model, except in lists: ("seed",), ("render",), ("render", "spp"), ..."""
     found: list[Loc] = []
     for name, field in model.model_fields.items():
         found.append((*at, name))
@@ -155,5 +153,5 @@ def places(model: type[BaseModel], at: Loc = ()) -> list[Loc]:
 
 
 def dotted(at: Loc) -> str:
-    """A place as it is written: `fem.load[1]`."""
+    """A path as text: `fem.load[1]`."""
     return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in at).removeprefix(".")

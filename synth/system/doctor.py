@@ -1,4 +1,4 @@
-"""What this machine offers to the program, and what to do about what it lacks."""
+"""A report of what this machine offers to the program, what it lacks, and how to fix that."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ class Diagnosis:
     what: str
     found: str
     good: bool = True
-    advice: str = ""
-    """What to do, when it is not good."""
+    advice: str = ""  # how to fix it, if it is not good
 
 
 def diagnose(folder: Path) -> list[Diagnosis]:
-    """Everything that is looked at; `folder` is where datasets would go."""
+    """All lines of the report; `folder` is where datasets are to be written."""
     machine, library = packages.machine(), llvm.find()
     found = [
         Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
@@ -44,7 +43,7 @@ def diagnose(folder: Path) -> list[Diagnosis]:
         _disk(folder),
         Diagnosis(
             "LLVM",
-            library or "none that works",
+            library or "none works",
             library is not None,
             "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH",
         ),
@@ -53,7 +52,7 @@ def diagnose(folder: Path) -> list[Diagnosis]:
             "renderer",
             "llvm_ad_rgb" if library else "scalar_rgb",
             library is not None,
-            "the slow variant works; LLVM halves the time",
+            "it is slow: with LLVM rendering takes half the time",
         ),
         *_lacking(),
         _kernels(),
@@ -62,7 +61,7 @@ def diagnose(folder: Path) -> list[Diagnosis]:
 
 
 def lines(found: Sequence[Diagnosis]) -> list[str]:
-    """The report as a person reads it."""
+    """The report as lines of text."""
     width, text = max(len(one.what) for one in found), []
     for one in found:
         text += hang(f"{'ok  ' if one.good else 'LACK'} {one.what:<{width}}  ", one.found)
@@ -72,7 +71,7 @@ def lines(found: Sequence[Diagnosis]) -> list[str]:
 
 
 def _lacking() -> Iterator[Diagnosis]:
-    """A system's library that the renderer is linked against, where the loader doesn't find it."""
+    """A system library that the renderer is linked to but the loader doesn't find."""
     spec = importlib.util.find_spec("drjit")
     threads = Path(spec.origin or "").parent / "libnanothread.so" if spec else Path()
     if not threads.is_file():
@@ -80,7 +79,7 @@ def _lacking() -> Iterator[Diagnosis]:
     try:
         ctypes.CDLL(str(threads))
     except OSError as error:
-        advice = "install it (Debian: apt-get install libatomic1): nothing is rendered without"
+        advice = "install it (Debian: apt-get install libatomic1): the renderer needs it"
         yield Diagnosis("renderer's libraries", str(error), False, advice)
 
 
@@ -88,7 +87,7 @@ def _kernels() -> Diagnosis:
     try:
         place = cache.folder("kernels")
     except OSError as error:
-        return Diagnosis("compiled kernels", f"not kept ({error})", False, "set SULCUS_CACHE to a folder")
+        return Diagnosis("compiled kernels", f"not cached ({error})", False, "set SULCUS_CACHE to a folder")
     size_mb, limit_mb = folder_bytes(place) / 1e6, cache.LIMIT_BYTES / 1e6
     return Diagnosis("compiled kernels", f"{size_mb:.0f} MB of at most {limit_mb:.0f} in {place}")
 

@@ -1,4 +1,4 @@
-"""NVIDIA GPUs, and what keeps the renderer from one: asked of the driver's own libraries."""
+"""NVIDIA GPUs, found by the driver's own libraries, and why the renderer can't use one."""
 
 from __future__ import annotations
 
@@ -17,40 +17,36 @@ _MAJOR, _MINOR = 75, 76  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_*
 
 @dataclass(frozen=True)
 class Gpu:
-    """What the driver says of itself and of its first device."""
+    """The driver and its first device."""
 
     devices: int
-    driver: str
-    """Version; empty where the system does not say."""
+    driver: str  # version; empty if unknown
     capability: tuple[int, int]
-    optix: bool
-    """Whether `libnvoptix.so.1` is there: another library than CUDA's, and the one that traces rays."""
+    optix: bool  # whether `libnvoptix.so.1` is present, which traces rays
 
 
 @functools.cache
 def probe() -> Gpu | None:
-    """The GPU of this machine; None without a driver or a device."""
-    try:
-        cuda = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return None
-    count, parts = ctypes.c_int(0), []
-    if cuda.cuInit(0) or cuda.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
+    """The GPU of this machine; None if there is no driver or device."""
+    cuda, count, parts = _library("libcuda.so.1"), ctypes.c_int(0), []
+    if not cuda or cuda.cuInit(0) or cuda.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
         return None
     for attribute in (_MAJOR, _MINOR):
         value = ctypes.c_int(0)
         cuda.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0)
         parts.append(value.value)
+    return Gpu(count.value, _driver(), (parts[0], parts[1]), _library("libnvoptix.so.1") is not None)
+
+
+def _library(name: str) -> ctypes.CDLL | None:
     try:
-        ctypes.CDLL("libnvoptix.so.1")
-        optix = True
+        return ctypes.CDLL(name)
     except OSError:
-        optix = False
-    return Gpu(count.value, _driver(), (parts[0], parts[1]), optix)
+        return None
 
 
 def obstacle(gpu: Gpu | None) -> str | None:
-    """Why the renderer cannot run on a GPU, with the remedy; None where nothing stands in its way."""
+    """Why the renderer cannot run on a GPU, with the remedy; None if it can."""
     if gpu is None:
         return "no NVIDIA GPU with a driver was found"
     if not gpu.optix:
@@ -68,8 +64,8 @@ def obstacle(gpu: Gpu | None) -> str | None:
 
 def _driver() -> str:
     try:
-        said = Path("/proc/driver/nvidia/version").read_text("utf-8")
+        text = Path("/proc/driver/nvidia/version").read_text("utf-8")
     except OSError:
         return ""
-    found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", said)
+    found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text)
     return found[0] if found else ""

@@ -1,4 +1,4 @@
-"""Compiling hot loops, cached on disk where that is possible."""
+"""Compilation of hot loops by numba, cached on disk where possible."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F) -> F:
-    """Compiles with numba, once a machine rather than once a process.
+    """Compiles with numba, once per machine rather than once per process.
 
-    The cache lies in `NUMBA_CACHE_DIR`, else beside the package, else in the user's cache folder (numba's own
-    order), else in ours (`synth.system.cache`); where none can be written it is done without.
+    The cache is in `NUMBA_CACHE_DIR`, else next to the package, else in the user's cache folder (numba's own
+    order), else in ours (`synth.system.cache`); if none of these is writable there is no cache.
 
-    numba notices a change only in the file a function stands in. Hence the rule of this package: a compiled
-    function calls compiled functions of its own file only.
+    numba detects changes only in the file of the function itself. Hence the rule of this package: a compiled
+    function only calls compiled functions of its own file.
     """
     return _compile(function)
 
 
 def vectorised(function: F) -> F:
-    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as NumPy's does.
+    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as in NumPy.
 
-    Python's own rule, an error, would put a branch into every division, and the loop would go pixel by pixel.
+    Python's rule, an exception, would add a branch to every division and prevent vectorisation.
     """
     return _compile(function, error_model="numpy")
 
@@ -35,12 +35,12 @@ def vectorised(function: F) -> F:
 def _compile(function: F, **how: str) -> F:
     try:
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # no folder to write to: read-only installation without a home
+    except RuntimeError:  # no writable folder: a read-only installation without a home
         before = numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = str(cache.folder("loops"))
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
-    except (RuntimeError, OSError):  # nor a temporary one, or a disk that is full
+    except (RuntimeError, OSError):  # no temporary folder either, or a full disk
         return numba.njit(nogil=True, **how)(function)  # type: ignore[no-any-return]
     finally:
         numba.config.CACHE_DIR = before

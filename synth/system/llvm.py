@@ -1,4 +1,4 @@
-"""Finding an LLVM that Mitsuba's fast variant survives: a wrong one aborts the process, uncatchably."""
+"""Search for an LLVM that works with Mitsuba's fast variant: a wrong one aborts the process."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _PROBE = (
 
 @functools.cache
 def find() -> str | None:
-    """Path of a libLLVM that the fast renderer works with here, or None.
+    """Path of a libLLVM that works with the fast renderer on this machine, or None.
 
-    `DRJIT_LIBLLVM_PATH` is tried first and alone if it is set; then what the linker knows and the usual
-    folders, newest version first. Each is probed in a subprocess, and the answer remembered for the process.
-    `SULCUS_LLVM` (a path, or empty for none) hands a worker what its parent found.
+    Only `DRJIT_LIBLLVM_PATH` is tried if it is set; else the libraries known to the linker and those in the
+    usual folders, newest version first. Each is tested in a subprocess; the result is cached in this process.
+    `SULCUS_LLVM` (a path, or empty for none) passes the result of a parent process to a worker.
     """
     given = os.environ.get("SULCUS_LLVM")
-    if given is not None:  # a parent process has looked already
+    if given is not None:
         return given or None
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     tried = [named] if named else candidates()
@@ -51,7 +51,7 @@ def candidates() -> list[str]:
 
 
 def probe(path: str) -> bool:
-    """Whether a small kernel runs through the LLVM at `path`, found out in a process that may die of it."""
+    """Whether a small kernel runs with the LLVM at `path`, tested in a process that may crash."""
     if not Path(path).exists():
         return False
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}

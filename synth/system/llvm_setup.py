@@ -1,4 +1,4 @@
-"""Set-up of LLVM on a new machine: finds one, or installs Debian's where it may. Never fails a build."""
+"""Set-up of LLVM on a new machine: finds one, or installs Debian's where permitted. Never fails a build."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PACKAGE = "libllvm19"
 
 
 def main() -> None:
-    """Says in one line what there is and what that means."""
+    """Prints in one line which LLVM was found and its consequence."""
     library = llvm.find()
     if library is None and _install():
         llvm.find.cache_clear()
@@ -22,12 +22,12 @@ def main() -> None:
     else:
         print(
             "fast renderer: no usable LLVM (17 or newer; Debian: apt-get install libllvm19); "
-            "going on with scalar_rgb, which takes up to twice as long"
+            "using scalar_rgb, which takes up to twice as long"
         )
 
 
 def _install() -> bool:
-    """Whether the package could be installed; needs apt and to be root, or sudo without a password."""
+    """Installs the package if there is apt and root or passwordless sudo; returns whether that succeeded."""
     if shutil.which("apt-get") is None:
         return False
     become: list[str] = []

@@ -1,4 +1,4 @@
-"""Versions of the installed packages that shape a sequence, and the machine that they run on."""
+"""Versions of the installed packages that affect a sequence, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -8,34 +8,23 @@ import re
 from importlib import metadata
 from pathlib import Path
 
-_SHAPING = (
-    "sulcus",
-    "mitsuba",
-    "drjit",
-    "numpy",
-    "scipy",
-    "opencv-contrib-python-headless",
-    "torch",
-    "zarr",
-    "numba",
-    "llvmlite",
-    "xatlas",
-)
+_OPENCV = "opencv-contrib-python-headless"
+COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite", "xatlas")
 
 
 def versions() -> dict[str, str]:
-    """`{package: version}` of the installed packages that shape a sequence, and of Python."""
+    """`{package: version}` of the installed packages that affect a sequence, and of Python."""
     found = {"python": platform.python_version()}
-    for name in _SHAPING:
+    for name in ("sulcus", "zarr", *COMPUTING):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            continue  # optional here, or run from a checkout that is not installed
+            continue  # optional, or run from a checkout that is not installed
     return found
 
 
 def machine() -> dict[str, str | int | float]:
-    """Processor, cores, memory [GB], system and Python; nothing that names the machine itself."""
+    """Processor, cores, memory [GB], system and Python; nothing that identifies the machine."""
     info = Path("/proc/cpuinfo")
     model = re.search(r"model name\s*:\s*(.+)", info.read_text() if info.exists() else "")
     return {

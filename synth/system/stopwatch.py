@@ -1,4 +1,4 @@
-"""CPU-seconds and peak memory by stage: with progress and patience, all in `synth` that reads a clock."""
+"""CPU time and peak memory by stage."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-StageCallback = Callable[[str, int, int], None]
-"""Told which stage a sequence is in, how many of its steps are done, and how many there are."""
+StageCallback = Callable[[str, int, int], None]  # called with a stage's name, steps done, steps in all
 
 
 class Stopwatch:
@@ -21,7 +20,7 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Times the block under `name`; blocks of one name add up."""
+        """Adds the time of the block to that of stage `name`."""
         cpu, wall = time.process_time(), time.perf_counter()
         try:
             yield
@@ -30,7 +29,7 @@ class Stopwatch:
             self._wall[name] += time.perf_counter() - wall
 
     def add(self, name: str, cpu_s: float, wall_s: float) -> None:
-        """What another process spent on a stage [s]."""
+        """Adds the time that another process spent on a stage [s]."""
         self._cpu[name] += cpu_s
         self._wall[name] += wall_s
 

@@ -6,33 +6,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 
-ProgressCallback = Callable[[int, int], None]
-"""Told how many are done, and how many there are."""
+ProgressCallback = Callable[[int, int], None]  # called with the number done and the number in all
 
 
-class ProgressBars(Progress):
-    """RunBars on stderr, where they can move: in a terminal, or in a notebook that has ipywidgets."""
+class ProgressBars(progress.Progress):
+    """Progress bars on stderr if they can be animated: in a terminal, or in a notebook with ipywidgets."""
 
-    def __init__(self, *further: ProgressColumn, transient: bool = False) -> None:
+    def __init__(self, *further: progress.ProgressColumn, transient: bool = False) -> None:
         console = Console(stderr=True)
         drawn = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *further)
+        text, counts = progress.TextColumn("{task.description}"), progress.MofNCompleteColumn()
+        columns = (text, progress.BarColumn(), counts, *further)
         super().__init__(*columns, console=console, transient=transient, disable=not drawn)
 
 
 @contextmanager
 def counting(what: str, total: int | None = None) -> Iterator[Callable[..., None]]:
-    """A bar; gives a function of how many are done and, where `total` says nothing, of how many."""
-    with ProgressBars(TimeRemainingColumn(), transient=True) as bars:
+    """A bar; yields a function of the number done and, if `total` is None, of the number in all."""
+    with ProgressBars(progress.TimeRemainingColumn(), transient=True) as bars:
         task = bars.add_task(what, total=total)
         yield lambda done, of=None: bars.update(task, completed=done, total=of)

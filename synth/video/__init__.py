@@ -1,1 +1,1 @@
-"""Films as files: frames read and written, masks of the tool, millimetres a pixel."""
+"""Video files: frames read and written, instrument masks, millimetres per pixel."""

@@ -1,4 +1,4 @@
-"""Masks of the tool that lie in files: a picture a frame, or one for all frames."""
+"""Instrument masks in files: a picture per frame, or one for all frames."""
 
 from __future__ import annotations
 
@@ -16,32 +16,31 @@ from synth.video.file_numbers import match_numbers, number_files
 from synth.video.read import read_mask
 
 MASKS = {
-    "auto": "what is found and proves useful",
-    "glare": "all highlights that are found",
-    "tool": "all that is taken for a tool",
-    "both": "both, whatever they do",
+    "auto": "detected highlights and instrument, where masking them helps",
+    "glare": "all detected highlights",
+    "tool": "all of the detected instrument",
+    "both": "all detected highlights and the detected instrument",
     "none": "nothing",
 }
-"""What is masked; a tool whose outline is given is masked in any case but `glare` and `none`."""
+"""What is masked; given instrument masks are used in all cases but `glare` and `none`."""
 
 
 @dataclass(frozen=True)
 class MaskFiles:
-    """Pictures, white where the tool is."""
+    """Pictures that are white on the instrument."""
 
     by_frame: dict[int, Path]
-    default: Path | None
-    """For frames that have none of their own."""
+    default: Path | None  # for frames without a mask of their own
 
     @classmethod
     def find(cls, numbered: Path, folder: Path) -> MaskFiles:
-        """Pictures with a frame's number in their names in `numbered`, and mask.png in `folder`, if any."""
+        """PNG files with a number in their names in `numbered`, and mask.png in `folder`, if present."""
         files = [path for path in numbered.glob("*.png") if re.search("[0-9]", path.stem)]
         default = folder / "mask.png"
         return cls(number_files(files), default if os.path.lexists(default) else None)
 
     def of_frames(self, frames: Collection[int], notes: list[str]) -> MaskFiles:
-        """The same with a film's numbers; arguments and errors as of `match_numbers`."""
+        """The same by the frames of a video; arguments and errors as `match_numbers`."""
         frame_of = match_numbers(self.by_frame, frames, "masks/", notes)
         return replace(self, by_frame={frame_of[number]: path for number, path in self.by_frame.items()})
 
@@ -49,13 +48,13 @@ class MaskFiles:
         return bool(self.by_frame) or self.default is not None
 
     def read(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """(H, W) of a frame, None if there is none for it. UserError for one of another size."""
+        """The mask (H, W) of a frame, None if there is none. UserError for another size."""
         path = self.by_frame.get(index, self.default)
         return None if path is None else read_mask(path, size)
 
 
 def read_choice(text: str) -> tuple[str, MaskFiles | None]:
-    """What `--masks` gives: one of `MASKS`, or a folder. UserError for a folder without masks."""
+    """Parses `--masks`: one of `MASKS`, or a folder. UserError for a folder without masks."""
     if text in MASKS:
         return text, None
     files = MaskFiles.find(Path(text), Path(text))

@@ -1,7 +1,8 @@
-"""Millimetres a pixel, stated or unknown: one rule for `learn predict`, `bench score` and `bench live`.
+"""Millimetres per pixel, given or unknown: one rule for `learn predict`, `bench score` and `bench live`.
 
-Force goes with the scale as it goes with E: of either unknown, a factor is. So of a picture of unknown scale
-a width is taken, E is taken for unknown too, and answers are right up to one factor.
+Force is proportional to a power of the scale and to E: without either it is known up to a factor. For an
+unknown scale a width of the picture is assumed and E is treated as unknown too, so estimates are right up to
+one factor.
 """
 
 from __future__ import annotations
@@ -11,20 +12,18 @@ from typing import Literal
 
 from synth.errors import UserError
 
-StatedScale = float | Literal["unknown"]
-"""mm a pixel."""
+StatedScale = float | Literal["unknown"]  # mm per pixel
 
-ASSUMED_WIDTH_MM = 32.0
-"""Width that a picture of unknown scale is taken to have [mm]: about what a microscope shows of a cortex."""
+ASSUMED_WIDTH_MM = 32.0  # of a picture of unknown scale: a typical field of view of a microscope on cortex
 
 UNKNOWN_NOTE = (
-    f"scale unknown: answers are per pixel, on a picture taken to be {ASSUMED_WIDTH_MM:g} mm wide, "
-    "and right up to a factor"
+    f"scale unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide; estimates are right up to "
+    "a factor"
 )
 
 
 def read_scale(text: str | None) -> StatedScale | None:
-    """What `--scale` says; None if it wasn't given. UserError if it is neither positive nor `unknown`."""
+    """Parses `--scale`; None if it is not given. UserError if it is neither positive nor `unknown`."""
     if text is None:
         return None
     if text == "unknown":
@@ -34,10 +33,10 @@ def read_scale(text: str | None) -> StatedScale | None:
     except ValueError:
         scale = math.nan
     if not 0 < scale < math.inf:
-        raise UserError(f"--scale {text}: give mm a pixel, or unknown")
+        raise UserError(f"--scale {text}: give mm per pixel, or unknown")
     return scale
 
 
 def pixel_mm(stated: StatedScale, width: int) -> float:
-    """mm a pixel of a picture so wide [px]: as stated, or as taken."""
+    """Scale [mm/px] of a picture of that width [px]: as stated, or as assumed."""
     return ASSUMED_WIDTH_MM / width if stated == "unknown" else stated

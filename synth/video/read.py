@@ -1,4 +1,4 @@
-"""Pictures with exact times, one at a time, from a video file or a folder of PNGs: the one reader."""
+"""The video reader: pictures with exact times, one at a time, from a video file or a folder of PNGs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from synth.video.file_numbers import number_files
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
-FPS = 25.0
-"""Taken where nobody knows a video's times."""
+FPS = 25.0  # assumed if a video's times are unknown
 
 Rgb = NDArray[np.uint8]
 
 _LARGEST_BYTES = 1 << 40
-_WIDEST = 4.0  # times as wide as high: more is no pixel but a damaged header
-_LABELS = 8  # levels of a mask that holds numbers, not a soft edge
+_WIDEST = 4.0  # largest aspect ratio of a pixel: a larger one is a damaged header
+_LABELS = 8  # most levels of a mask of class numbers; more are a soft edge
 
-# What FFmpeg may open: by its content a file could also be a list of other files and addresses.
+# Formats that FFmpeg may open: others could make it read further files and addresses.
 _CONTAINERS = {
     "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,asf,ogg,flv",
     "protocol_whitelist": "file",
@@ -40,24 +39,21 @@ _CONTAINERS = {
 
 @dataclass(frozen=True)
 class Picture:
-    """One frame as it is to be looked at: upright, sRGB."""
+    """One frame, upright, sRGB."""
 
-    index: int
-    """Number of the frame: its place in a video, the number in the name of a still."""
-    time_s: float | None
-    """Presentation time on the video's clock [s]; None if the file states none."""
-    rgb: Rgb
-    """(H, W, 3) uint8."""
+    index: int  # position in a video, or the number in the name of a still image
+    time_s: float | None  # presentation time on the video's clock [s]; None if the file states none
+    rgb: Rgb  # (H, W, 3) uint8
 
 
 def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
-    """Decodes frame by frame; times are the container's presentation times, else frames over `fps`.
+    """Decodes frame by frame; times are the container's presentation times, else those of `fps`.
 
-    A rotation stated in the file is applied, and pixels that it says are not square are made so: wider or
-    narrower, as high as they were. A file cut off in the middle gives the frames before the cut.
+    A rotation stated in the file is applied, and pixels stated not to be square are resampled in width. Of a
+    truncated file the frames before the cut are returned.
 
     Raises:
-        UserError: not a video, no video stream, or pictures beyond 40 megapixels.
+        UserError: not a video, no video stream, or pictures larger than 40 megapixels.
     """
     with _open_video(path) as container:
         if not container.streams.video:
@@ -87,14 +83,14 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
 
 
 def is_video(path: Path) -> bool:
-    """Whether it is a video by its name, or a folder of PNGs beside no sequences."""
+    """Whether the path is a video by its suffix, or a folder of PNGs without sequences."""
     if path.is_dir():
         return any(path.glob("*.png")) and not any(path.glob("*.zarr"))
     return path.suffix.lower() in SUFFIXES
 
 
 def read_frames(path: Path, fps: float) -> Iterator[Picture]:
-    """As `read_video`, of a folder its pictures by the numbers in their names, `fps` a second."""
+    """As `read_video`; the pictures of a folder by the numbers in their names, at `fps`."""
     if not path.is_dir():
         return read_video(path, fps)
     stills = number_files([*path.glob("*.png")])
@@ -103,10 +99,7 @@ def read_frames(path: Path, fps: float) -> Iterator[Picture]:
 
 
 def count_frames(path: Path) -> int | None:
-    """Number of frames that the container states, else of those in it; None: no video stream.
-
-    Raises UserError if it is no video.
-    """
+    """Number of frames stated by the container, else counted; None: no video stream. May raise UserError."""
     with _open_video(path) as container:
         if not (stream := next(iter(container.streams.video), None)):
             return None
@@ -119,14 +112,14 @@ def count_frames(path: Path) -> int | None:
 
 
 def pixel_aspect(path: Path) -> float:
-    """Width over height of a video's pixels, 1 if it states none. UserError if it is no video."""
+    """Width over height of a video's pixels, 1 if not stated. UserError if it is not a video."""
     with _open_video(path) as container:
         stream = next(iter(container.streams.video), None)
         return 1.0 if stream is None else _square_width(1 << 20, stream.sample_aspect_ratio) / (1 << 20)
 
 
 def _square_width(width: int, aspect: Fraction | None) -> int:
-    """Columns that square pixels have where these, of that aspect, are `width`."""
+    """Width in square pixels of a picture with `width` pixels of that aspect ratio."""
     stated = float(aspect) if aspect else 1.0
     return round(width * stated) if 1 / _WIDEST <= stated <= _WIDEST else width
 
@@ -134,7 +127,7 @@ def _square_width(width: int, aspect: Fraction | None) -> int:
 def _open_video(path: Path) -> InputContainer:
     checked_file.check_file(path, _LARGEST_BYTES)
     try:
-        # By "file:" a colon in the path is no protocol.
+        # With "file:" a colon in the path is not taken for a protocol.
         container: InputContainer = av.open(f"file:{path}", options=_CONTAINERS)
         for stream in container.streams.video:
             refuse_large(stream.width, stream.height)
@@ -144,48 +137,43 @@ def _open_video(path: Path) -> InputContainer:
 
 
 def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
-    """PNG (or any still OpenCV reads) files by their numbers, in the given order, without times.
-
-    Raises:
-        UserError: one can't be read, or its size differs from the first's.
-    """
+    """Still images by their numbers, in the given order, without times. UserError if their sizes differ."""
     size: tuple[int, ...] | None = None
     for index, path in paths.items():
         rgb = read_picture(path)
         if size is not None and rgb.shape != size:
             raise UserError(
-                f"{path}: {rgb.shape[1]} x {rgb.shape[0]}, the frames before it {size[1]} x {size[0]}"
+                f"{path}: is {rgb.shape[1]} x {rgb.shape[0]}, but the frames before are {size[1]} x {size[0]}"
             )
         size = rgb.shape
         yield Picture(index, None, rgb)
 
 
 def read_picture(path: Path) -> Rgb:
-    """A still as (H, W, 3) uint8 sRGB; 16-bit ones are brought to 8.
-
-    Raises:
-        UserError: unreadable.
-    """
+    """A still image as (H, W, 3) uint8 sRGB, 16-bit ones reduced to 8. UserError if it is unreadable."""
     return np.ascontiguousarray(checked_file.read_picture(path)[..., ::-1]).astype(np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(H, W) where the picture is white: over half its brightest, or not 0 where it holds numbers.
+    """The mask (H, W) of a picture: above half of its maximum, or not 0 if it holds class numbers.
 
-    Of a picture of one colour its opacity is the mask. UserError: unreadable, or of another height and width.
+    The opacity of a picture of one colour is its mask. UserError: unreadable, or not of `size` (height,
+    width).
     """
     picture = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
     levels = np.atleast_3d(picture)
     if levels.shape[2] == 4:
         colour, opaque = levels[..., :3], levels[..., 3]
-        seen = colour[opaque > 0]
-        plain = np.ptp(opaque) > 0 and (seen == seen[:1]).all()
+        drawn = colour[opaque > 0]
+        plain = np.ptp(opaque) > 0 and (drawn == drawn[:1]).all()
         levels = opaque[..., None] if plain else colour * (opaque > 0)[..., None]
     brightest = levels.max(axis=2)
     few = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
     mask = brightest > (0 if few else brightest.max() / 2)
     if mask.shape != size:
-        raise UserError(f"{path}: {mask.shape[1]} x {mask.shape[0]}, the video is {size[1]} x {size[0]}")
+        raise UserError(
+            f"{path}: is {mask.shape[1]} x {mask.shape[0]}, but the video is {size[1]} x {size[0]}"
+        )
     return np.asarray(mask, bool)
 
 

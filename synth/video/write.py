@@ -1,4 +1,4 @@
-"""Films written: the one H.264 encoder."""
+"""The video writer: H.264 encoding."""
 
 from __future__ import annotations
 
@@ -21,33 +21,32 @@ _TICKS = 90_000  # a second
 
 
 def encode_video(
-    target: Path, film: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 23, group: int = 12
+    target: Path, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 23, group: int = 12
 ) -> Path:
-    """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers play.
+    """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers can play.
 
     Args:
         target: the file.
-        film: at least one frame, all of one size; an odd last row or column is left out, as the codec takes
-            even sizes only.
-        fps: frames a second.
-        quality: x264's constant rate factor: less is better and larger.
-        group: frames from one that can be decoded by itself to the next.
+        frames: at least one, all of one size; an odd last row or column is cropped, as the codec requires.
+        fps: frames per second.
+        quality: x264's constant rate factor: smaller is better and larger.
+        group: distance of key frames.
     """
     import av
 
-    # Without these, players take large pictures for BT.709 and show other colours than were put in.
+    # Without these, players assume BT.709 for large pictures and show wrong colours.
     colours = {"colorspace": "smpte170m", "color_primaries": "bt709", "color_trc": "iec61966-2-1"}
     options = {"crf": str(quality), "g": str(group), "threads": "1", **colours, "color_range": "tv"}
-    # By "file:" a colon in the path is no protocol.
+    # With "file:" a colon in the path is not taken for a protocol.
     with checked_file.part_of(target) as part, av.open(f"file:{part}", "w", format="mp4") as container:
-        even = (picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2] for picture in film)
+        even = (picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2] for picture in frames)
         encode(container, even, Fraction(fps).limit_denominator(1000), "yuv420p", options)
     return target
 
 
 def encode(
     container: OutputContainer,
-    film: Iterable[NDArray[np.uint8]],
+    frames: Iterable[NDArray[np.uint8]],
     rate: Fraction | int,
     pixels: str,
     options: Mapping[str, str],
@@ -55,19 +54,19 @@ def encode(
     bits_per_s: int | None = None,
     times_s: NDArray[np.float64] | None = None,
 ) -> None:
-    """Encodes frames as the one stream of an open file, with H.264.
+    """Encodes frames with H.264 as the only stream of an open file.
 
     Args:
         container: the file.
-        film: (H, W, 3) uint8 sRGB each; H and W even where chroma is thinned out.
-        rate: frames a second.
+        frames: (H, W, 3) uint8 sRGB each; H and W even where chroma is subsampled.
+        rate: frames per second.
         pixels: FFmpeg's name of the pixel format.
         options: x264's.
-        bits_per_s: bitrate to keep to; None: as `options` say.
+        bits_per_s: target bitrate; None: set by `options`.
         times_s: (T,) rising, of each frame; None: by the rate.
 
     Raises:
-        UserError: frames of several sizes, or of none.
+        UserError: frames of different sizes, or without pixels.
     """
     import av
 
@@ -78,11 +77,13 @@ def encode(
     if times_s is not None:
         stream.codec_context.time_base = stream.time_base = Fraction(1, _TICKS)
     times = repeat(None) if times_s is None else times_s - times_s[0]
-    for k, (rgb, time_s) in enumerate(zip(film, times, strict=times_s is not None)):
+    for k, (rgb, time_s) in enumerate(zip(frames, times, strict=times_s is not None)):
         if k == 0:
             stream.height, stream.width = rgb.shape[:2]
         if rgb.shape[:2] != (stream.height, stream.width) or not rgb.size:
-            raise UserError(f"{container.name}: frame {k} of {rgb.shape[1]} x {rgb.shape[0]} px doesn't fit")
+            raise UserError(
+                f"{container.name}: frame {k} has another size, {rgb.shape[1]} x {rgb.shape[0]} px"
+            )
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
         if time_s is not None:
             frame.pts, frame.time_base = round(float(time_s) * _TICKS), Fraction(1, _TICKS)

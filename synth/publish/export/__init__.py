@@ -1,1 +1,1 @@
-"""The dataset in the formats of others, for the libraries that read them."""
+"""Exports of a dataset to the formats of other libraries."""

@@ -1,4 +1,4 @@
-"""The arrays that the published training code reads."""
+"""Export for the training code of the published method (D2FNet)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
-# The published loader drops nodes right of this pixel, and takes every file to have the nodes of the first.
+# The published loader drops nodes right of this pixel, and assumes that all files have the same nodes.
 _LARGEST_X = 1400.0
 _NODES = 20_000
 
@@ -18,12 +18,12 @@ Floats = NDArray[np.float32]
 
 
 def write_npz(dataset: Dataset, target: Path) -> None:
-    """What the published training code globs: `run_NNNNNN/brain_surface_NNNNNN_auto_projected_NNNNNN_2d.npz`.
+    """Writes `run_NNNNNN/brain_surface_NNNNNN_auto_projected_NNNNNN_2d.npz` for each sequence.
 
-    Arrays as there (github.com/D3MIA/D2FNet, d2fnet/dataset.py): `disp2d` (T, N, 2) mm, `force_mag` (T, N) N,
-    `projected_pixels` (T, N, 2) px. N is the same in every file, as that code needs. Displacement
-    is in the picture's plane and not the world's, and `force_mag` is their "intensity" (peak = total force)
-    made from the true traction; README.txt in the export says so.
+    Arrays as in github.com/D3MIA/D2FNet, d2fnet/dataset.py: `disp2d` (T, N, 2) mm, `force_mag` (T, N) N,
+    `projected_pixels` (T, N, 2) px, with the same N in every file. Unlike there, displacement is in the plane
+    of the picture, and `force_mag` is their "intensity" (peak = total force) from the true traction, as
+    stated in the export's README.txt.
     """
     count = min(_NODES, *(int(sequence["tissue"][:].sum()) for sequence in dataset))
     if not count:
@@ -38,7 +38,7 @@ def write_npz(dataset: Dataset, target: Path) -> None:
 
 
 def _arrays(sequence: Sequence, count: int) -> tuple[Floats, Floats, Floats]:
-    """Motion (T, N, 2) mm, intensity (T, N) N and place (T, N, 2) px of `count` points of the tissue."""
+    """Motion (T, N, 2) mm, intensity (T, N) N and position (T, N, 2) px of `count` points of the tissue."""
     tissue = np.argwhere(sequence["tissue"][:])
     rows, columns = tissue[np.linspace(0, len(tissue) - 1, count).round().astype(int)].T
     scale = float(sequence.attrs["scale_mm_per_px"])
@@ -60,6 +60,6 @@ def _arrays(sequence: Sequence, count: int) -> tuple[Floats, Floats, Floats]:
 
 _NOTE = """\
 Layout of github.com/D3MIA/D2FNet: disp2d (T, N, 2) mm, force_mag (T, N) N, projected_pixels (T, N, 2) px.
-disp2d is the motion in the picture's plane times the scale, not world x and y.
+disp2d is the motion in the plane of the picture times the scale, not world x and y.
 force_mag is the "intensity" map, its peak scaled to the total force; the true traction is in the Zarr stores.
 """

@@ -1,4 +1,4 @@
-"""Pictures and arrays as bytes of files."""
+"""Encoding of pictures and arrays as files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PICTURES = ("rgb", "rgb_right")
-"""Fields that are pictures."""
+PICTURES = ("rgb", "rgb_right")  # fields that are pictures
 
 
 def as_png(picture: NDArray[Any]) -> bytes:
@@ -24,13 +23,13 @@ def as_png(picture: NDArray[Any]) -> bytes:
 
 
 def write_png(path: Path, picture: NDArray[Any]) -> None:
-    """`as_png` of a picture (H, W) or (H, W, 3) as a file; its folder is made."""
+    """Writes a picture (H, W) or (H, W, 3) as PNG, see `as_png`; creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(as_png(picture))
 
 
 def write_exr(path: Path, radiance: NDArray[np.floating]) -> None:
-    """Linear light (H, W, 3) as an OpenEXR file in half floats; its folder is made."""
+    """Linear light (H, W, 3) as an OpenEXR file in float16; creates its folder."""
     import OpenEXR
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,7 +39,7 @@ def write_exr(path: Path, radiance: NDArray[np.floating]) -> None:
 
 
 def as_npy(values: NDArray[Any]) -> bytes:
-    """A .npy file of an array (...) of any shape."""
+    """The bytes of an .npy file of an array (...)."""
     file = io.BytesIO()
     np.save(file, values)
     return file.getvalue()

@@ -1,9 +1,9 @@
-"""The layout of EndoNeRF (github.com/med-air/EndoNeRF), which reconstructions of deforming tissue read.
+"""Export to the layout of EndoNeRF (github.com/med-air/EndoNeRF), for reconstructions of deforming tissue.
 
-A folder a sequence: `images/`, `depth/` and `masks/` as NNNNNN.png, and `poses_bounds.npy` (T, 17): by row
-the camera's pose 3 x 5 (axes right, up, backward; its place; height, width, focal length), then the nearest
-and farthest depth. Those programs know a pinhole in the middle of the picture only: pictures are undistorted
-and moved there, which is the one thing that is resampled.
+A folder per sequence: `images/`, `depth/` and `masks/` as NNNNNN.png, and `poses_bounds.npy` (T, 17): in each
+row the camera's pose 3 x 5 (axes right, up, backward; its position; height, width, focal length), then
+nearest and farthest depth. These programs assume a pinhole camera with a central principal point, to which
+all pictures are resampled.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import write_png
 
-UNIT_MM = 0.01
-"""One step of a depth picture, and so the unit of lengths: 16 bits reach to 655 mm."""
+UNIT_MM = 0.01  # one step of a depth picture, and the unit of lengths: 16 bits reach to 655 mm
 
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -30,7 +29,7 @@ Floats = NDArray[np.float64]
 
 
 class _Maps(NamedTuple):
-    """Where a pixel of the pinhole's picture lies in the recorded one (cv2.remap), each (H, W)."""
+    """Positions in the recorded picture of the pixels of the pinhole's (cv2.remap), each (H, W)."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -43,17 +42,17 @@ class _Maps(NamedTuple):
 
 
 def write_scenes(dataset: Dataset, target: Path) -> None:
-    """A folder a sequence, named by its index; a second lens's pictures are in `images_right/`, rectified.
+    """Writes a folder per sequence, named by its index, with `images_right/`, rectified, of a right camera.
 
-    Masks are white where there is no tissue to reconstruct: on the instrument and beyond the picture. World
-    axes are those of frame 0's camera. `scene.json` says unit, focal length, baseline and force.
+    Masks are white where there is no tissue: on the instrument and outside the recorded picture. World axes
+    are those of frame 0's camera. `scene.json` contains unit, focal length, baseline and force.
 
     Raises:
-        UserError: a sequence has no depth, or its microscope moved and its poses were not kept.
+        UserError: a sequence has no depth, or its microscope moved and its poses were not stored.
     """
     for sequence in dataset:
         if "depth" not in sequence:
-            raise UserError(f"{sequence.path}: holds no depth: the job's store.without left it out")
+            raise UserError(f"{sequence.path}: has no depth; remove it from the job's store.without")
         here = target / f"{sequence.index:06d}"
         focal = float(sequence.attrs["K"][0][0])
         bounds = _write_pictures(sequence, _maps(sequence, sequence.attrs, focal), here)
@@ -76,7 +75,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
 
 
 def _maps(sequence: Sequence, lens: dict[str, Any], focal: float) -> _Maps:
-    """From a pinhole whose axis meets the pixel (W // 2, H // 2), where those programs take it to be."""
+    """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume."""
     height, width = sequence.size
     middle = np.array([[focal, 0, width // 2], [0, focal, height // 2], [0, 0, 1]], np.float64)
     K, distortion = np.asarray(lens["K"], np.float64), np.asarray(lens["distortion"], np.float64)
@@ -90,7 +89,7 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
     for t in range(sequence.frames):
         depth = np.round(maps.nearest(sequence["depth"][t]) / UNIT_MM)
         if depth.max() > np.iinfo(np.uint16).max:
-            raise UserError(f"{sequence.path}: is deeper than 16 bits hold at {UNIT_MM:g} mm")
+            raise UserError(f"{sequence.path}: depth exceeds 16 bits at {UNIT_MM:g} mm")
         covered = maps.nearest(sequence["tool"][t].astype(np.uint8), outside=1).astype(bool) | (depth == 0)
         picture = maps.smooth(sequence["rgb"][t])
         drawn = {"images": picture, "depth": depth.astype(np.uint16), "masks": covered}
@@ -102,7 +101,7 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
 
 
 def _poses(sequence: Sequence) -> Iterator[Floats]:
-    """Camera of frame t to that of frame 0, (4, 4), in mm and OpenCV's axes."""
+    """Transforms from the camera of each frame to that of frame 0, (4, 4), in mm and OpenCV's axes."""
     if "camera" in sequence:
         poses = sequence["camera"][:]
         yield from (poses[0] @ np.linalg.inv(pose) for pose in poses)
@@ -110,7 +109,7 @@ def _poses(sequence: Sequence) -> Iterator[Floats]:
     camera_motion = sequence.attrs.get("scenario", {}).get("camera_motion", {})
     if camera_motion.get("drift_mm"):
         raise UserError(
-            f"{sequence.path}: the microscope moves and its poses were not kept; "
+            f"{sequence.path}: the microscope moves and its poses were not stored; "
             "render with store.extra=[camera]"
         )
     yield from [np.eye(4)] * sequence.frames

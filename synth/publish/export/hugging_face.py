@@ -1,8 +1,8 @@
-"""Parquet for the Hugging Face Hub: a row a frame with its pictures, and a row a sequence.
+"""Export as Parquet for the Hugging Face Hub: a row per frame with its pictures, and a row per sequence.
 
-`datasets.load_dataset(FOLDER)` reads it with pictures as pictures and arrays as arrays, and the Hub's viewer
-shows it. The features stand in the Parquet files' own metadata, as `datasets` writes them, so that writing
-needs pyarrow only (huggingface.co/docs/datasets/about_dataset_features).
+`datasets.load_dataset(FOLDER)` reads pictures as pictures and arrays as arrays, and the Hub's viewer shows
+them. The features are written to the metadata of the Parquet files, as `datasets` does, so that only pyarrow
+is needed (huggingface.co/docs/datasets/about_dataset_features).
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from synth.fields import FIELDS, TIME
 from synth.publish import card
 from synth.publish.export.encoding import PICTURES, as_png
 
-# The viewer reads a group of rows at once, and refuses ones of more than some hundred megabytes.
-_GROUP_BYTES, _GROUPS = 100 << 20, 5  # in a file
+# The viewer reads a row group at once, and refuses those of more than a few hundred megabytes.
+_GROUP_BYTES, _GROUPS = 100 << 20, 5  # size of a row group; row groups per file
 
 _ROWS = {"sequence": ("int64", "index of the sequence"), "frame": ("int64", "number in the sequence")}
-_LEFT_OUT = ("status", "reason", "path", "split")  # of the index: nothing to say here
+_LEFT_OUT = ("status", "reason", "path", "split")  # columns of the index without meaning here
 
 
 @dataclass(frozen=True)
 class ParquetColumn:
-    """One column: its type in Parquet, and what `datasets` makes of it."""
+    """One column: its type in Parquet, and its feature in `datasets`."""
 
     name: str
     type: pa.DataType
     feature: dict[str, Any]
 
     def describe(self) -> pa.Field:
-        """As a field of a schema; one of an array names the type that `datasets` has for it."""
+        """The field of a schema; with the extension type of `datasets` for an array."""
         kind = str(self.feature["_type"])
         if not kind.startswith("Array"):
             return pa.field(self.name, self.type)
@@ -53,7 +53,7 @@ class ParquetColumn:
         return pa.field(self.name, self.type, metadata=about)
 
     def pack(self, values: list[Any]) -> pa.Array:
-        """Rows as that type; arrays of one shape without a Python object for each number."""
+        """Rows as that type, without a Python object for each number of an array."""
         if not isinstance(values[0], np.ndarray):
             return pa.array(values, self.type)
         packed = pa.array(np.stack(values).astype(FIELDS[self.name].dtype, copy=False).reshape(-1))
@@ -63,10 +63,10 @@ class ParquetColumn:
 
 
 def write_parquet(dataset: Dataset, target: Path) -> None:
-    """`frames/SIDE-NNNNN.parquet` (default), `sequences/SIDE-00000.parquet`, and the card README.md.
+    """Writes `frames/SIDE-NNNNN.parquet` (default), `sequences/SIDE-00000.parquet`, and the card README.md.
 
-    A frame's row holds every field with a frame axis, masks and pictures as PNG, all without loss; a
-    sequence's row the index's columns, the fields without a frame axis, and all attributes as JSON.
+    A frame's row has all fields with a frame axis, masks and pictures as PNG, all lossless; a sequence's row
+    the columns of the index, the fields without a frame axis, and all attributes as JSON.
     """
     first, sides = dataset[0], index.group_by_side(dataset)
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
@@ -89,7 +89,7 @@ def _plain(name: str, kind: str) -> ParquetColumn:
 
 
 def _field(sequence: Sequence, name: str) -> ParquetColumn:
-    """A field's values in one row: a picture, a number, or an array of its shape."""
+    """The column of a field: pictures, numbers, or arrays."""
     dtype, shape = FIELDS[name].dtype, sequence[name].shape[FIELDS[name].dims[0] == TIME :]
     if _is_picture(name):
         kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -129,7 +129,7 @@ def _cell(name: str, values: NDArray[Any]) -> Any:
 
 
 def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator[dict[str, Any]]) -> None:
-    """`SIDE-NNNNN.parquet` in `folder`, each of several groups of rows."""
+    """Writes `SIDE-NNNNN.parquet` in `folder`, each of several row groups."""
     features = {column.name: column.feature for column in columns}
     about = {"huggingface": json.dumps({"info": {"features": features}})}
     schema = pa.schema([column.describe() for column in columns], about)
@@ -147,14 +147,14 @@ def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator
 
 
 def _bytes(value: Any) -> int:
-    """About what a cell takes unpacked."""
+    """Approximate uncompressed size of a cell."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     return len(value["bytes"]) if isinstance(value, dict) else 8
 
 
 def _card(dataset: Dataset, sides: list[str], framed: list[str], frameless: list[str]) -> str:
-    """README.md: what the Hub and `datasets` read of it, and what a person does."""
+    """The text of README.md, with its header for the Hub and `datasets`."""
     folder = Folder(dataset.root)
     rows = [index.row_of(sequence) for sequence in dataset]
     return str(

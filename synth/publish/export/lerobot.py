@@ -1,6 +1,6 @@
-"""LeRobot v3.0 (github.com/huggingface/lerobot): an episode a sequence, MP4, force by frame.
+"""Export to LeRobot v3.0 (github.com/huggingface/lerobot): an episode per sequence, MP4, force per frame.
 
-The dense truth (flow, traction, depth) has no place in it; `--to hf` and `--to webdataset` hold that.
+The format has no dense fields (flow, traction, depth); `--to hf` and `--to webdataset` export them.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
 from synth.video.write import encode_video
 
-_FILES = 1000  # in a folder
+_FILES = 1000  # per folder
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _DATA_PATH = f"data/{_FILE}.parquet"
 _VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_QUALITY, _GROUP = 18, 2  # any frame is decoded from at most one before it
-_PROBED = 100  # frames of an episode that the statistics of its pictures come from
+_QUALITY, _GROUP = 18, 2  # with a key frame every two frames, random access is fast
+_PROBED = 100  # frames of an episode for the statistics of its pictures
 _COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 Numbers = NDArray[Any]
 
 
 def write_episodes(dataset: Dataset, target: Path) -> None:
-    """`meta/`, `data/chunk-000/file-NNN.parquet` and `videos/KEY/chunk-000/file-NNN.mp4`, one an episode.
+    """Writes `meta/`, and per episode `data/chunk-000/file-NNN.parquet` and `videos/KEY/.../file-NNN.mp4`.
 
-    Features: `observation.images.left` (and `.right`) as video, `force` (3,) mN in camera
-    axes, `young_kpa` and `scale_mm_per_px` (1,). There is no action: nobody steered a robot. The task is
-    gesture and appearance. Sides of the split are the ranges under `splits`.
+    Features: `observation.images.left` (and `.right`) as video, `force` (3,) mN in camera axes, `young_kpa`
+    and `scale_mm_per_px` (1,). There are no actions, as there is no robot. The task is gesture and
+    appearance. The sides of the split are ranges in `splits`.
     """
     tasks, episodes, ranges = list[str](), list[dict[str, Any]](), dict[str, str]()
     for side, positions in group_by_side(dataset).items():
@@ -47,7 +47,7 @@ def write_episodes(dataset: Dataset, target: Path) -> None:
 
 
 def _cameras(sequence: Sequence) -> dict[str, str]:
-    """Features that are video, and the fields that they are of."""
+    """Video features and their fields."""
     names = {"left": "rgb", "right": "rgb_right"}
     return {f"observation.images.{key}": name for key, name in names.items() if name in sequence}
 
@@ -55,7 +55,7 @@ def _cameras(sequence: Sequence) -> dict[str, str]:
 def _write_episode(
     sequence: Sequence, number: int, before: int, tasks: list[str], target: Path
 ) -> dict[str, Any]:
-    """Frames and videos of an episode with `before` rows before it; its row in `meta/episodes`."""
+    """Writes the frames and videos of an episode after `before` rows; returns its row of `meta/episodes`."""
     about = row_of(sequence)
     task = f"{about['gesture']} the brain surface ({about['family']})"
     tasks += [task] if task not in tasks else []
@@ -115,7 +115,7 @@ def _statistics(values: Numbers, beyond: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _pooled(rows: list[dict[str, Any]], key: str) -> dict[str, Any]:
-    """Statistics of all episodes from theirs; quantiles as LeRobot pools them, by a weighted mean."""
+    """Statistics of all episodes, pooled from those of each; quantiles by a weighted mean, as in LeRobot."""
     names = ("min", "max", "mean", "std", "count", *_QUANTILES)
     get = {name: np.array([row[f"stats/{key}/{name}"] for row in rows]) for name in names}
     count = get["count"][:, 0].astype(float)
@@ -180,7 +180,7 @@ def _write_meta(
 
 
 def _indexed(tasks: list[str]) -> pa.Table:
-    """The tasks as pandas writes a table whose index they are, for LeRobot looks a task up by its text."""
+    """The tasks as a pandas table indexed by their texts, by which LeRobot looks them up."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
     columns = [
         {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},

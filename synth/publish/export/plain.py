@@ -1,4 +1,4 @@
-"""Plain files: a folder of PNG and .npy, and HDF5."""
+"""Exports as plain files: folders of PNG and .npy, and HDF5."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from synth.publish.export.encoding import PICTURES, write_exr, write_png
 
 
 def write_folder(dataset: Dataset, target: Path) -> None:
-    """`NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, attributes as `NNNNNN/attributes.json`.
+    """Writes `NNNNNN/rgb/TTTT.png`, other fields as `NNNNNN/FIELD.npy`, and `NNNNNN/attributes.json`.
 
     The right camera's pictures are in `NNNNNN/rgb_right/`, linear light in `NNNNNN/radiance/TTTT.exr`.
     """
@@ -32,7 +32,7 @@ def write_folder(dataset: Dataset, target: Path) -> None:
 
 
 def write_hdf5(dataset: Dataset, target: Path) -> None:
-    """`NNNNNN.h5` with the fields as datasets, a chunk a frame, and `attributes` as JSON."""
+    """Writes `NNNNNN.h5` with the fields as datasets, a chunk per frame, and `attributes` as JSON."""
     try:
         import h5py
     except ImportError:

@@ -1,4 +1,4 @@
-"""`synth export`: every format by its name."""
+"""`synth export`: the formats by their names."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ FORMATS: dict[str, Callable[..., None]] = {
     "d2fnet-npz": d2fnet.write_npz,
     "video": sequence_video.write_videos,
 }
-"""Every format by the name that `synth export --to` takes."""
+"""All formats by their names in `synth export --to`."""
 
 
 def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
-    """Writes the finished sequences of `root` into the new folder `target`; returns how many.
+    """Exports the finished sequences of `root` to the new folder `target`; returns their number.
 
-    Beside what the format holds `split.csv` says on which side of the dataset's split each is.
+    In addition to the files of the format, `split.csv` contains the side of each sequence in the dataset's
+    split.
 
     Args:
         root: the dataset.
-        target: a folder that does not exist yet; it is there in full or not at all.
+        target: a folder that does not exist yet; it is written as a whole or not at all.
         to: one of `FORMATS`.
         options: of the format: `overlays` and `interval_s` of a video.
 
     Raises:
-        UserError: an unknown format, a folder that exists, a damaged store, a missing package.
+        UserError: an unknown format, an existing folder, a damaged store, or a missing package.
     """
     if to not in FORMATS:
         raise UserError(f"{to}: is not one of {', '.join(FORMATS)}")

@@ -1,6 +1,6 @@
-"""The layout of TAP-Vid and TAPVid-3D (github.com/google-deepmind/tapnet): points followed through a film.
+"""Export to TAP-Vid and TAPVid-3D (github.com/google-deepmind/tapnet): tracks of points through a video.
 
-Coordinates are theirs: (0, 0) is the corner of the top-left pixel, whose centre is at a half.
+Coordinates as there: (0, 0) is the corner of the top-left pixel, whose centre is at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -22,22 +22,21 @@ Floats = NDArray[np.float64]
 
 
 def write_tracks(dataset: Dataset, target: Path) -> None:
-    """`NNNNNN.npz` a sequence, without pickles: points of tissue that frame 0 shows, asked for there.
+    """Writes `NNNNNN.npz` per sequence, without pickles: tracks of tissue points queried in frame 0.
 
     TAP-Vid: `video` (T, H, W, 3) uint8, `points` (N, T, 2) float32 x and y over (W, H), `occluded` (N, T).
-    What its pickles hold is `{path.stem: dict(np.load(path)) for path in folder.glob("*.npz")}`.
+    The content of its pickles is `{path.stem: dict(np.load(path)) for path in folder.glob("*.npz")}`.
 
-    TAPVid-3D, where a second eye had the motion in depth stored, as its evaluation loads it: `tracks_XYZ`
-    (T, N, 3) m in axes of each frame's camera, `visibility` (T, N), `queries_xyt` (N, 3) px and frame,
-    `fx_fy_cx_cy` (4,) px, `images_jpeg_bytes` (T,) PNGs. `distortion` (5,) is ours (k1, k2, p1, p2, k3): a
-    pinhole alone is off by it.
+    TAPVid-3D, for stereo datasets: `tracks_XYZ` (T, N, 3) m in axes of each frame's camera, `visibility` (T,
+    N), `queries_xyt` (N, 3) px and frame, `fx_fy_cx_cy` (4,) px, `images_jpeg_bytes` (T,) PNGs. In addition,
+    `distortion` (5,) (k1, k2, p1, p2, k3), which a pinhole projection neglects.
 
-    Tracks are the truth in the store: in space and picture they agree to 1e-3 px, or to the attribute
-    `summary.rounding_px` where flow is kept in half precision. STIR (github.com/athaddius/STIRLoader) knows
-    points of a film's first and last frame only: of these arrays, those two.
+    Tracks are the ground truth: in space and picture they agree to 1e-3 px, or to the attribute
+    `summary.rounding_px` where flow is stored as float16. STIR (github.com/athaddius/STIRLoader) uses the
+    first and last frame only.
 
     Raises:
-        UserError: a sequence shows no tissue in frame 0.
+        UserError: no tissue is visible in frame 0 of a sequence.
     """
     for sequence in dataset:
         pixels = _choose(sequence)
@@ -60,7 +59,7 @@ def write_tracks(dataset: Dataset, target: Path) -> None:
 
 
 def _choose(sequence: Sequence) -> NDArray[np.int64]:
-    """Pixels (N, 2) as x, y: a square grid of up to `_POINTS` on tissue that frame 0 shows."""
+    """Pixels (N, 2) as x, y: a square grid of up to `_POINTS` on tissue visible in frame 0."""
     shown = sequence["tissue"][:] & sequence["visible"][0]
     step = max(1, int(np.ceil(np.sqrt(shown.sum() / _POINTS))))
     grid = np.zeros_like(shown)
@@ -72,7 +71,7 @@ def _choose(sequence: Sequence) -> NDArray[np.int64]:
 
 
 def _in_depth(sequence: Sequence, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-    """Tracks of pixels (N, 2) of frame 0 in space, and the lens that projects them onto the picture."""
+    """Tracks of pixels (N, 2) of frame 0 in space, and the camera's intrinsics."""
     lens, right = sequence.attrs, sequence.attrs["right"]
     (fx, _, cx), (_, fy, cy), _ = K = np.asarray(lens["K"], np.float64)
     distortion = np.asarray(lens["distortion"], np.float64)

@@ -1,4 +1,4 @@
-"""WebDataset: tar shards, a sample a frame (github.com/webdataset/webdataset)."""
+"""Export to WebDataset: tar shards with a sample per frame (github.com/webdataset/webdataset)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SHARD_BYTES = 1 << 30
 
 
 def write_shards(dataset: Dataset, target: Path) -> None:
-    """Tar shards with a sample a frame: `NNNNNN_TTTT.rgb.png`, `.FIELD.npy` and `.json` (the attributes).
+    """Writes `SIDE-NNNNN.tar` with a sample per frame: `NNNNNN_TTTT.rgb.png`, `.FIELD.npy` and `.json`.
 
-    A second lens's pictures are `.rgb_right.png`. Shards are `SIDE-NNNNN.tar`, sides as the dataset is split.
+    Pictures of a right camera are `.rgb_right.png`; `.json` contains the attributes.
     """
     for side, positions in group_by_side(dataset).items():
         samples = _samples(dataset, positions)

@@ -1,4 +1,4 @@
-"""What a sequence will take is said before it is begun."""
+"""Forecasts of a sequence's memory."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from synth.job import reader
     ],
 )
 def test_memory_is_what_was_measured(keys: list[str], measured_mb: float) -> None:
-    said = size_forecast.estimate_memory(reader.load_job("demo", keys)) / 1e6
-    assert measured_mb < said < 1.5 * measured_mb
+    estimate_mb = size_forecast.estimate_memory(reader.load_job("demo", keys)) / 1e6
+    assert measured_mb < estimate_mb < 1.5 * measured_mb
 
 
-def test_a_sequence_that_no_worker_can_hold_is_refused_before_it_begins(tmp_path: Path) -> None:
+def test_a_sequence_too_large_for_a_worker_is_refused_before_it_begins(tmp_path: Path) -> None:
     job = reader.load_job("demo", ["sequences=1", "frames=10000"])
-    with pytest.raises(UserError, match=r"10000 frames takes about .* GB of memory .* --workers 1"):
+    with pytest.raises(UserError, match=r"10000 frames needs about .* GB of memory .* --workers 1"):
         run_job(job, tmp_path / "out", Options(workers=2, memory_gb=4), Silent())
     assert not (tmp_path / "out").exists()
-    size_forecast.refuse_if_too_long(job, None, 1)  # where memory can't be known, nothing is refused
+    size_forecast.refuse_if_too_long(job, None, 1)  # memory is unknown: nothing is refused

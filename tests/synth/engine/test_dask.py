@@ -1,4 +1,4 @@
-"""The Dask engine: same dataset as on one machine, and words for what is missing."""
+"""The Dask engine: errors of its configuration, and warnings about open clusters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from synth.job.schema import Job
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
 
 
-def test_no_scheduler_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("synth.engine.dask._CONNECT", "1s")
     with pytest.raises(UserError, match="no Dask scheduler answers"):
         run.run_job(JOB, tmp_path / "out", options("sequence", engine="dask://127.0.0.1:9"), Silent())
@@ -26,12 +26,12 @@ def test_no_scheduler_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch
     ("text", "message"),
     [
         (None, "is neither local, dask://host:port, tls://host:port nor a file"),
-        ("cores: 4\nmemory: 8GB\n", "how many `jobs`"),
+        ("cores: 4\nmemory: 8GB\n", "contain `jobs`"),
         ("jobs: 4\n", "cores and memory"),
         ("jobs: [", "not YAML"),
     ],
 )
-def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: str) -> None:
+def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
     if text is not None:
         (tmp_path / "slurm.yaml").write_text(text)
     with pytest.raises(UserError, match=message):
@@ -39,7 +39,7 @@ def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: s
 
 
 @pytest.mark.parametrize(
-    ("cluster", "said"),
+    ("cluster", "warning"),
     [
         ("dask://127.0.0.1:8786", ""),
         ("dask://localhost:8786", ""),
@@ -52,6 +52,6 @@ def test_slurm_files_that_do_not_do(tmp_path: Path, text: str | None, message: s
         ({"interface": "ib0", "security": True}, ""),
     ],
 )
-def test_who_could_run_code_is_said(cluster: str | dict[str, object], said: str) -> None:
-    assert said in open_to(cluster)
-    assert bool(said) == bool(open_to(cluster))
+def test_an_open_cluster_causes_a_warning(cluster: str | dict[str, object], warning: str) -> None:
+    assert warning in open_to(cluster)
+    assert bool(warning) == bool(open_to(cluster))
