@@ -1,4 +1,4 @@
-"""Stores damaged as disks, copies and people do it: verify finds what changes a value."""
+"""Stores with random damage: `synth verify` finds all damage that changes a value."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
-    """One damage of a kind; it may change no value, a bit of compression's slack."""
+    """Damages a store; some damage changes no value, e.g. an unused bit of the compressed data."""
     every = sorted(path for path in store.rglob("*") if path.is_file())
     chunks = [path for path in every if "c" in path.relative_to(store).parts]
     among = every if kind in ("bit", "emptied", "removed") else chunks
@@ -55,11 +55,11 @@ def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
         path.unlink()
     elif kind == "zeroed":
         path.write_bytes(data[:at] + bytes(len(data[at : at + 512])) + data[at + 512 :])
-    elif kind == "swapped":  # each is whole, and stands for other frames or another field
+    elif kind == "swapped":  # both files are intact, but of other frames or another field
         other = chunks[int(rng.integers(len(chunks)))]
         path.write_bytes(other.read_bytes())
         other.write_bytes(data)
-    elif kind == "rewritten":  # through Zarr itself, so that every chunk's own checksum is right
+    elif kind == "rewritten":  # by Zarr, so that every chunk's checksum is right
         group = zarr.open_group(str(store), mode="r+")
         array: Any = group[str(rng.choice(sorted(group.attrs["field_hashes"])))]
         place = tuple(int(rng.integers(length)) for length in array.shape)
@@ -98,7 +98,7 @@ def same(original: Path, copy: Path) -> bool:
             and np.array_equal(one[...], two[...])
             for one, two in ((first[name], second[name]) for name in first.attrs["field_hashes"])
         )
-    except Exception:  # whatever it is, a reader cannot read
+    except Exception:  # any error: it can't be read
         return False
 
 

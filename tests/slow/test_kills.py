@@ -1,4 +1,4 @@
-"""Runs that are killed, here and on a cluster, end with the bytes of one that was left in peace."""
+"""Killed and resumed runs, on this machine and on a cluster, give the bytes of an undisturbed run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KILLS = 6
 
 
 def children(pid: int) -> list[int]:
-    """Processes that `pid` started; only ever of a run that this test started itself."""
+    """Processes started by `pid`, which is always a run started by this test."""
     with suppress(FileNotFoundError):
         tasks = list(Path(f"/proc/{pid}/task").iterdir())
         return [int(child) for task in tasks for child in (task / "children").read_text().split()]
@@ -38,7 +38,7 @@ def children(pid: int) -> list[int]:
 
 
 def kill(run: subprocess.Popen[bytes], kind: str, rng: np.random.Generator) -> bool:
-    """Kills a worker, the engine or both; whether there was something to kill."""
+    """Kills a worker, the engine or both; returns whether there was one."""
     workers = children(run.pid)
     if kind != "engine":
         if not workers:
@@ -60,7 +60,7 @@ def test_a_run_that_is_killed_again_and_again_makes_the_same_dataset(tmp_path: P
         if run is None or run.poll() is not None:
             if root.exists():
                 Folder(root).clear_failures()
-            if len(list(root.glob("*.zarr"))) == JOB.sequences:  # all done before all kills
+            if len(list(root.glob("*.zarr"))) == JOB.sequences:  # all are done before the last kill
                 shutil.rmtree(root / "000002.zarr")
             run, starts = start(root, JOB, "slow"), starts + 1
             assert starts < 10 * KILLS, "runs end before anything can be killed"
@@ -106,7 +106,7 @@ def local_cluster(workers: int) -> Iterator[tuple[str, list[subprocess.Popen[byt
             process.wait()
 
 
-def test_a_lost_dask_worker_costs_nothing_but_time(tmp_path: Path) -> None:
+def test_a_lost_dask_worker_changes_no_byte(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
     root = tmp_path / "cluster"
     with local_cluster(2) as (address, processes):

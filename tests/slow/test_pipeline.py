@@ -1,4 +1,4 @@
-"""The real pipeline, small: its labels hold, and a killed run ends with the bytes of an undisturbed one."""
+"""The whole pipeline on a small job: its labels hold; a killed run gives the bytes of an undisturbed one."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ render: {size: [96, 72], spp: 1}
 
 def start(job: Path, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "synth", "render", str(job), "-o", str(out), "--workers", "1"]
-    return subprocess.Popen(
-        command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    )
+    quiet, errors = subprocess.DEVNULL, subprocess.PIPE
+    return subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=errors)
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
@@ -46,17 +45,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_dataset_passes_its_own_checks(undisturbed: Path) -> None:
+def test_the_dataset_passes_all_checks_and_traction_sums_to_the_force(undisturbed: Path) -> None:
     report = verify.verify_dataset(undisturbed)
     assert report.good, [check.failures for check in report.checks]
-
-
-def test_pixels_carry_the_applied_force(undisturbed: Path) -> None:
     for sequence in Dataset(undisturbed):
         total = np.einsum("thwk,hw->tk", sequence["traction"][...], sequence["area"][...])
         force = sequence["force"][...]
         assert np.linalg.norm(force, axis=1).max() > 0
-        # One pixel is 0.4 mm here, a tenth of the contact: quadrature costs more than the 1% of real sizes.
+        # A pixel of 0.4 mm is a tenth of the contact: the quadrature error exceeds the 1% of larger pictures.
         assert np.abs(total - force).max() <= 0.03 * np.linalg.norm(force, axis=1).max()
 
 

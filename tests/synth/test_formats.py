@@ -1,4 +1,4 @@
-"""Format versions: this one and the one before are read; what is older or newer is refused in one line."""
+"""Format versions: the current and the previous one are read; older and newer ones are refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from synth.errors import UserError
 from synth.formats import FIRST, FOLDER, check_format
 
 
-def test_a_reader_reads_its_format_and_the_one_before_but_none_of_before_the_first() -> None:
+def test_a_reader_accepts_its_format_and_the_previous_but_none_before_the_first() -> None:
     newest = FIRST + 2
     for found in (newest, newest - 1):
         check_format(found, newest, "x")
@@ -21,7 +21,7 @@ def test_a_reader_reads_its_format_and_the_one_before_but_none_of_before_the_fir
             check_format(found, current, "x")
 
 
-def test_a_dataset_of_before_formats_had_a_version_is_refused(tmp_path: Path) -> None:
+def test_a_dataset_without_a_format_version_is_refused(tmp_path: Path) -> None:
     before = {"identity": "", "job": {"fem": {"tip": "flat"}}, "generators": []}
     (tmp_path / "dataset.json").write_text(json.dumps(before))
     with pytest.raises(UserError, match=f"written by format 1; this version reads {FOLDER}"):

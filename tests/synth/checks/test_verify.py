@@ -1,4 +1,4 @@
-"""Verify: a good dataset passes, and each invariant has a damage that it alone must find."""
+"""`synth verify`: a good dataset passes, and each check finds the fault that it is made for."""
 
 from __future__ import annotations
 
@@ -70,15 +70,15 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
     ],
 )
 def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fault: str, check: str) -> None:
-    # One eye has recovered flow without recovered motion in space, which the stand-in doesn't make.
-    one_eye = Job(seed=1, sequences=1, frames=5, render={"size": (96, 72)})
-    job = one_eye if fault == "recovered_rest" else JOB.model_copy(update={"sequences": 1})
+    # A monocular job has recovered flow without recovered motion in space, which `fake_work` doesn't make.
+    monocular = Job(seed=1, sequences=1, frames=5, render={"size": (96, 72)})
+    job = monocular if fault == "recovered_rest" else JOB.model_copy(update={"sequences": 1})
     in_process(job, tmp_path / "out", fake_work.wrong(fault))
     found = next(one for one in verify.verify_dataset(tmp_path / "out").checks if one.name == check)
     assert not found.good
     assert found.offender.startswith("000000.zarr: ")
     assert found.cpu_s > 0
-    # What says only whether bytes are those that were written sees nothing here.
+    # Checks of integrity pass, as the files are as they were written.
     assert not failing(tmp_path / "out") & {"checksum", "seal", "schema", "readable", "dataset", "finite"}
 
 
@@ -111,7 +111,7 @@ def swapped_sequences(root: Path) -> None:
 
 
 def replaced_value(root: Path) -> None:
-    """Through Zarr, which makes its own checksums good."""
+    """Changes a value through Zarr, which updates the chunk's checksum."""
     array = zarr.open_group(str(root / "000001.zarr"), mode="r+")["depth"]
     array[3, 5, 5] = np.float32(array[3, 5, 5]) + np.float32(1e-3)
 

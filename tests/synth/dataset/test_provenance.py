@@ -1,4 +1,4 @@
-"""What made a sequence is named: code, networks and packages."""
+"""The provenance of a sequence includes its code, networks and packages."""
 
 from __future__ import annotations
 
@@ -9,8 +9,12 @@ from sources import imports
 from synth.dataset import provenance
 
 
-def test_what_decides_values_is_counted(tmp_path: Path) -> None:
-    for name in ("flow/tvl1.py", "flow/toolnet.pt", "fem/mesh/lattice.py", "engine/run.py", "flow/README.md"):
+def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> None:
+    files = {
+        **{"engine/run.py": False, "flow/README.md": False},
+        **{"flow/tvl1.py": True, "flow/toolnet.pt": True, "fem/mesh/lattice.py": True},
+    }
+    for name in files:
         file = tmp_path / "synth" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text("x = 1\n")
@@ -19,13 +23,7 @@ def test_what_decides_values_is_counted(tmp_path: Path) -> None:
         return provenance.code("synth/flow", "synth/fem", home=tmp_path)
 
     before = now()
-    for name, counts in (
-        ("engine/run.py", False),
-        ("flow/README.md", False),
-        ("flow/tvl1.py", True),
-        ("flow/toolnet.pt", True),
-        ("fem/mesh/lattice.py", True),
-    ):
+    for name, counts in files.items():
         (tmp_path / "synth" / name).write_text("x = 2\n")
         assert (now() != before) == counts, name
         before = now()
@@ -33,13 +31,13 @@ def test_what_decides_values_is_counted(tmp_path: Path) -> None:
     assert now() != before
 
 
-def test_rooms_that_a_sequence_is_made_with_are_counted_or_decide_no_value() -> None:
+def test_packages_that_a_sequence_is_made_with_are_hashed_or_have_no_effect_on_values() -> None:
     made = {
         "/".join(name.split(".")[:2])
-        for room in provenance._MAKING
-        for path in (provenance.HOME / room).rglob("*.py")
+        for package in provenance._MAKING
+        for path in (provenance.HOME / package).rglob("*.py")
         for name in imports(path)
         if name.startswith("synth.")
     }
-    deciding_none = {f"synth/{name}" for name in ("errors", "fields", "plugins", "system", "dataset")}
-    assert made - deciding_none == set(provenance._MAKING)
+    without_effect = {f"synth/{name}" for name in ("errors", "fields", "plugins", "system", "dataset")}
+    assert made - without_effect == set(provenance._MAKING)

@@ -1,4 +1,4 @@
-"""The sequence store: what goes in comes out, nothing unfinished is visible, damage is named."""
+"""The sequence store: values are read as written, nothing unfinished is visible, damage is reported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fake_work import attributes, sequence
 
 from synth.checks import contents
 from synth.dataset import fast_read, store
-from synth.dataset.store import Dataset, Writer, open_sequence
+from synth.dataset.store import Dataset, Sequence, Writer, open_sequence
 from synth.errors import NotFinite, UserError
 from synth.fields import FIELDS
 from synth.job.schema import Job
@@ -22,21 +22,21 @@ from synth.system.stopwatch import Stopwatch
 JOB = Job(seed=5, sequences=2, frames=7, render={"size": (40, 30)}, flow={"backend": "ideal"})
 
 
-def quiet(stage: str, done: int, of: int) -> None:
-    """Progress that nobody looks at."""
+def make(job: Job, index: int, folder: Path) -> Sequence:
+    sequence(job, index, folder, lambda *_: None)
+    return open_sequence(folder / f"{index:06d}.zarr")
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for index in range(JOB.sequences):
-        sequence(JOB, index, tmp_path, quiet)
+        make(JOB, index, tmp_path)
     return tmp_path
 
 
 def test_values_come_back_as_they_were_put(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)  # several shards, the last one not full
-    sequence(JOB, 2, root, quiet)
-    found = open_sequence(root / "000002.zarr")
+    found = make(JOB, 2, root)
     rng = np.random.default_rng((5, 2))
     assert np.array_equal(found["force"][:], rng.normal(size=(7, 3)))
     assert np.array_equal(found["tissue"][:], rng.random((30, 40)) > 0.2)
@@ -55,17 +55,16 @@ def test_values_come_back_as_they_were_put(root: Path, monkeypatch: pytest.Monke
         assert found[name].shape == FIELDS[name].shape(7, (30, 40))
 
 
-def test_timings_do_not_count_and_everything_else_does(root: Path) -> None:
+def test_the_content_hash_depends_on_all_attributes_but_timings_and_versions(root: Path) -> None:
     attrs = open_sequence(root / "000000.zarr").attrs
     assert store.content_hash({**attrs, "timings": {}, "versions": {}}) == attrs["content_hash"]
     for key in attrs.keys() - {"timings", "versions", "content_hash", "seal_hash"}:
         assert store.content_hash({**attrs, key: "edited"}) != attrs["content_hash"], key
 
 
-def test_single_frames_are_those_that_zarr_reads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_frames_equal_those_read_by_zarr(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_SHARD_BYTES", 3 * 40 * 30 * 8)
-    sequence(JOB, 2, root, quiet)
-    found, plain = open_sequence(root / "000002.zarr"), zarr.open_group(str(root / "000002.zarr"), mode="r")
+    found, plain = make(JOB, 2, root), zarr.open_group(str(root / "000002.zarr"), mode="r")
     for name in found.fields:
         column, array = found[name], plain[name]
         fast = fast_read.open_frames(array, root / "000002.zarr" / name)
@@ -87,14 +86,11 @@ def writer(folder: Path) -> Writer:
     return Writer(folder, 9, frames=2, size=(4, 5), job=JOB)
 
 
-def test_nan_is_refused_with_field_and_frame(tmp_path: Path) -> None:
+def test_nan_and_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
     sink = writer(tmp_path)
     sink.put_frame("depth", 0, np.ones((4, 5)))
     with pytest.raises(NotFinite, match="depth, frame 1"):
         sink.put_frame("depth", 1, np.where(np.arange(20).reshape(4, 5) == 13, np.nan, 1.0))
-
-
-def test_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
     sink = writer(tmp_path)
     with pytest.raises(ValueError, match="shape"):
         sink.put_frame("depth", 0, np.ones((5, 4)))
@@ -106,11 +102,10 @@ def test_wrong_shape_type_order_and_name_are_refused(tmp_path: Path) -> None:
         sink.put("colour", np.ones(3))
 
 
-def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_path: Path) -> None:
+def test_float16_is_read_as_float32_within_the_stated_error(root: Path, tmp_path: Path) -> None:
     job = JOB.model_copy(update={"store": JOB.store.model_copy(update={"flow": "float16"})})
     (tmp_path / "half").mkdir()
-    sequence(job, 0, tmp_path / "half", quiet)
-    exact, half = open_sequence(root / "000000.zarr"), open_sequence(tmp_path / "half/000000.zarr")
+    exact, half = open_sequence(root / "000000.zarr"), make(job, 0, tmp_path / "half")
     assert (half["flow"].dtype, half["flow"].stored) == ("float32", "float16")
     assert half["depth"].stored == "float32"
     assert half["flow"][2].dtype == np.float32
@@ -122,11 +117,9 @@ def test_half_floats_are_read_as_floats_within_the_stated_error(root: Path, tmp_
     assert all(measure.good for _, measure in contents.check_values(half, [0], False, Stopwatch()))
 
 
-def test_a_job_says_which_fields_are_kept(tmp_path: Path) -> None:
+def test_a_job_sets_which_fields_are_stored(tmp_path: Path) -> None:
     job = Job.model_validate({**JOB.model_dump(), "store": {"without": ["depth"]}})
-    sequence(job, 0, tmp_path, quiet)
-    found = open_sequence(tmp_path / "000000.zarr")
-    assert "depth" not in found
+    assert "depth" not in make(job, 0, tmp_path)
     assert not (tmp_path / "000000.zarr/depth").exists()
     with pytest.raises(ValueError, match="rgb"):
         Job.model_validate({"store": {"without": ["rgb"]}})
@@ -146,7 +139,7 @@ def test_nothing_is_visible_before_the_seal(tmp_path: Path) -> None:
         Dataset(tmp_path)
 
 
-def test_foreign_and_truncated_stores_are_one_line(root: Path) -> None:
+def test_foreign_and_truncated_stores_are_refused(root: Path) -> None:
     foreign = root / "foreign.zarr"
     zarr.create_group(str(foreign), zarr_format=3)
     with pytest.raises(UserError):
@@ -162,7 +155,7 @@ def test_foreign_and_truncated_stores_are_one_line(root: Path) -> None:
 
 
 @pytest.mark.parametrize("cut", [0, 1, 100, -1])
-def test_a_cut_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cut: int) -> None:
+def test_a_truncated_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cut: int) -> None:
     shard = root / "000000.zarr/flow/c/0/0/0/0"
     data = bytearray(shard.read_bytes())
     if cut >= 0:
@@ -176,7 +169,7 @@ def test_a_cut_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cut: int
         [open_sequence(root / "000000.zarr")["flow"][t] for t in range(7)]
 
 
-def test_a_zip_reads_as_the_folder_does_and_names_what_it_lacks(root: Path, tmp_path: Path) -> None:
+def test_a_zip_equals_its_folder_and_missing_files_are_named(root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "out of it.zip"
     with zipfile.ZipFile(archive, "w") as target:
         for file in sorted(root.rglob("*.zarr/**/*")):

@@ -1,4 +1,4 @@
-"""A dataset rendered through SLURM, the real one, on this machine: lost jobs and nodes change no byte."""
+"""A dataset rendered through a real SLURM on this machine: lost jobs and nodes change no byte."""
 
 from __future__ import annotations
 
@@ -15,17 +15,8 @@ from synth.job.schema import Job
 
 pytestmark = pytest.mark.trial
 
-JOB = Job.model_validate(
-    {
-        "seed": 7,
-        "sequences": 5,
-        "frames": 3,
-        "render": {"size": [64, 48], "spp": 2},
-        "anatomy": {"vertices": 2500},
-        "fem": {"tets": 300},
-        "flow": {"backend": "ideal"},
-    }
-)
+SMALL = {"render": {"size": [64, 48], "spp": 2}, "anatomy": {"vertices": 2500}, "fem": {"tets": 300}}
+JOB = Job.model_validate({"seed": 7, "sequences": 5, "frames": 3, "flow": {"backend": "ideal"}, **SMALL})
 DESCRIBED = """
 jobs: 2
 cores: 1
@@ -50,7 +41,7 @@ class Disturbing(Silent):
         if self._once.acquire(blocking=False):
             slurm_cluster.call("scontrol", "update", f"nodename={self.node}", "state=drain", "reason=test")
             running = slurm_cluster.call("squeue", "-h", "-t", "running", "-o", "%i").split()
-            assert len(running) == 2, "both slots should be at work"
+            assert len(running) == 2, "both slots should be busy"
             self.killed = running[0]
             slurm_cluster.call("scancel", "--signal=KILL", "--full", self.killed)
             slurm_cluster.call("scancel", self.killed)

@@ -1,4 +1,4 @@
-"""Status and forecast: what they say is what is on disk, during a run and after it."""
+"""Status and forecast agree with the files, during a run and after it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
     run = start(root, JOB, "slow")
     wait_for(lambda: bool(root.exists() and (root / ".run/progress.json").exists()))
     wait_for(lambda: bool(status.read_status(root).in_flight) or status.read_status(root).done == 6)
-    seen = status.read_status(root)
-    assert seen.total == 6
-    assert seen.running or seen.done == 6
+    during = status.read_status(root)
+    assert during.total == 6
+    assert during.running or during.done == 6
     assert run.wait(timeout=60) == 0
     after = status.read_status(root)
     assert (after.done, after.failed, after.running, after.in_flight) == (6, {}, False, {})
@@ -39,13 +39,13 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
 def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
     job = JOB.model_copy(update={"sequences": 7})
     engine.run_job(job, tmp_path / "out", options("trying"), Silent())
-    seen = status.read_status(tmp_path / "out")
-    assert (seen.done, seen.failed) == (5, {"the load is past the material's range": 2})
+    found = status.read_status(tmp_path / "out")
+    assert (found.done, found.failed) == (5, {"the load is past the material's range": 2})
     shown = CliRunner().invoke(app, ["status", str(tmp_path / "out"), "--json"]).stdout
     assert json.loads(shown)["done"] == 5
 
 
-def test_what_is_left_goes_by_the_latest_sequences(tmp_path: Path) -> None:
+def test_the_time_left_is_estimated_from_the_latest_sequences(tmp_path: Path) -> None:
     def left(workers: int, todo: int, *ends: float) -> float | None:
         journal = Journal(Folder(tmp_path), workers, Silent().account)
         journal._left = todo
@@ -53,7 +53,7 @@ def test_what_is_left_goes_by_the_latest_sequences(tmp_path: Path) -> None:
             journal.pace(at)
         return journal.left_s()
 
-    assert left(2, 10, 20.0, 21.0) is None, "the first of each worker also compile"
+    assert left(2, 10, 20.0, 21.0) is None, "the first sequence of each worker includes compilation"
     assert left(2, 10, 20.0, 21.0, 25.0, 26.0) == pytest.approx(10 * 2.5)
     slow, fast = [10.0 * k for k in range(1, 101)], [1000.0 + 2.0 * k for k in range(1, 101)]
     assert left(1, 50, *slow, *fast) == pytest.approx(100)

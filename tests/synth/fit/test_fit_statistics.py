@@ -1,4 +1,4 @@
-"""Statistics of pictures that were drawn with what they are to find, and a camera that is found again."""
+"""Statistics of drawn pictures with known parameters, and recovery of a known camera."""
 
 from __future__ import annotations
 
@@ -22,21 +22,15 @@ SIZE = (360, 480)
 
 def encoded(linear: np.ndarray) -> np.ndarray:
     """The sRGB picture of linear light."""
-    value = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
-    )
+    root = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
+    value = np.where(linear <= 0.0031308, 12.92 * linear, root)
     return np.clip(np.rint(255 * value), 0, 255).astype(np.uint8)
 
 
-def tissue() -> np.ndarray:
-    """Plain linear tissue (H, W, 3) with a little grain, so that nothing is exactly flat."""
-    grain = 1 + 0.01 * np.random.default_rng(0).standard_normal(SIZE)
-    return np.array([0.8, 0.6, 0.4]) * grain[..., None]
-
-
 def lines(count: int, width_px: int) -> np.ndarray:
-    """Tissue crossed by horizontal red vessels."""
-    picture = tissue()
+    """Linear light of tissue with a little grain, crossed by horizontal red vessels, (H, W, 3)."""
+    grain = 1 + 0.01 * np.random.default_rng(0).standard_normal(SIZE)
+    picture = np.array([0.8, 0.6, 0.4]) * grain[..., None]
     for y in np.linspace(20, SIZE[0] - 20, count).astype(int):
         cv2.line(picture, (0, int(y)), (SIZE[1], int(y)), (0.75, 0.12, 0.08), width_px)
     return picture
@@ -46,16 +40,15 @@ def test_noise_of_known_size_is_found_and_blur_lowers_sharpness() -> None:
     picture = encoded(lines(8, 3)).astype(float)
     noise = 3 * np.random.default_rng(1).standard_normal(SIZE)[..., None]
     usable = np.ones(SIZE, bool)
-    assert measure(np.clip(picture + noise, 0, 255).astype(np.uint8), usable)["noise"] == pytest.approx(
-        3, rel=0.15
-    )
+    noisy = np.clip(picture + noise, 0, 255).astype(np.uint8)
+    assert measure(noisy, usable)["noise"] == pytest.approx(3, rel=0.15)
     sharp = measure(picture.astype(np.uint8), usable)
     soft = measure(cv2.GaussianBlur(picture, (0, 0), 1.5).astype(np.uint8), usable)
     assert soft["sharpness"] < 0.7 * sharp["sharpness"]
     assert soft["noise"] < sharp["noise"]
 
 
-def test_colours_of_the_same_tissue_are_found_again() -> None:
+def test_colours_of_the_same_tissue_are_recovered() -> None:
     rng = np.random.default_rng(2)
     blood = rng.random((9000, 1)) ** 2
     light = np.array([0.95, 0.8, 0.5]) * np.exp(-blood * [0.3, 1.9, 2.3]) * rng.uniform(0.5, 1.1, (9000, 1))
@@ -67,7 +60,7 @@ def test_colours_of_the_same_tissue_are_found_again() -> None:
 
 
 @pytest.mark.slow
-def test_the_camera_of_a_photograph_of_another_brain_is_found_again() -> None:
+def test_the_camera_of_a_photograph_of_another_brain_is_recovered() -> None:
     frame = fitting.render("pale", 400, MM, 7)
     rgb = frame.record({"vignette": 0.4, "blur": 1.0, "full_well": 3000.0, "read_noise": 6.0})
     packed = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Photographs as they come: what is masked, what is refused, what their packing says."""
+"""Photographs of cortex: detection of the usable region, refused files, compression."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
     return path
 
 
-def test_the_opening_is_found_and_the_instrument_left_out() -> None:
+def test_the_opening_is_detected_without_the_instrument() -> None:
     with_tool, truth = cortex(scene(), 0.08), opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
@@ -55,7 +55,7 @@ def test_the_opening_is_found_and_the_instrument_left_out() -> None:
     assert (cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
 
 
-def test_the_tables_of_a_jpeg_are_read_and_pack_alike() -> None:
+def test_the_compression_of_a_jpeg_is_read_and_reproduced() -> None:
     rgb = scene()
     packed = io.BytesIO()
     Image.fromarray(rgb).save(packed, "JPEG", quality=60, subsampling="4:2:0")
@@ -65,7 +65,7 @@ def test_the_tables_of_a_jpeg_are_read_and_pack_alike() -> None:
     assert np.abs(found.apply(rgb).astype(int) - once).mean() < 0.05
 
 
-def test_what_cannot_be_used_is_refused(tmp_path: Path) -> None:
+def test_unusable_photographs_are_refused(tmp_path: Path) -> None:
     dark = written(tmp_path / "dark.png", np.zeros((300, 400, 3), np.uint8))
     small = written(tmp_path / "small.png", scene(200, 150))
     photo = written(tmp_path / "photo.png", scene())
@@ -75,8 +75,8 @@ def test_what_cannot_be_used_is_refused(tmp_path: Path) -> None:
             read_photograph(path, 35.0, drawn)
 
 
-@pytest.mark.skipif(not REFERENCE.exists(), reason="the reference photograph is not at hand")
-def test_the_cortex_of_the_reference_photograph_is_found(tmp_path: Path) -> None:
+@pytest.mark.skipif(not REFERENCE.exists(), reason="the reference photograph is missing")
+def test_the_cortex_of_the_reference_photograph_is_detected(tmp_path: Path) -> None:
     photo = Path(shutil.copy(REFERENCE, tmp_path / "photo.jpg"))
     found = read_photograph(photo, 110.0, None)
     assert 1200 < found.cortex_mm2 < 2400, "the opening is some 55 mm wide"

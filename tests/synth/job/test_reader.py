@@ -1,4 +1,4 @@
-"""Job files: what is written is what is read, and every mistake is named at its place."""
+"""Job files: they are read as written, and every error is reported with its place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ anatomy:
 """
 
 
-def test_every_mistake_is_named_at_its_line_and_column() -> None:
+def test_every_error_is_reported_with_line_and_column() -> None:
     with pytest.raises(UserError) as caught:
         reader.parse_job(BAD, "job.yaml", Path())
     places = [": ".join(line.split(": ")[:2]) for line in str(caught.value).splitlines()]
@@ -48,7 +48,7 @@ def test_what_is_not_a_job_is_refused(text: str) -> None:
         reader.parse_job(text, "job.yaml", Path())
 
 
-def test_overrides_win_and_name_themselves_when_wrong() -> None:
+def test_overrides_take_precedence_and_are_named_if_wrong() -> None:
     overrides = ["render.spp=8", "render.size=[64, 48]", "fem.load=0.1"]
     job = reader.parse_job("render: {spp: 2}", "job.yaml", Path(), overrides)
     assert (job.render.spp, job.render.size, job.fem.load) == (8, (64, 48), (0.1, 0.1))
@@ -63,6 +63,6 @@ def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
     assert reader.parse_job(writer.dump_job(job), "job.yaml", Path()) == job
 
 
-def test_identity_is_of_what_shapes_a_sequence() -> None:
+def test_the_identity_does_not_depend_on_the_number_of_sequences() -> None:
     assert identity.identify_job(Job(sequences=3)) == identity.identify_job(Job(sequences=30))
     assert identity.identify_job(Job(seed=1)) != identity.identify_job(Job(seed=2))

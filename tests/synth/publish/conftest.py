@@ -1,4 +1,4 @@
-"""One dataset for all tests of this folder."""
+"""One dataset for all tests in this folder."""
 
 from __future__ import annotations
 
@@ -14,24 +14,17 @@ from synth.job.schema import Job
 from synth.publish import croissant
 
 ABOUT = {
-    "title": "Pulls: a test",
-    "licence": "cc-by-4.0",
-    "summary": "Made to be read.",
-    "authors": ["A. Person"],
+    **{"title": "Pulls: a test", "licence": "cc-by-4.0"},
+    **{"summary": "Made to be read.", "authors": ["A. Person"]},
 }
 
 
 @pytest.fixture(scope="session")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six sequences of two eyes, with sides, card and description; not to be written to."""
+    """Six stereo sequences, with sides, card and description; not to be modified."""
     out = tmp_path_factory.mktemp("publish") / "out"
-    job = Job(
-        sequences=6,
-        frames=3,
-        render={"size": (48, 36), "stereo_mm": 24.0},
-        flow={"backend": "ideal"},
-        card=ABOUT,
-    )
+    render = {"size": (48, 36), "stereo_mm": 24.0}
+    job = Job(sequences=6, frames=3, render=render, flow={"backend": "ideal"}, card=ABOUT)
     in_process(job, out, consistent)
     index.split_anew(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
     croissant.write_croissant(Folder(out))

@@ -1,4 +1,4 @@
-"""The card: a hub and the public validator read it, and its numbers are the dataset's own."""
+"""The card: `datasets` and the Croissant validator can read it, and its numbers are those of the dataset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from synth.dataset.store import Dataset
 from synth.publish import card, croissant, picture
 
 
-def test_the_card_is_of_this_dataset(root: Path) -> None:
+def test_the_card_agrees_with_the_dataset(root: Path) -> None:
     text = (root / "README.md").read_text("utf-8")
     front = YAML(typ="safe").load(text.split("---")[1])
     assert (front["pretty_name"], front["license"]) == ("Pulls: a test", "cc-by-4.0")
@@ -30,22 +30,22 @@ def test_the_card_is_of_this_dataset(root: Path) -> None:
     assert [float(cell) for cell in line.split("|")[2:5]] == pytest.approx(
         [min(stiffness), float(np.median(stiffness)), max(stiffness)], rel=5e-3
     )
-    # The first are shown, the others named; a sequence's and the users' own are no file of it.
+    # All pictures shown and all files named in it exist.
     for named in re.findall(r"\]\((\S+)\)|`(\w+\.(?:json|parquet|yaml|mp4))`", text):
         assert (root / (named[0] or named[1])).is_file(), named
 
 
-def test_the_page_holds_all_that_it_shows(root: Path, tmp_path: Path) -> None:
+def test_the_page_is_self_contained(root: Path, tmp_path: Path) -> None:
     text = card.write_page(root, tmp_path / "page.html").read_text("utf-8")
     assert text.count("data:image/jpeg") == 6
     assert text.count("<svg") == len(list((root / "card").glob("*.svg"))) > 0
     ids = re.findall(r' id="(\w+-\w+)"', text)
-    assert len(ids) == len(set(ids)), "pictures of one page share no part"
+    assert len(ids) == len(set(ids)), "ids of SVG pictures on one page are unique"
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_public_validator_is_content_and_reads_the_records(root: Path) -> None:
+def test_the_croissant_validator_finds_no_issue_and_reads_the_records(root: Path) -> None:
     import mlcroissant
 
     dataset = mlcroissant.Dataset(jsonld=str(root / croissant.NAME))
@@ -78,7 +78,7 @@ def test_a_picture_shows_flow_and_load_where_they_are(root: Path, tmp_path: Path
     at = np.unravel_index(load.argmax(), load.shape)
     force = drawn[-height:, -width:]
     red, _, blue = force[at].astype(int)
-    assert red > blue + 50, "yellow where the load is greatest"
+    assert red > blue + 50, "yellow at the greatest load"
     assert np.array_equal(drawn[-height:, :width], sequence["rgb"][2])
     words = ["view", str(root), "--frame", "0", "-f", str(picture.strongest(sequence)), "--save"]
     assert CliRunner().invoke(app, [*words, str(tmp_path / "two.png")]).exit_code == 0

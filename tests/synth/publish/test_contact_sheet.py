@@ -1,4 +1,4 @@
-"""The contact sheet of a job, through the command that makes it."""
+"""The contact sheet of a job, by its command."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from synth.cli import app
 
 
 @pytest.mark.slow
-def test_preview_draws_scenarios_and_says_what_they_cost(tmp_path: Path) -> None:
+def test_preview_draws_scenarios_and_prints_their_cost(tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.png"
     small = ["render.size=[80, 64]", "sequences=40", "frames=6", "render.spp=4", "anatomy.vertices=900"]
     done = CliRunner().invoke(app, ["preview", "tiny", *small, "-n", "3", "-o", str(sheet), "--json"])

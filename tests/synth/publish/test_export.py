@@ -1,4 +1,4 @@
-"""Exports as the libraries that they are for read them, and as the geometry says."""
+"""Exports, read by the libraries that they are made for, and checked against the geometry."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
     with np.load(files[0]) as first, np.load(files[1]) as second:
         frames, nodes, _ = first["disp2d"].shape
         assert (frames, first["force_mag"].shape) == (3, (3, nodes))
-        assert second["disp2d"].shape[1] == nodes, "that code takes all files to have the nodes of the first"
+        assert second["disp2d"].shape[1] == nodes, "that code assumes the same nodes in all files"
         total_n = np.linalg.norm(sequence["force"][:], axis=1) / 1000
         assert first["force_mag"].max(axis=1) == pytest.approx(total_n, rel=0.02)
         column, row = first["projected_pixels"][0, 100].astype(int)
@@ -114,8 +114,8 @@ def test_datasets_gives_the_stores_values(
     several = len(list((tmp_path / "to/frames").glob("train-*.parquet"))) > 1
     assert several == (group_bytes < 100_000)
     found = datasets.load_dataset(str(tmp_path / "to"), cache_dir=str(tmp_path / "cache"))
-    told, stores = sides(root), by_index(root)
-    assert {side: {row["sequence"] for row in rows} for side, rows in found.items()} == told
+    stores = by_index(root)
+    assert {side: {row["sequence"] for row in rows} for side, rows in found.items()} == sides(root)
     height, width = stores[0].size
     features = found["train"].features
     assert features["flow"] == datasets.Array3D((height, width, 2), "float32")
@@ -141,25 +141,23 @@ def test_webdataset_gives_arrays_as_arrays(root: Path, tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset", reason="WebDataset's library is not installed")
     export_dataset(root, tmp_path / "to", "webdataset")
     shards = sorted(str(path) for path in (tmp_path / "to").glob("*.tar"))
-    stores, seen = by_index(root), 0
+    stores, count = by_index(root), 0
     for sample in webdataset.WebDataset(shards, shardshuffle=False).decode("rgb8"):
         key, t = sample["__key__"].split("_")
-        sequence, seen = stores[int(key)], seen + 1
+        sequence, count = stores[int(key)], count + 1
         for name in sequence.fields:
             stored = sequence[name][int(t)] if FIELDS[name].dims[0] == "frame" else sequence[name][:]
             given = sample[f"{name}.png" if name.startswith("rgb") else f"{name}.npy"]
             assert isinstance(given, np.ndarray)
             assert np.array_equal(given, stored), name
         assert sample["json"] == sequence.attrs
-    assert seen == sum(sequence.frames for sequence in stores.values())
-    held = {key for path in shards if "/test-" in path for key in _keys(path)}
-    assert {int(key.split("_")[0]) for key in held} == sides(root)["test"]
+    assert count == sum(sequence.frames for sequence in stores.values())
+    names = list[str]()
+    for path in (tmp_path / "to").glob("test-*.tar"):
+        with tarfile.open(path) as archive:
+            names += archive.getnames()
+    assert {int(name.split("_")[0]) for name in names} == sides(root)["test"]
     gc.collect()
-
-
-def _keys(path: str) -> set[str]:
-    with tarfile.open(path) as archive:
-        return {name.split(".")[0] for name in archive.getnames()}
 
 
 def drawn(*words: Any) -> np.ndarray:
@@ -172,14 +170,14 @@ def decoded(path: Path) -> list[tuple[float, np.ndarray]]:
         return [(float(one.time), one.to_ndarray(format="rgb24")) for one in container.decode(video=0)]
 
 
-def test_lerobots_files_are_as_its_format_says(root: Path, tmp_path: Path) -> None:
+def test_lerobot_files_follow_its_format(root: Path, tmp_path: Path) -> None:
     export_dataset(root, tmp_path / "to", "lerobot")
     info = json.loads((tmp_path / "to/meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     rows = pq.read_table(tmp_path / "to/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     values = pq.read_table(tmp_path / "to/data/chunk-000/file-000.parquet").to_pylist()
-    stores, told = by_index(root), sides(root)
-    order = [k for side in split.SIDES for k in sorted(told[side])]
+    stores, on = by_index(root), sides(root)
+    order = [k for side in split.SIDES for k in sorted(on[side])]
     assert info["splits"] == {"train": "0:3", "validation": "3:5", "test": "5:6"}
     for row in values:
         sequence = stores[order[row["episode_index"]]]
@@ -194,7 +192,7 @@ def test_lerobots_files_are_as_its_format_says(root: Path, tmp_path: Path) -> No
 
 
 def moving(out: Path, job: Job) -> list[Camera]:
-    """A plane seen by a lens with distortion, off its middle, that shifts and turns; flow by OpenCV."""
+    """Writes a sequence of a plane by a moving camera with distortion and off-centre principal point."""
     width, height = job.render.size
     K = np.array([[900.0, 0, 30.0], [0, 900.0, 19.0], [0, 0, 1]])
     bent = np.array([-0.2, 0.05, 0.001, -0.002, 0.0])
@@ -231,7 +229,7 @@ def moving(out: Path, job: Job) -> list[Camera]:
             "glare": still > 0,
         }
         for name in ("rgb", "flow", "visible", "depth"):
-            values[f"{name}_right"] = values[name]  # of which nothing is read
+            values[f"{name}_right"] = values[name]  # not used
         for name, value in values.items():
             writer.put_frame(name, t, value)
     baseline, shifted = job.render.stereo_mm, K + np.array([[0, 0, 70.0], [0, 0, 0], [0, 0, 0]])
@@ -255,21 +253,16 @@ def moving(out: Path, job: Job) -> list[Camera]:
     return cameras
 
 
-def test_endonerfs_points_are_the_scenes(tmp_path: Path) -> None:
-    """Back-projected as its readers do: c2w of axes right, up, backward; the axis at (W // 2, H // 2)."""
-    job = Job(
-        sequences=1,
-        frames=3,
-        render={"size": (64, 48)},
-        flow={"backend": "ideal"},
-        store={"extra": ["camera"]},
-    )
+def test_points_of_the_endonerf_export_are_on_the_scene(tmp_path: Path) -> None:
+    """Back-projected as by its readers: c2w of axes right, up, backward; the axis at (W // 2, H // 2)."""
+    more = {"flow": {"backend": "ideal"}, "store": {"extra": ["camera"]}}
+    job = Job(sequences=1, frames=3, render={"size": (64, 48)}, **more)
     (tmp_path / "in").mkdir()
     cameras = moving(tmp_path / "in", job)
     export_dataset(tmp_path / "in", tmp_path / "to", "endonerf")
     here = tmp_path / "to/000000"
-    told = np.load(here / "poses_bounds.npy")
-    poses, bounds = told[:, :-2].reshape(-1, 3, 5), told[:, -2:]
+    rows_17 = np.load(here / "poses_bounds.npy")
+    poses, bounds = rows_17[:, :-2].reshape(-1, 3, 5), rows_17[:, -2:]
     tall, wide, focal = poses[0, :, -1]
     rows, columns = np.mgrid[: int(tall), : int(wide)]
     first = np.eye(4)
@@ -278,57 +271,56 @@ def test_endonerfs_points_are_the_scenes(tmp_path: Path) -> None:
         c2w = np.concatenate([poses[t, :, :1], -poses[t, :, 1:3], poses[t, :, 3:4]], axis=1)
         depth = np.asarray(Image.open(here / f"depth/{t:06d}.png")).astype(float)
         mask = 1 - np.asarray(Image.open(here / f"masks/{t:06d}.png")) / 255.0
-        seen = (mask > 0) & (depth > 0)
-        assert 0.5 < seen.mean() < 1
+        visible = (mask > 0) & (depth > 0)
+        assert 0.5 < visible.mean() < 1
         flat = np.stack([(columns - wide // 2) / focal, (rows - tall // 2) / focal, np.ones_like(depth)], -1)
-        local = (flat * depth[..., None])[seen]
-        # Axes of frame 0's camera, right, up and backward; brought to the scene's own.
+        local = (flat * depth[..., None])[visible]
+        # From axes of frame 0's camera (right, up, backward) to those of the scene.
         world = (local @ c2w[:, :3].T + c2w[:, 3]) * np.array([1, -1, -1]) * endonerf.UNIT_MM
         scene = (world - first[:3, 3]) @ first[:3, :3]
-        assert np.abs(scene[:, 2]).max() < 0.15, "the plane is where it was; pixels of depth are not blended"
+        assert np.abs(scene[:, 2]).max() < 0.15, "points are on the plane; depths are not interpolated"
         assert np.median(np.abs(scene[:, 2])) < 0.03
-        assert bounds[t] == pytest.approx([depth[seen].min(), depth[seen].max()])
-        picture = np.asarray(Image.open(here / f"images/{t:06d}.png"))[seen].astype(float)
+        assert bounds[t] == pytest.approx([depth[visible].min(), depth[visible].max()])
+        picture = np.asarray(Image.open(here / f"images/{t:06d}.png"))[visible].astype(float)
         drawn = np.clip(128 + 40 * np.sin(scene[:, 0]) + 40 * np.cos(1.3 * scene[:, 1]), 0, 255)
         assert np.abs(picture[:, 0] - drawn).mean() < 2.0
         where = project(camera, scene)
         assert (where[:, 0] > 4).all(), "the instrument is masked"
 
 
-def test_tapvids_tracks_are_the_scenes(tmp_path: Path) -> None:
-    """As both readers take them: in the picture, in space through the stated lens, and the store's mask."""
+def test_tracks_of_the_tapvid_export_follow_the_scene(tmp_path: Path) -> None:
+    """In the picture, in space projected by the stated camera, and their visibility."""
     render = {"size": (64, 48), "stereo_mm": 24.0}
     job = Job(sequences=1, frames=4, render=render, flow={"backend": "ideal"}, store={"extra": ["camera"]})
     (tmp_path / "in").mkdir()
     cameras = moving(tmp_path / "in", job)
     export_dataset(tmp_path / "in", tmp_path / "to", "tapvid")
     with np.load(tmp_path / "to/000000.npz", allow_pickle=False) as file:
-        told = dict(file)
+        held = dict(file)
     sequence = Dataset(tmp_path / "in")[0]
-    size = np.array(told["video"].shape[2:0:-1])
-    places = told["points"] * size - 0.5
-    columns, rows = told["queries_xyt"][:, :2].astype(int).T
+    size = np.array(held["video"].shape[2:0:-1])
+    places = held["points"] * size - 0.5
+    columns, rows = held["queries_xyt"][:, :2].astype(int).T
     assert 500 < len(columns) <= 1024
     assert places[:, 0] == pytest.approx(np.stack([columns, rows], axis=1), abs=1e-4)
-    fx, fy, cx, cy = told["fx_fy_cx_cy"]
+    fx, fy, cx, cy = held["fx_fy_cx_cy"]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     for t, camera in enumerate(cameras):
         assert places[:, t] - places[:, 0] == pytest.approx(sequence["flow"][t][rows, columns], abs=1e-4)
-        local = told["tracks_XYZ"][t].astype(float)
-        seen = cv2.projectPoints(local, np.zeros(3), np.zeros(3), K, told["distortion"])[0].reshape(-1, 2)
-        assert seen - 0.5 == pytest.approx(places[:, t], abs=1e-3)
+        local = held["tracks_XYZ"][t].astype(float)
+        projected = cv2.projectPoints(local, np.zeros(3), np.zeros(3), K, held["distortion"])[0][:, 0]
+        assert projected - 0.5 == pytest.approx(places[:, t], abs=1e-3)
         assert ((1000 * local - camera.translation) @ camera.rotation)[:, 2] == pytest.approx(0, abs=1e-3)
-        assert np.array_equal(told["visibility"][t], sequence["visible"][t][rows, columns])
-        assert np.array_equal(
-            np.asarray(Image.open(io.BytesIO(told["images_jpeg_bytes"][t]))), told["video"][t]
-        )
-    assert np.array_equal(told["occluded"], ~told["visibility"].T)
-    assert not told["occluded"][:, 0].any()
-    assert told["occluded"].any()
-    assert np.array_equal(told["video"], sequence["rgb"][:])
+        assert np.array_equal(held["visibility"][t], sequence["visible"][t][rows, columns])
+        picture = np.asarray(Image.open(io.BytesIO(held["images_jpeg_bytes"][t])))
+        assert np.array_equal(picture, held["video"][t])
+    assert np.array_equal(held["occluded"], ~held["visibility"].T)
+    assert not held["occluded"][:, 0].any()
+    assert held["occluded"].any()
+    assert np.array_equal(held["video"], sequence["rgb"][:])
 
 
-def test_films_show_what_is_asked(root: Path, tmp_path: Path) -> None:
+def test_videos_have_the_requested_overlays(root: Path) -> None:
     sequence = Dataset(root)[0]
     bare = drawn(sequence, [])
     assert np.array_equal(bare, sequence["rgb"][:])
@@ -340,7 +332,6 @@ def test_films_show_what_is_asked(root: Path, tmp_path: Path) -> None:
     size = np.linalg.norm(sequence["traction"][2], axis=-1)
     at = np.unravel_index(size.argmax(), size.shape)
     peak = np.array(at) + sequence["flow"][2][at][::-1]
-    assert changed[tuple((times * (np.round(peak) + 0.5)).astype(int))], (
-        "the glow is where the loaded tissue has moved to"
-    )
+    at_peak = tuple((times * (np.round(peak) + 0.5)).astype(int))
+    assert changed[at_peak], "the overlay follows the loaded tissue"
     assert len(drawn(sequence, ["flow"], (0.5 / sequence.attrs["fps"], np.inf))) == 2

@@ -1,4 +1,4 @@
-"""Openings of a brain: found where they are and not where they can't be; their lines make a job."""
+"""Suggested openings of a brain: their places and directions, and the job made of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def found(egg: Path) -> list[Opening]:
     return openings.find_openings(egg, RADIUS, 3)
 
 
-def test_an_eggs_openings_look_straight_out_of_it(found: list[Opening]) -> None:
+def test_openings_of_an_egg_are_on_it_along_its_normal_and_apart(found: list[Opening]) -> None:
     assert len(found) == 3
     for one in found:
         on = (one.point / [32.0, 26.0, 22.0]) @ (one.point / [32.0, 26.0, 22.0])
@@ -42,10 +42,10 @@ def test_an_eggs_openings_look_straight_out_of_it(found: list[Opening]) -> None:
         assert one.relief_mm < 0.4
     for k, one in enumerate(found):
         for other in found[:k]:
-            assert np.linalg.norm(one.point - other.point) >= 2 * RADIUS, "they share no tissue"
+            assert np.linalg.norm(one.point - other.point) >= 2 * RADIUS, "no common tissue"
 
 
-def test_the_command_draws_the_places_and_prints_a_job_that_works(egg: Path, tmp_path: Path) -> None:
+def test_the_command_draws_the_places_and_prints_a_valid_job(egg: Path, tmp_path: Path) -> None:
     words = ["preview", str(egg), "--radius", f"{RADIUS:g}", "--count", "2", "-o", str(tmp_path / "a.png")]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
@@ -60,7 +60,7 @@ def test_the_command_draws_the_places_and_prints_a_job_that_works(egg: Path, tmp
     assert both.also[0].point != both.point
 
 
-def test_sequences_take_the_openings_of_a_brain_in_turn(egg: Path, found: list[Opening]) -> None:
+def test_sequences_use_the_openings_of_a_brain_in_turn(egg: Path, found: list[Opening]) -> None:
     first, *others = (one.craniotomy(RADIUS).model_dump() for one in found)
     also = [{name: one[name] for name in ("point", "direction")} for one in others]
     anatomy = {"mesh": egg, "vertices": 2500, "craniotomy": first | {"also": also}}

@@ -1,4 +1,4 @@
-"""Viewing: a recording that rerun finds whole, on this machine only."""
+"""The recording for the viewer rerun."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_recording_holds_every_field_on_one_timeline(root: Path, tmp_path: Pat
     assert made.exit_code == 0, made.output
     rerun = [sys.executable, "-m", "rerun", "rrd"]
     subprocess.run([*rerun, "verify", str(path)], check=True, capture_output=True)
-    said = subprocess.run([*rerun, "print", str(path)], check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run([*rerun, "print", str(path)], check=True, capture_output=True, text=True).stdout
     for entity in ("camera/frame", "camera/depth", "right/frame", "flow", "traction", "force"):
-        assert f"- /{entity} - " in said
-    assert "000001" in said
+        assert f"- /{entity} - " in printed
+    assert "000001" in printed

@@ -1,4 +1,4 @@
-"""Files of others are read within limits and run nothing; files of ours are there whole or not at all."""
+"""Untrusted files are read within limits and run no code; files are written as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from synth.errors import UserError
 from synth.system import checked_file
 
 
-class Villain:
+class Malicious:
     """Runs code when it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -25,7 +25,7 @@ class Villain:
 
 
 def png(width: int, height: int) -> bytes:
-    """A picture of zeros: a square of 32,000 takes a megabyte."""
+    """A picture of zeros: one of 32,000 x 32,000 pixels has a megabyte."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -49,7 +49,7 @@ def test_only_regular_files_of_a_bounded_size_are_opened(tmp_path: Path, name: s
 
 def save_code(path: Path) -> None:
     with path.open("wb") as file:
-        np.savez(file, a=np.array([Villain()], object), allow_pickle=True)
+        np.savez(file, a=np.array([Malicious()], object), allow_pickle=True)
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,14 @@ def save_code(path: Path) -> None:
         (checked_file.read_json, lambda path: path.write_bytes(b"\xff\xfe")),
         (checked_file.read_json, lambda path: path.write_text("{")),
         (checked_file.read_arrays, save_code),
-        (checked_file.read_arrays, lambda path: path.write_bytes(pickle.dumps(Villain()))),
+        (checked_file.read_arrays, lambda path: path.write_bytes(pickle.dumps(Malicious()))),
         (checked_file.read_arrays, lambda path: path.write_bytes(b"PK cut")),
         (checked_file.read_picture, lambda path: path.write_bytes(b"GIF89a")),
         (checked_file.read_picture, lambda path: path.write_bytes(png(32_000, 32_000))),
         (checked_file.read_storage, lambda path: path.write_text("")),
     ],
 )
-def test_a_corrupted_file_is_one_line_and_runs_nothing(
+def test_a_corrupted_file_is_one_line_and_runs_no_code(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     read: Callable[[Path], object],
@@ -81,7 +81,7 @@ def test_a_corrupted_file_is_one_line_and_runs_nothing(
     assert not (tmp_path / "ran").exists()
 
 
-def test_what_a_sound_file_holds_is_read(tmp_path: Path) -> None:
+def test_values_of_valid_files_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("a: 1\nb: [1.5, true, ~]\nc: 2001-01-01\nd: &d {e: 1}\nf: *d\n")
     assert checked_file.read_yaml(tmp_path / "a.yaml") == {
         **{"a": 1, "b": [1.5, True, None], "c": "2001-01-01"},
@@ -98,22 +98,17 @@ def test_what_a_sound_file_holds_is_read(tmp_path: Path) -> None:
     assert (held["K"].tolist(), held["width"]) == ([[1, 2]], 5)
 
 
-def fail(done: int) -> None:
-    """After `done` characters."""
-    raise ZeroDivisionError
-
-
-def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_write_leaves_files_unchanged(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("before")
-    for make in (checked_file.part_of, checked_file.folder_of):
-        place = tmp_path / ("a" if make is checked_file.part_of else "b")
-        with pytest.raises(ZeroDivisionError), make(place) as part:
-            fail((part if part.is_file() else part / "c").write_text("half"))
+    for make, name in ((checked_file.part_of, "a"), (checked_file.folder_of, "b")):
+        with pytest.raises(ZeroDivisionError), make(tmp_path / name) as part:  # noqa: PT012
+            (part if part.is_file() else part / "c").write_text("half")
+            raise ZeroDivisionError
     assert (tmp_path / "a").read_text() == "before"
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_a_folder_without_room_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_space_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError):
         checked_file.make_folder(tmp_path / "new/out", 1 << 60)
     checked_file.make_folder(tmp_path / "new/out", 1 << 20)

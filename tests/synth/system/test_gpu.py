@@ -1,4 +1,4 @@
-"""What keeps the renderer from a GPU."""
+"""Drivers and GPUs that the renderer can use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from synth.system.gpu import Gpu, obstacle
         (Gpu(1, "565.57.01", (8, 9), optix=True), False),
         (Gpu(1, "570.133.20", (12, 0), optix=True), True),
         (Gpu(1, "550.54.14", (7, 0), optix=True), False),
-        (Gpu(1, "", (8, 0), optix=True), True),  # the system does not say: it is tried
+        (Gpu(1, "", (8, 0), optix=True), True),  # an unknown driver is tried
     ],
 )
 def test_drivers_and_devices_that_the_renderer_runs_on(gpu: Gpu | None, fit: bool) -> None:
