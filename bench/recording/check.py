@@ -183,7 +183,7 @@ def _check_film(recording: Recording, found: _Checked) -> None:
     second = RightCamera(recording, found.mm_per_px or 1.0) if recording.has_stereo else None
     pictures = _counted(recording, found)
     film = replace(recording.film(pictures), only=only)
-    video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), second=second)
+    video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), depth=second)
     try:
         followed = list(video.frames())
         if found.picture is not None and followed:

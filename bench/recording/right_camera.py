@@ -129,7 +129,7 @@ class RightCamera:
         return moved
 
     def depth_mm(self) -> Map | None:
-        """See `SecondView`: of two eyes by matching the frame's own pictures."""
+        """See `DepthSource`: of two eyes by matching the frame's own pictures."""
         if self._stereo is None or self._pair is None:
             return self._seen
         r, anywhere = self._stereo.rectified, np.ones(self._pair[0].shape[:2], bool)

@@ -1,1 +1,1 @@
-"""One pass over a video: displacement from the rest frame."""
+"""Tracking of recordings and streams, with the forces of methods."""

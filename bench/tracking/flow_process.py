@@ -1,7 +1,7 @@
-"""Flow in a process of its own: forces are computed from a frame's flow while the next frame's is.
+"""Flow in another process, which works on the next frame while forces of the current one are computed.
 
-A thread wouldn't do: the flow makes thousands of short calls a frame and would wait for the interpreter after
-each (measured: two threads took longer than one).
+Threads are no alternative: flow makes thousands of short calls per frame and would wait for the interpreter
+after each (two threads take longer than one).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from synth.recording_flow.local_flow import LocalFlow
 
 
 class FlowProcess(LocalFlow):
-    """Flow in one other process, which starts at once and ends with this one."""
+    """Flow in another process, which starts at once and ends with this one."""
 
     ahead = 1
 
     def __init__(self) -> None:
         self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_set_up)
-        # The other process inherits that Ctrl-C is held back: it is for this one, which closes the other.
+        # The other process inherits the blocked SIGINT: on Ctrl-C this process closes it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self._pool.submit(os.getpid)  # a first task starts it
+            self._pool.submit(os.getpid)  # the first task starts the process
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -45,13 +45,13 @@ class FlowProcess(LocalFlow):
         return self._pool.submit(_step, rgb, proposal)
 
     def close(self) -> None:
-        """Ends it, after the frame that it is at."""
+        """Ends the process after its current frame."""
         self._pool.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
 def open_flow_process() -> Iterator[FlowProcess | None]:
-    """Another process for the flow, closed at the end; None where there is but one core."""
+    """Opens a process for flow and closes it at the end; None on a single core."""
     if len(os.sched_getaffinity(0)) < 2:
         yield None
         return
@@ -59,8 +59,7 @@ def open_flow_process() -> Iterator[FlowProcess | None]:
         yield process
 
 
-_flow = LocalFlow()
-"""The other process's: it has one video at a time."""
+_flow = LocalFlow()  # of the other process, for one video at a time
 
 
 def _set_up() -> None:
@@ -71,7 +70,7 @@ def _set_up() -> None:
 
 
 def _end_with_parent() -> None:
-    """A pool's process waits for tasks for ever when the one that gives them is killed."""
+    """Ends the process with its parent, which when killed would leave it waiting for tasks."""
     parent = parent_process()
     if parent is not None:
         parent.join()

@@ -1,7 +1,7 @@
-"""`bench live`: a video as a stream: decode, mask, flow, force, frame by frame, and what each costs.
+"""`bench live`: a video as a stream, masked and tracked frame by frame, with the latency of each stage.
 
-The stream is paced by the video's own clock: a frame that arrives while another is still worked on is
-dropped, as it would be at the table. Masks, flow and model are those that score recordings.
+The clock of the video paces the stream: a frame that arrives while another is processed is dropped, as in the
+operating theatre. Masks, flow and model are those of `bench score`.
 """
 
 from __future__ import annotations
@@ -26,34 +26,28 @@ from synth.video.pixel_scale import StatedScale, pixel_mm
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """One frame that was worked on."""
+    """Result of one processed frame."""
 
     index: int
-    latency_s: float
-    """From its arrival to its answer."""
-    stages_s: dict[str, float]
-    """mask, flow, force: time in each."""
-    confidence: float
-    """Mean over the tissue that is visible."""
+    latency_s: float  # from arrival to result
+    stages_s: dict[str, float]  # time for mask, flow and force
+    confidence: float  # mean over the visible tissue
     trusted: bool
-    largest_px: float
-    force_mn: float | None
-    """Magnitude of the total force; None without a model, and of a frame that could not be followed."""
+    largest_px: float  # largest motion of the visible tissue
+    force_mn: float | None  # magnitude of the total force; None: no model, or a lost frame
 
 
 @dataclass
 class Stream:
-    """What a stream came to."""
+    """Results of a stream."""
 
     frames: list[LiveFrame] = field(default_factory=list)
     dropped: int = 0
-    size: tuple[int, int] = (0, 0)
-    """Height, width of what is worked on [px]."""
+    size: tuple[int, int] = (0, 0)  # height, width of the downsampled pictures [px]
     findings: tuple[Finding, ...] = ()
-    """What is odd or wrong about it, and whether its camera moved."""
 
     def summary(self) -> dict[str, float | int]:
-        """Latency percentiles [ms], mean time of each stage [ms], dropped and flagged frames."""
+        """Latency percentiles [ms], mean time of each stage [ms], dropped and lost frames."""
         latency = 1e3 * np.array([frame.latency_s for frame in self.frames])
         result: dict[str, float | int] = {"frames": len(self.frames), "dropped": self.dropped}
         result |= {"height": self.size[0], "width": self.size[1]}
@@ -75,24 +69,24 @@ def stream_video(
     report: Callable[[LiveFrame], None] = lambda frame: None,
     flow: LocalFlow | None = None,
 ) -> Stream:
-    """Follows the video from its first frame on, which is taken as the rest frame.
+    """Tracks a video as a stream; the first frame is the rest frame.
 
     Args:
         footage: the video.
-        settings: how; a rate, or a pulse to be found over the whole video, is not for a stream.
-        method: a model that makes force of flow; needs the scale.
-        scale_mm_per_px: of the video's own pixels; unknown: forces are right up to a factor, whatever E is.
+        settings: of the tracking; a stream has no limit on the rate and no search for pulsation.
+        method: estimates force from flow; requires the scale.
+        scale_mm_per_px: of the original pixels; "unknown": forces are correct up to a factor, for any E.
         young_kpa: of the tissue, if known.
-        paced: drop what arrives meanwhile; False: work on every frame.
-        report: given every frame's answer.
-        flow: where it is computed, closed by the caller; None: here. In another process a frame's flow runs
-            while the next is masked and the force of the one before is computed.
+        paced: drop frames that arrive while another is processed; False: process every frame.
+        report: called with the result of every frame.
+        flow: computes the flow and is closed by the caller; None: in this process. Another process computes
+            it while the next frame is masked and the force of the previous one is estimated.
 
     Raises:
         UserError: unreadable video, fewer than two frames, or a model without a scale.
     """
     if method is not None and scale_mm_per_px is None:
-        raise UserError("a model needs --scale (mm a pixel, or unknown): forces have no meaning without it")
+        raise UserError("a model requires --scale (mm per pixel, or unknown): forces depend on it")
     stream, pace = Stream(), _VideoClock(paced)
     video = VideoFlow(footage, settings, flow, pace=pace)
     scene: MethodContext | None = None
@@ -126,19 +120,18 @@ def stream_video(
 
 
 class _VideoClock:
-    """A `Pace`: frames arrive as the video's own clock has them."""
+    """A `Pace` with the clock of the video."""
 
     def __init__(self, paced: bool) -> None:
         self.paced, self.dropped = paced, 0
-        self.arrivals_s: dict[int, float] = {}
-        """Of frames that are worked on, by index."""
+        self.arrivals_s: dict[int, float] = {}  # of frames in process, by index
 
     def start(self, time_s: float) -> None:
         """See `Pace`."""
         self.first_s, self.began_s = time_s, time.perf_counter()
 
     def is_due(self, index: int, time_s: float) -> bool:
-        """Waits until a frame arrives; False if it has a successor already."""
+        """Waits until a frame arrives; False if the next one has arrived already."""
         since, now = time_s - self.first_s, time.perf_counter()
         arrival_s = self.began_s + since if self.paced else now
         if arrival_s < now - since / index:
@@ -156,7 +149,7 @@ class _VideoClock:
 
 
 def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
-    """`live.json`: the summary, how the stream was run, and the machine."""
+    """Writes `live.json`: the summary, the options of the stream, and the machine."""
     out.mkdir(parents=True, exist_ok=True)
     record = {"command": "bench live", **how, "machine": machine(), **summary}
     write_whole(out / "live.json", json.dumps(record, indent=1) + "\n", durable=False)

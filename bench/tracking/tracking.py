@@ -1,4 +1,4 @@
-"""A recording's motion, and every method's force from it."""
+"""Motion in a recording, and the forces of all methods."""
 
 from __future__ import annotations
 
@@ -24,71 +24,53 @@ from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
-Progress = Callable[[int], None]
-"""Told how many frames are done."""
+Progress = Callable[[int], None]  # called with the number of frames done
 
 _MOST_SNAPSHOTS = 64
-_SNAPSHOT_WIDTH = 480
+_SNAPSHOT_WIDTH = 480  # px, at most
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A frame for the report, shrunk."""
+    """A downsampled frame for the report."""
 
-    position: int
-    """Index into the curves."""
-    rgb: NDArray[np.uint8]
-    flow: NDArray[np.float32]
-    """(h, w, 2), in pixels of the shrunken picture."""
-    density: NDArray[np.float32] | None
-    """(h, w) kPa."""
-    depth: NDArray[np.float32] | None = None
-    """(h, w) mm, motion along the view, away from the camera; None without a second eye."""
+    position: int  # index into the curves
+    rgb: NDArray[np.uint8]  # (h, w, 3)
+    flow: NDArray[np.float32]  # (h, w, 2) px of the downsampled picture
+    density: NDArray[np.float32] | None  # (h, w) kPa, of the traction
+    depth: NDArray[np.float32] | None = None  # (h, w) mm, motion away from the camera; None: monocular
 
 
 @dataclass
 class TrackedRecording:
-    """Curves over the frames that have a time, from the rest frame on."""
+    """Curves over the frames that have a time, from the rest frame on, and the results of a recording."""
 
-    frame: list[int] = field(default_factory=list)
-    """Frame numbers in the recording."""
+    frame: list[int] = field(default_factory=list)  # numbers in the recording
     time_s: list[float] = field(default_factory=list)
-    force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
-    """By method: (3,) each."""
+    force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)  # by method: (3,) each
+    # By method: `low_mn` and `high_mn` of each `ForceEstimate`.
     bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """By method: `low_mn` and `high_mn` of each `ForceEstimate`."""
-    speed: list[float] = field(default_factory=list)
-    """Mean speed of the tissue since the frame before [mm/s]; what is lined up with the sensor."""
-    confidence: list[float] = field(default_factory=list)
-    """Mean confidence of the flow over the tissue."""
-    trusted: list[bool] = field(default_factory=list)
-    """Whether the frame could be followed; the forces of one that couldn't are none."""
+    speed: list[float] = field(default_factory=list)  # mean over the tissue since the previous frame [mm/s]
+    confidence: list[float] = field(default_factory=list)  # mean over the tissue
+    trusted: list[bool] = field(default_factory=list)  # False: the frame is lost, its forces are not valid
     summary: TrackingSummary = field(default_factory=TrackingSummary)
-    """What was masked, lost and reinitialised."""
+    # Repeated pictures, see `VideoFaults.repeats`.
     repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
-    """Frames that show an earlier one again, as of `VideoFaults.repeats`."""
     snapshots: list[Snapshot] = field(default_factory=list)
-    pictured: str = ""
-    """The method whose force map they have."""
-    rest: NDArray[np.uint8] | None = None
-    tissue: NDArray[np.bool_] | None = None
-    """(h, w), shrunk as the snapshots are."""
-    size: tuple[int, int] = (0, 0)
-    """Height, width of the recording [px]."""
+    pictured: str = ""  # method whose force map the snapshots show
+    rest: NDArray[np.uint8] | None = None  # (h, w, 3) rest frame, downsampled as the snapshots
+    tissue: NDArray[np.bool_] | None = None  # (h, w), likewise
+    size: tuple[int, int] = (0, 0)  # height, width of the recording [px]
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-    """What is wrong with the video, and with what is stated of it."""
-    stereo: StereoQuality | None = None
-    """What the second eye or the depth camera is good for; None: there is none, or it was not used."""
-    turning: SurfaceMotion | None = None
-    """How the tissue moved over `sensor.turn_s`; None without that span."""
-    pulse: list[dict[str, float]] = field(default_factory=list)
-    """rate_hz and amplitude_mm of each rhythm of the tissue's own that was taken off."""
+    stereo: StereoQuality | None = None  # of the right or depth camera; None: none, or not used
+    turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
+    pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
 
     @property
     def fault(self) -> str:
-        """Why nothing of the video is a measurement; empty if something may be."""
+        """Reason why no number is valid; empty if there is none."""
         return first_fault(self.findings)
 
 
@@ -102,17 +84,17 @@ def track_recording(
     flow: LocalFlow | None = None,
     progress: Progress = lambda done: None,
 ) -> TrackedRecording:
-    """Follows the video and applies every method, holding a few frames at a time.
+    """Tracks the video and applies every method, with a few frames in memory.
 
     Args:
         recording: the opened recording.
         methods: by name.
-        scale_mm_per_px: of the recording's own pixels.
-        settings: of this run.
-        pictured: the method whose force map goes into the snapshots.
-        flow: where it is computed, closed by the caller; None: here. Elsewhere, it is on its way while the
-            methods are applied to the frame before.
-        progress: told after every frame.
+        scale_mm_per_px: of the original pixels.
+        settings: of the tracking.
+        pictured: method whose force map the snapshots show.
+        flow: computes the flow and is closed by the caller; None: in this process. Another process computes
+            it while the methods are applied to the previous frame.
+        progress: called after every frame.
 
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
@@ -120,9 +102,9 @@ def track_recording(
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
 
-    def once(pulse: PulseSearch | None) -> tuple[TrackedRecording, PulseSearch | None]:
-        second = RightCamera(recording, scale_mm_per_px) if recording.has_stereo else None
-        video = VideoFlow(recording.film(), settings, flow, pulse, second, watch=watch)
+    def one_pass(pulse: PulseSearch | None) -> tuple[TrackedRecording, PulseSearch | None]:
+        depth = RightCamera(recording, scale_mm_per_px) if recording.has_stereo else None
+        video = VideoFlow(recording.film(), settings, flow, pulse, depth, watch=watch)
         forces = _Forces(methods, pictured, watch)
         for frame in video.frames(progress):
             if frame.is_rest:
@@ -142,17 +124,17 @@ def track_recording(
                 )
             raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
         found = video.find_pulse(about.pulse.free_s)
-        if pulse is not None or found is None:  # else all is read again
+        if pulse is not None or found is None:  # otherwise a second pass follows
             forces.finish(about)
-        out.stereo = None if second is None else second.quality
+        out.stereo = None if depth is None else depth.quality
         _describe(out, video, recording, methods, scale_mm_per_px * video.shrink)
         return out, found
 
-    out, pulse = once(None)
+    out, pulse = one_pass(None)
     if pulse is not None:
-        # Forces are of the tissue as it would lie at rest: all over again, with the pulse taken off.
-        out, _ = once(pulse)
-    # Of both times through, for whoever asks what an answer costs.
+        # Forces refer to tissue without pulsation: a second pass removes it.
+        out, _ = one_pass(pulse)
+    # Times of both passes.
     out.timings |= watch.report()
     return out
 
@@ -164,10 +146,9 @@ def _describe(
     methods: Mapping[str, Method],
     mm_per_px: float,
 ) -> None:
-    """What was done to the video, which is through, and what somebody should know of it."""
+    """Adds summary, findings and notes after the last frame."""
     out.summary, out.size, out.notes = video.summary, video.size, video.notes
-    scale = mm_per_px / video.shrink
-    out.findings = check.judge(recording, scale, video, out.stereo)
+    out.findings = check.judge(recording, mm_per_px / video.shrink, video, out.stereo)
     if video.faults is not None:
         out.repeats = video.faults.repeats()
     if out.fault:
@@ -197,7 +178,7 @@ def _context(about: Meta, tissue: NDArray[np.bool_], mm_per_px: float) -> Method
 
 
 class _Forces:
-    """Every method applied to every frame."""
+    """Applies every method to every frame."""
 
     def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
         shown = methods.get(pictured) if pictured is not None else None
@@ -206,19 +187,19 @@ class _Forces:
         self.out = TrackedRecording(pictured=self.pictured or "")
         self.answers: list[dict[str, ForceEstimate]] = []
         self.last: NDArray[np.float32] | None = None
-        self.stride, self.eyes = 1, 1
+        self.stride, self.cameras = 1, 1
 
     def begin(self, rest: NDArray[np.uint8], scene: MethodContext) -> None:
-        """The rest frame's picture, (h, w, 3), and what stays the same over the recording."""
+        """Starts with the rest frame (h, w, 3) and the constants of the recording."""
         self.scene, self.out.rest = scene, _shrunk(rest)
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
-        """The methods' forces of a frame at its time [s]."""
+        """Adds the forces of a frame at its time [s]."""
         out, scene, inside, moved = self.out, self.scene, self.scene.tissue, frame.motion
         position = len(out.time_s)
         wanted = position % self.stride == 0
-        self.eyes = 1 if moved is None else 2
+        self.cameras = 1 if moved is None else 2
         answers: dict[str, ForceEstimate] = {}
         density = None
         for name, method in self.methods.items():
@@ -248,23 +229,23 @@ class _Forces:
             self._snap(position, frame, density)
 
     def finish(self, about: Meta) -> None:
-        """What methods say of all frames once the film is over; the times are what clocks and meta state."""
+        """Computes results that need all frames, with contact-free spans on the clock of the video."""
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times = np.array(self.out.time_s)
-        inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False of none
+        inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
         contact_free = np.array(self.out.trusted, bool) & inside
         for name, method in self.methods.items():
             if isinstance(method, Revising) and len(times):
                 with self.watch.stage(name):
                     for frame, answer in zip(self.answers, method.revise(contact_free), strict=True):
                         frame[name] = answer
-        followed = [frame for frame, kept in zip(self.answers, self.out.trusted, strict=True) if kept]
+        tracked = [frame for frame, known in zip(self.answers, self.out.trusted, strict=True) if known]
         for name, method in self.methods.items():
             if isinstance(method, FusedEstimate):
                 with self.watch.stage(name):
-                    fused = method.fuse(followed, self.scene, self.eyes)
-                for frame, answer in zip(followed, fused, strict=True):
+                    fused = method.fuse(tracked, self.scene, self.cameras)
+                for frame, answer in zip(tracked, fused, strict=True):
                     frame[name] = answer
                 for frame in self.answers:
                     frame.setdefault(name, frame[method.parts[0]])
@@ -273,7 +254,7 @@ class _Forces:
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.answers]
 
     def _snap(self, position: int, frame: FrameMotion, density: NDArray[np.float32] | None) -> None:
-        """Takes at most so many, evenly: when full, every other one goes and the stride doubles."""
+        """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""
         small = None if density is None else _shrunk(density)
         flow = _shrunk(frame.flow) * np.float32(_ratio(frame.rgb.shape[1]))
         moved = frame.motion
@@ -289,7 +270,7 @@ def _ratio(width: int) -> float:
 
 
 def _shrunk(array: NDArray[A]) -> NDArray[A]:
-    """As wide as a snapshot at most."""
+    """Downsamples an array (H, W[, C]) to the width of a snapshot."""
     ratio = _ratio(array.shape[1])
     if ratio == 1.0:
         return array
@@ -297,8 +278,8 @@ def _shrunk(array: NDArray[A]) -> NDArray[A]:
 
 
 def picture_masks(tracked: TrackedRecording) -> NDArray[np.uint8] | None:
-    """The rest frame, red where the picture is masked, the more often the redder, and yellow where the rest
-    frame itself is; (h, w, 3). None if nothing is."""
+    """The rest frame (h, w, 3), tinted red by the share of frames in which a pixel is masked and yellow where
+    the rest frame is masked; None if nothing is masked."""
     summary, rest = tracked.summary, tracked.rest
     if rest is None or summary.masked_count is None:
         return None

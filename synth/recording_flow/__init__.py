@@ -1,1 +1,1 @@
-"""The motion that a film of somebody's camera shows: flow, heart and breath, what is lost."""
+"""Motion of tissue in recorded videos: flow, camera motion, heart and breath, faults of the pictures."""

@@ -1,9 +1,9 @@
-"""The camera's own motion in a video: a similarity of the picture, found on what doesn't deform, and undone.
+"""Camera motion in a video: a similarity of the picture, estimated on rigid surroundings and removed.
 
-A microscope is bumped, sways, zooms and turns, and a method takes that for the tissue's motion. Corners (Shi
-& Tomasi, CVPR 1994) of the rest frame's surroundings, rim, drape and bone, are followed into each frame
-(Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is fitted to them, robustly. Where too
-little of the surroundings is visible, it is found in the tissue's motion: `shared_motion`.
+A microscope that is bumped, drifts, zooms or rotates moves the whole picture, which would otherwise count as
+motion of the tissue. Corners (Shi & Tomasi, CVPR 1994) of the surroundings in the rest frame (rim, drape and
+bone) are tracked into each frame (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is
+fitted to them robustly. Where the surroundings are too small, `shared_motion` estimates it from the tissue.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
 
 @dataclass(frozen=True)
 class CornerConstants:
-    """Constants of the fit: by hand, on moved textures (tests/synth/recording_flow/test_camera_motion.py)."""
+    """Constants of the fit, chosen by hand on textures (tests/synth/recording_flow/test_camera_motion.py)."""
 
-    corners: int = 200  # at most
-    apart_px: int = 5  # from corner to corner, at least
-    rim_px: int = 4  # between tissue and surroundings, which may show either
-    smooth_px: float = 1.0  # bilinear sampling of sharper pictures is off by up to 0.03 px
-    window: tuple[int, int] = (13, 13)  # px, of local contrast and of Lucas & Kanade
-    far_px: float = 5.0  # of jumps beyond that many corners are lost
-    points: int = 20  # corners, at least
-    rounds: int = 6  # of the robust fit
-    singular: float = 1e8  # condition number of a fit that says nothing
-    outlier: float = 4.0  # standard deviations from which on a corner counts nothing (Tukey's biweight)
-    spread_px: float = 0.03  # of followed corners, at least
-    correlated: float = 3.0  # neighbouring corners err alike: so many count as one
-    uncertain_px: float = 0.15  # deviation over the tissue from which on corners show too little
-    unlike: float = 0.1  # of the motion, by which surroundings near and far differ that deform
-    still_px: float = 0.05  # motion of less is a still camera's
-    sure: float = 4.0  # and of so few deviations
+    corners: int = 200  # most corners
+    apart_px: int = 5  # least distance of corners
+    rim_px: int = 4  # margin between tissue and surroundings
+    smooth_px: float = 1.0  # Gaussian blur: bilinear sampling of sharper pictures errs by up to 0.03 px
+    window: tuple[int, int] = (13, 13)  # px, for local contrast and Lucas & Kanade
+    far_px: float = 5.0  # length of a jump beyond which corners are searched at the shifted position
+    points: int = 20  # least number of tracked corners
+    rounds: int = 6  # iterations of the robust fit
+    singular: float = 1e8  # condition number above which a fit is rejected
+    outlier: float = 4.0  # standard deviations beyond which a corner has no weight (Tukey's biweight)
+    spread_px: float = 0.03  # least standard deviation of tracked corners
+    correlated: float = 3.0  # factor of the variance, for correlated errors of neighbouring corners
+    uncertain_px: float = 0.15  # largest standard deviation of the shift of the tissue
+    unlike: float = 0.1  # relative difference of near and far surroundings above which they deform
+    still_px: float = 0.05  # least shift of a moving camera
+    sure: float = 4.0  # least shift in standard deviations
 
 
 CORNERS = CornerConstants()
@@ -49,21 +49,21 @@ CORNERS = CornerConstants()
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """How a picture is shifted, turned and scaled against the rest frame's."""
+    """Shift, rotation and scale of a picture relative to the rest frame."""
 
-    matrix: Floats  # (2, 3): from the rest frame's pixels to the picture's
-    deviation_px: float = 0.0  # standard deviation of the shift that it gives the tissue
-    length_px: float = 0.0  # root mean square of that shift
+    matrix: Floats  # (2, 3): from pixels of the rest frame to pixels of the picture
+    deviation_px: float = 0.0  # standard deviation of the shift over the tissue
+    length_px: float = 0.0  # root mean square of the shift over the tissue
 
     def undo(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A picture (H, W[, C]) uint8 as a camera at rest would have taken it."""
+        """Resamples a picture (H, W[, C]) uint8 to the view of the camera at rest."""
         x, y = map(_unbiased, self._places(picture.shape))
         return np.asarray(
             cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8
         )
 
     def outside(self, size: tuple[int, ...]) -> Flags:
-        """(H, W) what of the rest frame's picture the moved camera doesn't show."""
+        """Mask (H, W) of the pixels of the rest frame that are outside the moved picture."""
         x, y = self._places(size)
         return (x < 0) | (y < 0) | (x > size[1] - 1) | (y > size[0] - 1)
 
@@ -72,14 +72,14 @@ class Similarity:
         return [(a * x + b * y + c).astype(np.float32) for a, b, c in self.matrix]
 
     def steady(self, flow: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A flow (H, W, 2) from the rest frame as a camera at rest would have had it."""
+        """Removes the camera motion from a flow (H, W, 2) px from the rest frame."""
         y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
         back = cv2.invertAffineTransform(self.matrix).astype(np.float32)
         at = flow + np.dstack([x, y])
         return np.asarray(at @ back[:, :2].T + back[:, 2] - np.dstack([x, y]), np.float32)
 
     def distance_px(self, other: Similarity | None, size: tuple[int, ...]) -> float:
-        """Root mean square over a picture (H, W) of what two shift differently; None: at rest."""
+        """Root mean square difference of two shifts over a picture (H, W) [px]; None: no camera motion."""
         matrix = self.matrix - (np.eye(2, 3) if other is None else other.matrix)
         y, x = np.mgrid[: size[0] : 8, : size[1] : 8]
         shift = np.column_stack([x.ravel(), y.ravel()]) @ matrix[:, :2].T + matrix[:, 2]
@@ -88,67 +88,64 @@ class Similarity:
 
 @dataclass(frozen=True, eq=False)
 class CameraPath:
-    """Where the camera was in the frames of a recording."""
+    """Camera motion over a recording."""
 
-    time_s: Floats  # (T,), rising
-    found: tuple[Similarity | None, ...]  # by time; None: it had stood still since the rest frame
+    time_s: Floats  # (T,), increasing
+    found: tuple[Similarity | None, ...]  # at these times; None: no camera motion since the rest frame
 
     def at(self, time_s: float) -> Similarity | None:
-        """Where it was; between frames where it was in the one before."""
+        """Camera motion at a time; between frames that of the previous frame."""
         known = int(np.searchsorted(self.time_s, time_s, side="right"))
         return self.found[known - 1] if known else None
 
 
 class SimilarityBasis:
-    """Small similarities about a picture's middle as four numbers: shift in x and y, scale and turn [px].
-
-    The last two are of what lies half a picture's width away.
-    """
+    """Small similarities about the middle of a picture as four parameters [px]: shift in x and y, and the
+    shifts by scale and rotation at a distance of half the width."""
 
     def __init__(self, size: tuple[int, ...]) -> None:
         """`size`: (H, W) of the picture."""
         self._centre, self._unit = np.array(size[::-1]) / 2, size[1] / 2
 
     def design(self, at: Floats) -> Floats:
-        """(2 N, 4) x and y of the shifts at places (N, 2) px by one px of each number."""
+        """(2 N, 4) derivatives of the shifts in x and y at places (N, 2) px by the parameters."""
         x, y = ((at - self._centre) / self._unit).T
         one, nothing = np.ones_like(x), np.zeros_like(x)
         return np.column_stack([one, nothing, x, -y, nothing, one, y, x]).reshape(-1, 4)
 
     def matrix(self, answer: Floats) -> Floats:
-        """(2, 3): from the rest frame's pixels to the picture's."""
+        """(2, 3): from pixels of the rest frame to pixels of the picture."""
         x, y, larger, turned = answer / np.array([1, 1, self._unit, self._unit])
         linear = np.array([[1 + larger, -turned], [turned, 1 + larger]])
         return np.column_stack([linear, self._centre - linear @ self._centre + (x, y)])
 
 
 Course = list[tuple[float, Similarity, float]]
-"""Time [s], where the camera was, and how far from where it was in the frame before [px]."""
+"""Time [s], camera motion since the rest frame, and motion since the previous frame [px]."""
 
 
 def describe_course(course: Course, shrink: int) -> str:
-    """How it moved, in pixels of a film that is `shrink` times larger than the pictures here."""
+    """A sentence on the camera motion, in pixels of the video before downsampling by `shrink`."""
     time_s, found, step = zip(*course, strict=True)
     most, sudden = max(one.length_px for one in found), int(np.argmax(step))
     sure = np.array([one.deviation_px for one in found])
-    said = f"the camera moved by up to {shrink * most:.2g} px, from {time_s[0]:.3g} s on, most at once at "
-    said += f"{time_s[sudden]:.3g} s, {shrink * step[sudden]:.2g} px: "
-    said += f"taken off to ± {shrink * np.median(sure):.1g} px"
-    return said + (f", ± {shrink * sure.max():.1g} px at worst" if sure.max() > 2 * np.median(sure) else "")
+    text = f"the camera moved by up to {shrink * most:.2g} px from {time_s[0]:.3g} s on, with the largest "
+    text += f"step of {shrink * step[sudden]:.2g} px at {time_s[sudden]:.3g} s; "
+    text += f"this is removed to ± {shrink * np.median(sure):.1g} px"
+    return text + (f", at worst ± {shrink * sure.max():.1g} px" if sure.max() > 2 * np.median(sure) else "")
 
 
 class CameraTracker:
-    """The camera's motion since the rest frame, frame by frame."""
+    """Estimates the camera motion since the rest frame, frame by frame."""
 
     def __init__(self, rest: Rgb, tissue: Flags, blocked: Flags) -> None:
-        """Starts at the rest frame (H, W, 3); `tissue`: (H, W) may deform; `blocked`: (H, W) tool, glare."""
+        """Starts at the rest frame (H, W, 3); masks (H, W): `tissue` may deform; `blocked`: tool, glare."""
         self._basis = SimilarityBasis(tissue.shape)
         self._rest = _contrast(rest)
         element = np.ones((2 * CORNERS.rim_px + 1,) * 2, np.uint8)
         near, hidden = (cv2.dilate(one.astype(np.uint8), element) > 0 for one in (tissue, blocked))
         self._points = _corners(self._rest, ~near & ~hidden)
-        self.is_blind = len(self._points) < CORNERS.points
-        """Too little of the surroundings shows in the rest frame."""
+        self.is_blind = len(self._points) < CORNERS.points  # too little surroundings in the rest frame
         rows, columns = np.nonzero(tissue)
         some = slice(None, None, max(1, len(rows) // 100))
         self._tissue = np.column_stack([columns, rows])[some].astype(np.float64)
@@ -157,9 +154,9 @@ class CameraTracker:
         self._course: Course = []
 
     def find(self, rgb: Rgb, time_s: float | None) -> Similarity | None:
-        """Where the camera is in a frame (H, W, 3) uint8; None: it has stood still since the rest frame.
+        """Camera motion in a frame (H, W, 3) uint8; None: none since the rest frame.
 
-        Where that can't be told, it is where it was in the frame before.
+        Where it cannot be estimated, that of the previous frame.
         """
         now = _contrast(rgb)
         last = self._last
@@ -171,38 +168,38 @@ class CameraTracker:
             self._unknown_s.append(time_s or 0.0)
             if last is not None:
                 self._last = replace(last, deviation_px=float(np.hypot(last.deviation_px, self._usual_px())))
-        # Once it has moved, what is less is still more than nothing.
+        # The threshold holds only for the first motion.
         elif last is not None or found.length_px > max(CORNERS.still_px, CORNERS.sure * found.deviation_px):
             step = self._length(found.matrix - before.matrix)
             self._course.append((time_s or 0.0, found, step))
             if last is not None and step < CORNERS.sure * found.deviation_px:
-                # No more than it may err by, as where a contact moves much: it goes on as it usually does.
+                # A step within the error, as during a large contact, is shrunk towards the usual step.
                 share = 1 / (1 + (found.deviation_px / max(self._usual_px(), 1e-3)) ** 2)
                 found = replace(found, matrix=last.matrix + share * (found.matrix - last.matrix))
             self._last = found
         return self._last
 
     def describe(self, shrink: int) -> list[str]:
-        """How it moved, in pixels of a film that is `shrink` times larger than the pictures here."""
+        """Sentences on the camera motion, in pixels of the video before downsampling by `shrink`."""
         if not self._course:
             return []
-        time_s, said = self._course[0][0], describe_course(self._course, shrink)
+        time_s, text = self._course[0][0], describe_course(self._course, shrink)
         if unknown := [time for time in self._unknown_s if time > time_s]:
-            said += f"; in {len(unknown)} frames, from {unknown[0]:.3g} s on, nothing shows where it is"
-        return [said]
+            text += f"; in {len(unknown)} frames, from {unknown[0]:.3g} s on, it could not be estimated"
+        return [text]
 
     def _usual_px(self) -> float:
-        """How far it moves from frame to frame."""
+        """Median step from frame to frame [px]."""
         return float(np.median([step for *_, step in self._course]))
 
     def _jump(self, now: NDArray[np.uint8]) -> Floats:
-        """(2, 3) the shift of the whole picture, however far (phase correlation)."""
+        """Shift (2, 3) of the whole picture, of any length, by phase correlation."""
         first, second = (one.astype(np.float32) for one in (self._rest, now))
         shift, _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(now.shape[::-1], cv2.CV_32F))
         return np.column_stack([np.eye(2), shift])
 
     def _find(self, now: NDArray[np.uint8], near: Similarity) -> Similarity | None:
-        """A similarity near another, of the surroundings; None where too few show it, or they deform."""
+        """Similarity of the surroundings, started at `near`; None: too few corners, or they deform."""
         points = self._points
         if self.is_blind:
             return None
@@ -232,47 +229,47 @@ class CameraTracker:
         variance = CORNERS.correlated * spread**2 * 2 * leverage
         matrix = self._basis.matrix(answer)
         length = self._length(matrix - np.eye(2, 3))
-        # What moves more beside the tissue than far from it is tissue that the mask leaves out.
+        # Surroundings that move more near the tissue than far from it are tissue outside the mask.
         away = np.linalg.norm(at - self._tissue.mean(axis=0), axis=1)
-        beside = away < np.median(away)
-        apart = [
-            (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum() for half in (beside, ~beside)
-        ]
-        deforms = np.linalg.norm(apart[0] - apart[1]) > max(CORNERS.unlike * length, CORNERS.still_px)
+        close, far = (
+            (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum()
+            for half in (away < np.median(away), away >= np.median(away))
+        )
+        deforms = np.linalg.norm(close - far) > max(CORNERS.unlike * length, CORNERS.still_px)
         if deforms or variance > CORNERS.uncertain_px**2:
             return None
         return Similarity(matrix, float(np.sqrt(variance)), length)
 
     def _length(self, matrix: Floats) -> float:
-        """Root mean square over the tissue of a shift (2, 3) [px]."""
+        """Root mean square of a shift (2, 3) over the tissue [px]."""
         return float(np.sqrt(np.square(self._tissue @ matrix[:, :2].T + matrix[:, 2]).sum(axis=1).mean()))
 
 
 def weigh_outliers(off: Floats, typical: Floats) -> tuple[Floats, float]:
-    """(N,) Tukey's biweight of distances [px], and the deviation of a component that `typical` ones show."""
+    """Tukey's biweight (N,) of distances [px], and a component's standard deviation from `typical` ones."""
     spread = max(float(np.median(typical)) / 1.18, CORNERS.spread_px)  # Rayleigh's median
     return np.maximum(1 - (off / (CORNERS.outlier * spread)) ** 2, 0) ** 2, spread
 
 
 def _contrast(rgb: Rgb) -> NDArray[np.uint8]:
-    """(H, W) local contrast."""
+    """Local contrast (H, W) of a frame."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return image.local_contrast(cv2.GaussianBlur(grey, (0, 0), CORNERS.smooth_px), CORNERS.window)
 
 
 def _corners(picture: NDArray[np.uint8], where: Flags) -> NDArray[np.float32]:
-    """(N, 2) px."""
+    """Corners (N, 2) px of a picture inside a mask."""
     mask = where.astype(np.uint8) * 255
     found = cv2.goodFeaturesToTrack(picture, CORNERS.corners, 0.01, CORNERS.apart_px, mask=mask, blockSize=7)
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
 
 
 def _unbiased(place: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Where OpenCV's cubic kernel (a = -3/4) has to be asked to answer a ramp at `place` [px] rightly.
+    """Sampling position at which OpenCV's cubic kernel (a = -3/4) reproduces a ramp at `place` [px].
 
-    It answers at t + (a + 1/2) 2 t (1 - t) (2t - 1) of a pixel instead of t: off by up to 0.05 px.
+    At a fraction t of a pixel it returns the ramp at t + (a + 1/2) 2 t (1 - t) (2t - 1), up to 0.05 px off.
     """
-    part = asked = place - np.floor(place)
+    part = sampled = place - np.floor(place)
     for _ in range(2):
-        asked = part + 0.5 * asked * (1 - asked) * (2 * asked - 1)
-    return np.asarray(place - part + asked, np.float32)
+        sampled = part + 0.5 * sampled * (1 - sampled) * (2 * sampled - 1)
+    return np.asarray(place - part + sampled, np.float32)

@@ -1,4 +1,4 @@
-"""Foreground that no mask holds: it stands in front of the tissue, moves unlike it, or came between."""
+"""Detection of unmasked foreground: objects that stand above the tissue, move unlike it, or occlude it."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When something is foreground: by hand, on videos; 13 of 17 with foreign objects are reported, none of
-    19 clean ones (docs/design.md)."""
+    """Thresholds for foreground, chosen by hand on videos: it is reported in 13 of 17 with foreign objects
+    and in none of 19 clean ones (docs/design.md)."""
 
-    front_mm: float = 2.5  # in front of the tissue's surface: more than relief
-    sigmas: float = 5.0  # of the depth about that surface: more than noise
-    front: float = 0.005  # share of the tissue, in one piece
-    step_px: float = 0.25  # that the flow jumps by, at least
-    step: float = 0.2  # and this share of the largest motion
-    least_px: float = 0.7  # largest motion below which no jump is looked for
-    across_px: int = 5  # to either side of a jump
-    long: float = 0.12  # of the picture's width: an edge extends over this, a contact's rim doesn't
-    lost: float = 0.02  # share of the tissue without a match, in one piece
-    near_px: int = 8  # so near to masks nothing is concluded
-    rounds: int = 8  # of the surface's robust fit
+    front_mm: float = 2.5  # least height above the surface of the tissue: more than its relief
+    sigmas: float = 5.0  # least height in standard deviations of the depth
+    front: float = 0.005  # least share of the tissue that a raised object covers
+    step_px: float = 0.25  # least jump of the flow
+    step: float = 0.2  # least jump as a share of the largest motion
+    least_px: float = 0.7  # largest motion below which jumps are not searched
+    across_px: int = 5  # distance from a jump at which the flow is compared
+    long: float = 0.12  # least extent of a jump over the width of the picture: more than the rim of a contact
+    lost: float = 0.02  # least share of the tissue that an occluder covers
+    near_px: int = 8  # margin around masks that is not searched
+    rounds: int = 8  # iterations of the robust fit of the surface
 
 
 LIMITS = Thresholds()
 
 
 class ForegroundSearch:
-    """Looks at frames of a film, in order and from the rest frame on."""
+    """Searches frames of a video, in order from the rest frame on."""
 
     def __init__(self, tissue: Flags, shrink: int) -> None:
-        """`tissue`: (h, w), as small as the frames; `shrink`: how many times smaller than the film's."""
+        """`tissue`: (h, w) on the pixels of the frames; `shrink`: their factor of downsampling."""
         self._tissue, self._shrink = tissue, shrink
         self._surface: tuple[Map, float] | None = None
         self._found: dict[str, list[tuple[float, str, Flags]]] = {}
-        self._masked = ~tissue  # in any frame: a mask is often chosen only once something moves
+        self._masked = ~tissue  # in any frame: masks are often selected only once something moves
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
-        """Looks at a frame; `depth_mm`: (h, w) of the frame along the view, NaN: unknown; None: one eye."""
+        """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
         masked = ~self._tissue
         for known in (frame.masked, frame.rest_masked, frame.confidence == 0 if frame.is_rest else None):
             masked = masked if known is None else masked | known
@@ -61,7 +61,7 @@ class ForegroundSearch:
         if frame.is_rest or not frame.trusted:
             return
         lost = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
-        self._note("hides what was there at rest", lost, frame, LIMITS.lost)
+        self._note("hides tissue that is visible at rest", lost, frame, LIMITS.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > LIMITS.least_px:
             inner = cv2.erode(free.astype(np.uint8), _square(2 * LIMITS.across_px), borderValue=0) > 0
@@ -71,16 +71,16 @@ class ForegroundSearch:
 
     @property
     def findings(self) -> list[Finding]:
-        """What was found in two frames at least and not masked in others, the largest of each kind."""
+        """The largest object of each kind that is found in two frames or more and not masked in others."""
         found = []
         for places in self._found.values():
-            unmasked = [(share, said) for share, said, where in places if self._masked[where].mean() < 0.5]
+            unmasked = [(share, text) for share, text, where in places if self._masked[where].mean() < 0.5]
             if len(unmasked) > 1:
                 found.append(Finding("odd", "foreground", max(unmasked)[1]))
         return found
 
     def _note(self, why: str, where: Flags, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
-        """Keeps the largest piece, if it has that share of the tissue and that extent in widths."""
+        """Stores the largest component if it has this share of tissue and this extent in picture widths."""
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
         if len(stats) < 2:
@@ -90,18 +90,18 @@ class ForegroundSearch:
         wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]
         if found >= share and np.hypot(wide, high) >= extent * where.shape[1]:
             x, y = self._shrink * (centres[k] + 0.5) - 0.5
-            said = f"something at x {x:.0f}, y {y:.0f} in frame {frame.index} {why}: mask it? (masks/)"
-            self._found.setdefault(why, []).append((found, said, label == k))
+            text = f"an object at x {x:.0f}, y {y:.0f} in frame {frame.index} {why}: mask it in masks/?"
+            self._found.setdefault(why, []).append((found, text, label == k))
 
 
 def fit_surface(depth_mm: Map, tissue: Flags) -> tuple[Map, float]:
-    """The smooth surface (h, w) mm under what stands in front, and the tissue's deviation from it [mm].
+    """Fits a smooth surface (h, w) mm to the tissue; also returns its deviation from the surface [mm].
 
-    A quadratic by least squares; what is far from it is left out anew in each round, in front the sooner.
+    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front.
 
     Args:
-        depth_mm: (h, w) along the view; NaN: unknown.
-        tissue: (h, w) where it is fitted.
+        depth_mm: (h, w) along the optical axis; NaN: unknown.
+        tissue: (h, w), where the surface is fitted.
     """
     height, width = depth_mm.shape
     y, x = np.mgrid[:height, :width] / max(height, width) - 0.5
@@ -120,19 +120,19 @@ def fit_surface(depth_mm: Map, tissue: Flags) -> tuple[Map, float]:
 
 
 def flow_jump(flow: Flow) -> Map:
-    """(h, w) px by which a flow (h, w, 2) changes across a place more than it does on both sides of it.
+    """Excess (h, w) px of the change of a flow (h, w, 2) across a place over that on both sides of it.
 
-    Of a straight slope it is 0, of a smooth one little: an elastic surface makes none, an edge does.
+    It is 0 for a linear flow and small for a smooth one, as on elastic tissue; it is large at edges.
     """
 
-    def beside(dx: float, dy: float) -> Flow:
+    def shifted(dx: float, dy: float) -> Flow:
         shift, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), (flow.shape[1], flow.shape[0])
         return np.asarray(cv2.warpAffine(flow, shift, size, borderMode=cv2.BORDER_REPLICATE))
 
     most, near, far = np.zeros(flow.shape[:2], np.float32), LIMITS.across_px, 2.5 * LIMITS.across_px
     for dx, dy in ((1, 0), (0, 1), (0.7, 0.7), (0.7, -0.7)):
-        a, b, c, d = (beside(k * dx, k * dy) for k in (near, -near, far, -far))
-        # Across lie 2 widths, on either side 1.5.
+        a, b, c, d = (shifted(k * dx, k * dy) for k in (near, -near, far, -far))
+        # The distance is 2 widths across the place and 1.5 widths on either side.
         slopes = np.linalg.norm(c - a, axis=-1) + np.linalg.norm(b - d, axis=-1)
         most = np.maximum(most, np.linalg.norm(a - b, axis=-1) - slopes * 2 / 3)
     return most

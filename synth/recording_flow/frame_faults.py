@@ -1,4 +1,4 @@
-"""Pictures that show nothing to follow, and videos whose pictures were corrupted after the camera."""
+"""Detection of pictures that cannot be tracked, and of videos corrupted by recording or compression."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from synth.recording_flow.finding import Finding
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When a picture or a video is faulty: between 50 rendered videos, whose values stand last, and the same
-    corrupted; docs/results/scoring/stability has what they find."""
+    """Thresholds between 50 clean rendered videos, whose values are given, and corrupted ones; the rates of
+    detection are in docs/results/scoring/stability."""
 
-    side: int = 24  # px of the picture at least: no window of any estimator fits into less
-    tissue: int = 400  # px at least
-    dark: float = 12.0  # grey levels that 95% of the tissue stay below
-    flat: float = 0.5  # grey levels of detail; a camera's own noise is more
-    dim: float = 60.0  # as `dark`; 196 and more
-    noisy: float = 12.0  # grey levels, one standard deviation; below 5
-    soft: float = 0.34  # detail finer than 1 px over that of 1 to 4 px; 0.6 and more, strongly compressed 0.4
-    grid: float = 3.0  # steps at every eighth pixel over those between; 1.1, of JPEG at quality 10 2.5
-    blurred: float = 0.5  # of the rest frame's finest detail; 0.87 and more
-    combed: float = 1.4  # squared steps to the next row over those to the one after it; 1.1, of noise 1.2
-    bar: float = 0.14  # of the picture's level, that a black bar stays below: 16 of 255 may be black
-    even: float = 4.0  # grey levels, spread within a row of it
-    same: float = 0.1  # of the usual change from picture to picture
-    still: float = 0.2  # grey levels by which even the stillest part of a camera's picture changes
-    caught_up: float = 1.6  # usual changes after pictures that stood still
-    leapt: float = 3.0  # times as much change as from the pictures on either side
+    side: int = 24  # px, least side of a picture: windows of the estimators need it
+    tissue: int = 400  # px, least area of the tissue
+    dark: float = 12.0  # grey levels, 95th percentile of the tissue below which a picture is black
+    flat: float = 0.5  # grey levels, least standard deviation of detail; sensor noise is more
+    dim: float = 60.0  # grey levels, 95th percentile below which a video is dim; clean: at least 196
+    noisy: float = 12.0  # grey levels, largest standard deviation of noise; clean: below 5
+    soft: float = 0.34  # least ratio of detail below 1 px to that of 1 to 4 px; clean 0.6, compressed 0.4
+    grid: float = 3.0  # largest ratio of steps every eighth pixel to others; clean 1.1, JPEG quality 10 2.5
+    blurred: float = 0.5  # least ratio of the finest detail to that of the rest frame; clean: at least 0.87
+    combed: float = 1.4  # largest ratio of squared steps to the next row to those to the second; noise 1.2
+    bar: float = 0.14  # level of a black bar over that of the picture, at most: black may be 16 of 255
+    even: float = 4.0  # grey levels, largest standard deviation within a row of a bar
+    same: float = 0.1  # change from picture to picture over the usual one below which a picture is repeated
+    still: float = 0.2  # grey levels, least change of the stillest part of a picture with sensor noise
+    caught_up: float = 1.6  # change after repeated pictures over the usual one that shows a delay
+    leapt: float = 3.0  # change over those before and after that shows a jump
 
 
 LIMITS = Thresholds()
-_SOME = 5  # of a list that are named
-_STRIDE = 4  # every such pixel is compared, unsmoothed: noise tells two pictures apart
+_SOME = 5  # most times that a message lists
+_STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise distinguishes two pictures
 
 
 def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
-    """Why nothing can be followed in a picture; empty if something may be.
+    """Reason why a picture cannot be tracked; empty if it can.
 
     Args:
         rgb: (H, W, 3) uint8.
@@ -48,21 +48,21 @@ def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
     """
     height, width = tissue.shape
     if min(height, width) < LIMITS.side:
-        return f"only {width} x {height} px large"
+        return f"only {width} x {height} px"
     count = int(tissue.sum())
     if count < LIMITS.tissue:
-        return f"only {count} px of it are tissue"
+        return f"showing only {count} px of tissue"
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     if float(np.percentile(grey[tissue], 95)) < LIMITS.dark:
         return "black"
     detail = grey - cv2.GaussianBlur(grey, (0, 0), 3)
     if float(detail[tissue].std()) < LIMITS.flat:
-        return "of one colour, without any detail"
+        return "of one colour, without detail"
     return ""
 
 
 def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) True on the black bars along the borders of a picture (H, W, 3)."""
+    """Mask (H, W) of black bars along the borders of a picture (H, W, 3)."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     bars, least = np.zeros(grey.shape, bool), LIMITS.bar * float(np.percentile(grey, 95))
     for lines, across in ((grey, bars), (grey.T, bars.T)):
@@ -72,7 +72,7 @@ def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
-    """Whether a mask (H, W) of tissue marks the border of the picture and leaves out its middle."""
+    """Whether a tissue mask (H, W) covers the border of the picture but not its middle."""
     height, width = tissue.shape
     border = np.concatenate([tissue[0], tissue[-1], tissue[:, 0], tissue[:, -1]])
     middle = tissue[height // 3 : -(height // 3), width // 3 : -(width // 3)]
@@ -80,16 +80,16 @@ def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
 
 
 class VideoFaults:
-    """What a film's pictures suffer from, gathered as they go by."""
+    """Faults of the pictures of a video, collected frame by frame."""
 
     def __init__(self, rgb: NDArray[np.uint8], small: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> None:
-        """The rest frame (H, W, 3), the same as flow is computed on, (h, w, 3), and (h, w) its tissue."""
+        """Starts with the rest frame (H, W, 3), also downsampled (h, w, 3), and its tissue mask (h, w)."""
         self._tissue, self._last = tissue, rgb[::_STRIDE, ::_STRIDE]
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         self._fine = _detail(grey, 0, 1)[tissue].std()
         self._numbers: list[int] = []
         self._times: list[float] = []
-        # Since the one before: mean, of the quietest part, and of the middling one.
+        # Change since the previous picture: mean, minimum and median over parts of the picture.
         self._changes: list[tuple[float, float, float]] = []
         self._blurred: list[float] = []
         self._combed: list[float] = []
@@ -98,25 +98,18 @@ class VideoFaults:
         noise = float(np.median(np.abs(corners[tissue]))) / 6 / 0.6745  # Immerkaer 1996, by the median
         soft = self._fine / max(float(_detail(grey, 1, 4)[tissue].std()), 1e-6)
         steps = [_grid(lines) for lines in (rgb[..., 1].astype(np.float32), rgb[..., 1].T.astype(np.float32))]
-        self._rest = [
-            said
-            for wrong, said in (
-                (
-                    level < LIMITS.dim,
-                    f"the film is dim: 95% of the tissue is below grey level {level:.0f} of 255",
-                ),
-                (noise > LIMITS.noisy, f"the film is noisy: {noise:.0f} grey levels"),
-                (
-                    soft < LIMITS.soft,
-                    "the rest frame has no fine detail: out of focus, or strongly compressed?",
-                ),
-                (min(steps) > LIMITS.grid, "the pictures fall into blocks of 8 px: strongly compressed"),
-            )
-            if wrong
-        ]
+        dim = f"the video is dim: 95% of the tissue is below grey level {level:.0f} of 255"
+        no_detail = "the rest frame has no fine detail: is it out of focus or strongly compressed?"
+        rest = (
+            (level < LIMITS.dim, dim),
+            (noise > LIMITS.noisy, f"the video is noisy: {noise:.0f} grey levels"),
+            (soft < LIMITS.soft, no_detail),
+            (min(steps) > LIMITS.grid, "the pictures have blocks of 8 px: they are strongly compressed"),
+        )
+        self._rest = [message for wrong, message in rest if wrong]
 
-    def see(self, index: int, time_s: float, rgb: NDArray[np.uint8]) -> None:
-        """A picture (H, W, 3) of the film, each in order."""
+    def add_decoded(self, index: int, time_s: float, rgb: NDArray[np.uint8]) -> None:
+        """Adds a picture (H, W, 3) of the video; every picture in order."""
         one = rgb[::_STRIDE, ::_STRIDE]
         if one.shape == self._last.shape:
             change = cv2.absdiff(one, self._last).mean(axis=2)
@@ -126,23 +119,21 @@ class VideoFaults:
             self._changes.append((float(change.mean()), float(parts.min()), float(np.median(parts))))
         self._last = one
 
-    def look(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
-        """A picture that is followed, and the same as flow is computed on."""
+    def add_tracked(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
+        """Adds a picture that is tracked, and the same downsampled."""
         fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
         if fine < LIMITS.blurred * self._fine:
             self._blurred.append(time_s)
         green = rgb[:, ::2, 1].astype(np.float32)
         near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
-        # The most torn blocks: elsewhere the picture may be at rest.
+        # The blocks of largest ratio: elsewhere the picture may be at rest.
         torn = (near / (far + 1))[8::16, 4::8]
         if torn.size and np.percentile(torn, 98) > LIMITS.combed:
             self._combed.append(time_s)
 
     def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
-        """Frames that show an earlier one again, surely, and unless the tissue was still: number → of which.
-
-        The rest frame's number is -1.
-        """
+        """Repeated pictures as {number: number of the picture shown}, certain ones, and those for which the
+        tissue may just have been still. The rest frame has number -1."""
         change, quiet, _ = np.array(self._changes).reshape(-1, 3).T
         surely, maybe = dict[int, int](), dict[int, int]()
         if not change.any():
@@ -157,36 +148,34 @@ class VideoFaults:
         return surely, maybe
 
     def findings(self) -> list[Finding]:
-        """What is odd, once the film is through."""
-        # An instrument may come in at once; a cut or a bump changes most of the picture.
-        again, change = self.repeats()[0], [middling for *_, middling in self._changes]
-        beside = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
-        leaps = [k for k, other in enumerate(beside, 1) if change[k] > LIMITS.leapt * other]
+        """Findings after the last frame."""
+        # The median over parts ignores an instrument that enters; a cut or bump changes most of the picture.
+        again, change = self.repeats()[0], [median for *_, median in self._changes]
+        around = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
+        leaps = [k for k, other in enumerate(around, 1) if change[k] > LIMITS.leapt * other]
+        cuts = [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])]
         at = dict(zip(self._numbers, self._times, strict=True))
-        found = [Finding("odd", "pictures", said) for said in self._rest]
-        for times, said in (
-            (self._combed, "interlaced: rows are of two moments; deinterlace the film"),
-            (self._blurred, "far less sharp than the rest frame: out of focus?"),
-            ([at[k] for k in sorted(again)], "the one before again: frozen or doubled"),
-            (
-                [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])],
-                "far from those beside: frames missing, a cut or a bump?",
-            ),
+        found = [Finding("odd", "pictures", message) for message in self._rest]
+        for times, fault in (
+            (self._combed, "interlaced: deinterlace the video"),
+            (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
+            ([at[k] for k in sorted(again)], "the previous one again: frozen or doubled"),
+            (cuts, "very different from their neighbours: are frames missing, or is there a cut or a bump?"),
         ):
             if times:
                 some = ", ".join(f"{t:.2f}" for t in times[:_SOME]) + (", ..." if len(times) > _SOME else "")
-                found.append(Finding("odd", "pictures", f"{len(times)} pictures ({some} s) are {said}"))
+                found.append(Finding("odd", "pictures", f"{len(times)} pictures ({some} s) are {fault}"))
         return found
 
 
 def _detail(grey: NDArray[np.float32], finer: float, coarser: float) -> NDArray[np.float32]:
-    """What of a picture (H, W) lies between two widths of Gaussians [px]; 0: the picture itself."""
+    """Difference (H, W) of a picture blurred by two Gaussians [px]; a width of 0 means no blur."""
     top = cv2.GaussianBlur(grey, (0, 0), finer) if finer else grey
     return np.asarray(top - cv2.GaussianBlur(grey, (0, 0), coarser), np.float32)
 
 
 def _grid(lines: NDArray[np.float32]) -> float:
-    """Mean step at the columns (H, W) of a grid of 8 px over the median of others."""
+    """Mean step between columns (H, W) on a grid of 8 px, over the median of the eight possible grids."""
     steps = np.abs(np.diff(lines, axis=1)).mean(axis=0)
     each = [float(steps[k::8].mean()) for k in range(8)]
     return max(each) / max(float(np.median(each)), 1e-6)

@@ -1,4 +1,4 @@
-"""Rhythms fitted to the coefficients of a smooth motion: harmonics of phases whose rate may wander."""
+"""Fit of rhythms, harmonics of a phase of slowly varying rate, to the coefficients of a smooth motion."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class RhythmConstants:
-    """What a rhythm is: by hand, on the videos of tests/synth/recording_flow/test_pulse.py."""
+    """Constants of rhythms, chosen by hand on the videos of tests/synth/recording_flow/test_pulse.py."""
 
-    harmonics: int = 3  # of a phase, at most
+    harmonics: int = 3  # most harmonics of a phase
     knot_s: float = 4.0  # between corrections of the phase
-    bend: float = 0.3  # of the phase's second differences, over the data's mean weight
-    small: float = 0.01  # the same of the phase itself
-    rounds: int = 6  # of Gauss-Newton
-    folds: int = 6  # of the time, each predicted from the others
-    predicted: float = 0.3  # share of the variance that a rhythm predicts in frames it was not fitted to
-    rates_hz: Span = (0.08, 3.5)  # slowest breath, quickest heart
-    periods: float = 3.0  # that the frames must span: fewer are a drift
-    most: int = 3  # rhythms (heart, breath, what is left of either), and as many attempts that are none
-    even: float = 3.0  # 95th percentile of amplitude over median: without, 4 of 23 videos have a false pulse
-    least_px: float = 0.03  # of amplitude; less is the flow's own error
-    main: int = 6  # components of the motion that rates are searched in; the rest is noise
-    faster: float = 0.95  # share of the loss at a rate that twice or three times that rate must be below
-    alike: float = 0.03  # relative distance of a rate from another's harmonic that is the same
+    bend: float = 0.3  # prior on second differences of the phase, over the mean weight of the data
+    small: float = 0.01  # prior on the correction of the phase, likewise
+    rounds: int = 6  # Gauss-Newton iterations
+    folds: int = 6  # of cross-validation over time
+    predicted: float = 0.3  # least share of the variance of held-out frames that a rhythm predicts
+    rates_hz: Span = (0.08, 3.5)  # slowest breath, fastest heart rate
+    periods: float = 3.0  # least number of periods in the frames: fewer look like drift
+    most: int = 3  # most accepted rhythms (heart, breath, residual), and most rejected ones
+    even: float = 3.0  # largest 95th percentile of amplitude over median: without, 4 of 23 videos pulsate
+    least_px: float = 0.03  # least median amplitude: the error of the flow is of this size
+    main: int = 6  # principal components of the motion in which rates are searched
+    faster: float = 0.95  # share of the explained variance that two or three times the best rate must reach
+    alike: float = 0.03  # relative distance below which a rate equals a harmonic of another
 
 
 RHYTHM = RhythmConstants()
@@ -39,31 +39,31 @@ RHYTHM = RhythmConstants()
 
 @dataclass(frozen=True, eq=False)
 class Rhythm:
-    """A motion of the whole surface that follows the harmonics of one phase."""
+    """Motion of the whole surface as harmonics of one phase."""
 
     rate_hz: float
     knots_s: Floats  # (K,) times at which the phase is corrected
-    lead: Floats  # (K,) by how much it is ahead of the rate there [rad]
+    lead: Floats  # (K,) correction of the phase at these times [rad]
     harmonics: int
+    # (2 H, B, C) coefficients of the B polynomials for each wave and component; empty before the fit.
     modes: Floats = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    """(2 H, B, C) coefficients of the polynomials, for each wave; empty before the fit."""
 
     def phase(self, time_s: Floats) -> Floats:
-        """(T,) rad."""
+        """Phase (T,) [rad]."""
         return np.asarray(
             2 * np.pi * self.rate_hz * time_s + np.interp(time_s, self.knots_s, self.lead), np.float64
         )
 
     def waves(self, time_s: Floats) -> Floats:
-        """(T, 2 H) cosine and sine of each harmonic."""
+        """Cosine and sine (T, 2 H) of each harmonic."""
         return _waves(self.phase(time_s), self.harmonics)
 
     def at(self, time_s: Floats) -> Floats:
-        """(T, B, C) coefficients of the motion."""
+        """Coefficients (T, B, C) of the motion."""
         return np.asarray(np.tensordot(self.waves(time_s), self.modes, axes=1), np.float64)
 
     def amplitude(self, basis: Floats) -> Floats:
-        """(P,) half of the way from one end to the other at places of the basis (P, B)."""
+        """Amplitude (P,), half of the peak-to-peak motion, at places of the basis (P, B)."""
         turn = _waves(np.linspace(0, 2 * np.pi, 48, endpoint=False), self.harmonics)
         path = np.einsum("pa,tac->tpc", basis, np.tensordot(turn, self.modes, axes=1))
         return np.asarray(np.linalg.norm(np.ptp(path, axis=0), axis=1) / 2, np.float64)
@@ -72,18 +72,18 @@ class Rhythm:
 def find_rhythms(
     t: Floats, coefficients: Floats, basis: Floats
 ) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...]]:
-    """The rhythms of a motion, the strongest first, each found in what those before it leave.
+    """Finds the rhythms of a motion, the strongest first, each in the residual of the previous ones.
 
     Args:
         t: (T,) s.
         coefficients: (T, B, C) of the motion.
-        basis: (P, B) the polynomials at places of the surface.
+        basis: (P, B) polynomials at places of the surface.
 
     Returns:
-        Those that repeat, predict frames and move all places alike; and what had to be fitted before the last
-        of them but does not.
+        Accepted rhythms, which are periodic, predict held-out frames and move the surface evenly; and
+        rejected ones that are stronger than the last accepted one and must be fitted with it.
     """
-    # In these coordinates a length is a length of motion over the places.
+    # In these coordinates the norm is the root mean square of the motion over the places.
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
     y = np.einsum("ab,tbc->tac", metric, coefficients).reshape(len(t), -1)
     back = np.linalg.inv(metric)
@@ -101,20 +101,20 @@ def find_rhythms(
         if np.median(size) < RHYTHM.least_px:
             break
         accepted.append(periodic and bool(np.percentile(size, 95) <= RHYTHM.even * np.median(size)))
-        # What comes after the last rhythm is noise, and fitting it would do harm.
+        # Rejected rhythms after the last accepted one are noise and are not fitted.
         best = found if accepted[-1] else best
     fitted = list(zip(fit(t, y, best, back), accepted, strict=False))
     return tuple(one for one, own in fitted if own), tuple(one for one, own in fitted if not own)
 
 
 def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[Rhythm]:
-    """Rhythms of known phases with the modes that fit a motion best, besides a constant and a drift.
+    """Fits the modes of rhythms of known phase, together with a constant and a drift, by least squares.
 
     Args:
         t: (T,) s.
-        y: (T, B C) coefficients of the motion, maybe in other coordinates.
-        rhythms: their phases.
-        back: (B, B) what brings those coordinates back.
+        y: (T, B C) coefficients of the motion, possibly in other coordinates.
+        rhythms: with their phases.
+        back: (B, B) transform from those coordinates.
     """
     weights = np.linalg.lstsq(_design(t, rhythms), y, rcond=None)[0]
     modes = np.einsum("ab,kbc->kac", back, weights.reshape(len(weights), len(back), -1))
@@ -123,32 +123,32 @@ def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[R
 
 
 def visible_rates(t: Floats) -> Span | None:
-    """Lowest and highest rate that frames at times (T,) s can show [Hz]; None: they show none."""
+    """Lowest and highest rate [Hz] that frames at times (T,) s can resolve; None: there is none."""
     low = max(RHYTHM.rates_hz[0], RHYTHM.periods / max(float(np.ptp(t)), 1e-9))
     high = min(RHYTHM.rates_hz[1], 0.45 / float(np.median(np.diff(t))))
     return (low, high) if low < high else None
 
 
 def _waves(phase: Floats, harmonics: int) -> Floats:
-    """(T, 2 H) cosine and sine of each harmonic of a phase (T,) [rad]."""
+    """Cosine and sine (T, 2 H) of each harmonic of a phase (T,) [rad]."""
     turns = phase[:, None] * np.arange(1, harmonics + 1)
     return np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(phase), -1)
 
 
 def _design(t: Floats, rhythms: Sequence[Rhythm]) -> Floats:
-    """(T, K) a constant (the rest frame's noise), a drift, and each rhythm's waves."""
+    """Design matrix (T, K): a constant (noise of the rest frame), a drift, and the waves of each rhythm."""
     middle = (t - t.mean()) / max(float(np.ptp(t)), 1e-9)
     parts = [np.ones((len(t), 1)), middle[:, None], *(one.waves(t) for one in rhythms)]
     return np.concatenate(parts, axis=1)
 
 
 def _harmonics(t: Floats, rate_hz: float) -> int:
-    """As many as the frames can tell apart."""
+    """Number of harmonics that the frames can resolve."""
     return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, RHYTHM.harmonics))
 
 
 def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | None:
-    """The rate whose waves explain most of what is left (Lomb 1976; Scargle 1982)."""
+    """Rate whose waves explain most of the residual (Lomb 1976; Scargle 1982); None: there is none."""
     rates_hz = visible_rates(t)
     if rates_hz is None:
         return None
@@ -164,7 +164,7 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
 
     step = 1 / (6 * float(np.ptp(t)))
     best: float = min(np.arange(*rates_hz, step).tolist(), key=loss)
-    # A half or a third of the rate has the same waves among its own: the fastest that does as well is meant.
+    # The waves of half or a third of a rate include its own: the fastest rate of similar fit is right.
     for order in (3, 2):
         if order * best < rates_hz[1]:
             around = np.linspace(order * best - 2 * step, order * best + 2 * step, 17)
@@ -176,9 +176,9 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
 
 
 def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) -> tuple[list[Rhythm], bool]:
-    """The rhythms refined together with one of that rate, and whether that one is periodic.
+    """Refines the rhythms together with a new one of this rate; also returns whether the new one is periodic.
 
-    Few frames can't tell three harmonics: it has as many as predict what they weren't fitted to.
+    The new rhythm has the largest number of harmonics that predicts held-out frames.
     """
     count = max(2, round(float(np.ptp(t)) / max(RHYTHM.knot_s, 3 / rate)) + 1)
     knots = np.linspace(t[0], t[-1], count)
@@ -186,13 +186,13 @@ def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) ->
     for harmonics in range(_harmonics(t, rate), 0, -1):
         refined = _refine(t, y, [*rhythms, Rhythm(rate, knots, np.zeros(count), harmonics)])
         if _predicts(t, y, refined):
-            # Its phase, running behind, may have made it too slow to repeat in so short a time.
+            # The correction of the phase may have made it too slow to repeat in the frames.
             return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= RHYTHM.periods - 0.5
     return refined, False
 
 
 def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
-    """The phases' leads by Gauss-Newton on the residual, smooth by a prior."""
+    """Refines the corrections of the phases by Gauss-Newton with a smoothness prior."""
     now = list(rhythms)
     for _ in range(RHYTHM.rounds):
         design = _design(t, now)
@@ -216,7 +216,7 @@ def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
 
 
 def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
-    """Whether the last rhythm, fitted to five sixths of the time, predicts the last sixth, each in turn."""
+    """Whether the last rhythm predicts frames in cross-validation over six parts of the time."""
     fold = np.arange(len(t)) * RHYTHM.folds // len(t)
 
     def error(design: Floats) -> float:
@@ -231,6 +231,6 @@ def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
 
 
 def _is_harmonic(rhythms: Sequence[Rhythm]) -> bool:
-    """Whether the last rate is one of the others, or a harmonic of it."""
+    """Whether the last rate equals another rate, its half, or a harmonic of it."""
     *others, last = (one.rate_hz for one in rhythms)
     return any(abs(last - order * rate) < RHYTHM.alike * last for rate in others for order in (0.5, 1, 2, 3))

@@ -1,4 +1,4 @@
-"""One film's flow, computed in this process."""
+"""Flow of one video, computed in this process."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 
 class LocalFlow:
-    """Flow from a rest frame, frame by frame; computed here and at once, by subclasses elsewhere."""
+    """Computes flow from the rest frame, frame by frame; subclasses use another process."""
 
-    ahead = 0
-    """How many frames may be submitted before the first is waited for."""
+    ahead = 0  # number of frames that may be submitted before the first result is awaited
 
     def begin(self, backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
-        """The rest frame; arguments and errors as `SelectingTracker`."""
+        """Starts with the rest frame; arguments and errors as for `SelectingTracker`."""
         self._tracker = SelectingTracker(backend, rest, proposal, tissue)
 
     def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
-        """The motion of a frame (h, w, 3); errors as `SelectingTracker.step`."""
+        """Computes the motion of a frame (h, w, 3); errors as for `SelectingTracker.step`."""
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self._tracker
         flow, confidence = tracker.step(rgb, proposal)
         done: Future[FrameMotion] = Future()

@@ -1,10 +1,10 @@
-"""Heart and breath: the tissue's own periodic motion, found in a recording so that it can be taken off.
+"""Pulsation of the tissue by heart and breath, estimated over a recording so that it can be removed.
 
-It is as large as what a gentle contact does, and an inverse takes it for one. What tells them apart: heart
-and breath are periodic, move the whole surface, and go on without contact. So a rhythm is a smooth motion of
-the surface (polynomials in x and y) times harmonics of one phase, whose rate may wander. It is fitted to the
-frames without contact, by least trimmed squares (Rousseeuw, J. Amer. Stat. Assoc. 79, 1984) where these are
-unknown, and must predict frames that it was not fitted to. A rate that wanders by more than a radian is lost.
+It is as large as the motion by a gentle contact and would be taken for force. Unlike contacts, heart and
+breath are periodic, move the whole surface, and continue without contact. A rhythm is therefore a smooth
+motion of the surface (polynomials in x and y) times harmonics of one phase, whose rate may vary. It is fitted
+to frames without contact, by least trimmed squares (Rousseeuw, J. Amer. Stat. Assoc. 79, 1984) where these
+are unknown, and must predict held-out frames. A phase that varies by more than a radian is not found.
 
 Measured by `evidence.scoring.pulse` and `tests/synth/recording_flow/test_pulse.py`.
 """
@@ -19,25 +19,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.flow.estimator import Flags
 from synth.recording_flow.camera_motion import CameraPath
 from synth.recording_flow.harmonic_fit import Floats, Rhythm, Span, find_rhythms, fit, visible_rates
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class CellConstants:
-    """Cells of a surface, and frames free of contact: by hand, on videos of `evidence.scoring.pulse`."""
+    """Constants of the cells and of frames without contact, chosen by hand on `evidence.scoring.pulse`."""
 
     columns: int = 20  # cells across the picture
     degree: int = 4  # of the polynomials in x and y
-    visible: float = 0.3  # share of a cell that must be visible for its motion to count
-    frames: int = 30  # without contact, at least: a contact alone, 2.5 s at 10 Hz, shows no rhythm
-    rest_noise_px: float = 0.15  # by which noise of the rest frame displaces a cell at most; more is a motion
-    smoothest: float = 0.2  # share of the frames that is surely free of contact
-    smooth: float = 2.0  # their largest misfit that others may have
-    explained: float = 2.5  # the smooth frames' median misfit that frames explained by rhythms may have
-    noise_px: float = 1e-3  # added to both
+    visible: float = 0.3  # least visible share of a cell
+    frames: int = 30  # least number of frames without contact: a contact alone, 2.5 s at 10 Hz, has no rhythm
+    rest_noise_px: float = 0.15  # largest displacement of a cell by noise of the rest frame
+    smoothest: float = 0.2  # share of the frames that is assumed to be without contact
+    smooth: float = 2.0  # misfit over the largest of these up to which other frames are smooth
+    explained: float = 2.5  # misfit over the median of smooth frames up to which rhythms explain a frame
+    noise_px: float = 1e-3  # added to both limits
 
 
 CELLS = CellConstants()
@@ -45,21 +44,20 @@ CELLS = CellConstants()
 
 @dataclass
 class SurfaceMotion:
-    """A tissue's motion, averaged over a grid of cells, frame by frame.
+    """Motion of tissue averaged over a grid of cells, frame by frame.
 
-    Its C components are x and y in the picture; with a second eye also motion in space, along the view first,
-    then across: all in pixels of the rest frame.
+    Its C components, in pixels of the rest frame, are x and y in the picture; in stereo also motion in three
+    dimensions, first along the optical axis, then lateral.
     """
 
     tissue: Flags  # (h, w)
     time_s: list[float] = field(default_factory=list)
     motion: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c, C) each
-    visible: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c) share of each cell that is
-    depth_weight: float = 1.0
-    """Of motion along the view where rhythms are looked for: less, the less certain it is."""
+    visible: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c) visible share of each cell
+    depth_weight: float = 1.0  # of motion along the axis in the search for rhythms, by its precision
 
     def add(self, time_s: float, motion: NDArray[np.float32], confidence: NDArray[np.float32]) -> None:
-        """One frame that could be followed: (h, w, C) and (h, w) in 0..1."""
+        """Adds the motion (h, w, C) and confidence (h, w) of a trusted frame."""
         mean, share = in_cells(motion, confidence * self.tissue)
         self.time_s.append(time_s)
         self.motion.append(mean)
@@ -69,7 +67,7 @@ class SurfaceMotion:
 def in_cells(
     motion: NDArray[np.float32], weight: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(r, c, C) mean over each cell of a motion (h, w, C), weighed by (h, w), and (r, c) the weight's."""
+    """Weighted mean (r, c, C) over cells of a motion (h, w, C), and mean (r, c) of the weight (h, w)."""
     height, width = weight.shape
     size = (CELLS.columns, max(2, round(CELLS.columns * height / width)))
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
@@ -81,79 +79,75 @@ def in_cells(
 
 @dataclass(frozen=True, eq=False)
 class PulseEstimate:
-    """All rhythms of one recording, in the components of its surface motion."""
+    """The rhythms of a recording, in the components of its surface motion."""
 
     rhythms: tuple[Rhythm, ...]
-    basis: NDArray[np.float32]  # (h, w, B) at the pixels, 0 outside the tissue
-    offset: Floats
-    """(B, C) coefficients of the rest frame's own place in the rhythms, from which motion is measured."""
-    rest_noise: NDArray[np.float32]
-    """(h, w, C) what all frames without contact have in common besides: the rest frame's noise."""
-    amplitudes_px: tuple[float, ...]
-    """Of each rhythm, in space if known: half of the way from end to end, median over the tissue."""
+    basis: NDArray[np.float32]  # (h, w, B) polynomials at the pixels; 0 outside the tissue
+    offset: Floats  # (B, C) coefficients that make the motion zero at the time of the rest frame
+    rest_noise: NDArray[np.float32]  # (h, w, C) constant residual of frames without contact
+    amplitudes_px: tuple[float, ...]  # of each rhythm, in 3D if known: median over the tissue
 
     def at(self, time_s: float) -> NDArray[np.float32]:
-        """(h, w, C) by which the surface has moved by itself since the rest frame, or seems to have."""
+        """Pulsation (h, w, C) since the rest frame, with the noise of the rest frame."""
         now = sum((rhythm.at(np.array([time_s]))[0] for rhythm in self.rhythms), self.offset)
         return np.asarray(self.basis @ now.astype(np.float32) + self.rest_noise, np.float32)
 
     def describe(self, mm_per_px: float) -> str:
-        """Amplitudes and rates in words; `mm_per_px`: of the pixels that flow is on."""
+        """A sentence on amplitudes and rates; `mm_per_px`: of the pixels of the flow."""
         parts = [
             f"{mm_per_px * amplitude:.2g} mm at {rhythm.rate_hz:.3g} Hz"
             for rhythm, amplitude in zip(self.rhythms, self.amplitudes_px, strict=True)
         ]
-        return f"the whole surface moves by itself, {' and '.join(parts)}: taken off"
+        return f"the whole surface pulsates by {' and '.join(parts)}: this motion is removed"
 
 
 @dataclass(frozen=True, eq=False)
 class PulseSearch:
-    """What a search for rhythms found, and in which frames."""
+    """Result of a search for rhythms."""
 
-    pulse: PulseEstimate | None  # None: there is none, or too little shows it
-    free_s: Floats  # times of the followed frames that were taken for free of contact
-    rates_hz: Span | None  # between which rhythms were looked for; None: they weren't
-    reason: str = ""  # why they weren't
-    camera: CameraPath | None = None
-    """The camera's motion in what the rhythms leave; None: there is none, or its surroundings show it."""
+    pulse: PulseEstimate | None  # None: not found
+    free_s: Floats  # times of the tracked frames that are assumed to be without contact
+    rates_hz: Span | None  # searched rates; None: no search was possible
+    reason: str = ""  # why no search was possible
+    camera: CameraPath | None = None  # camera motion found on the tissue; None: none, or on surroundings
 
     def describe(self) -> str:
-        """What heart or breath might have been missed, in words; empty if neither was."""
+        """A sentence on pulsation that the search may have missed; empty if it covers heart and breath."""
         if self.rates_hz is None:
             return (
-                f"heart and breath were not looked for: {self.reason}. "
-                "If the tissue moves by itself, that is not taken off"
+                f"heart and breath were not searched: {self.reason}. "
+                "Pulsation of the tissue, if any, is not removed"
             )
         low, high = self.rates_hz
-        if low <= 0.21 and high >= 1.5:  # breath under anaesthesia, 12 a minute, and a quick heart, 90
+        if low <= 0.21 and high >= 1.5:  # breath under anaesthesia, 12 a minute, and a fast heart, 90
             return ""
         none = "no heart or breath was found, but " if self.pulse is None else "of heart and breath, "
         return (
-            f"{none}only rates from {low:.2g} to {high:.2g} Hz would show in {_count(self.free_s)}. "
-            "Slower or faster motion of the tissue's own is not taken off"
+            f"{none}only rates from {low:.2g} to {high:.2g} Hz show in {_count(self.free_s)}. "
+            "Slower or faster pulsation is not removed"
         )
 
 
 def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = ()) -> PulseSearch:
-    """The surface's own rhythms, looked for in the frames without contact.
+    """Searches the frames without contact for rhythms of the surface.
 
     Args:
-        surface: of the whole recording.
+        surface: motion over the whole recording.
         rest_s: time of the rest frame [s].
-        free_s: spans known to be without contact [s]; none: the frames that least depart from smooth and
-            periodic motion are taken.
+        free_s: spans known to be without contact [s]; if empty, frames of smooth and periodic motion are
+            used.
     """
     time_s = np.array(surface.time_s)
     if len(time_s) < CELLS.frames:
         return _too_few(time_s)
     cells = _Cells(surface, np.array([1.0, 1.0, surface.depth_weight])[: surface.motion[0].shape[2]])
     if len(cells.basis) < 2 * cells.basis.shape[1]:
-        return PulseSearch(None, time_s, None, "too little of the picture is tissue that could be followed")
+        return PulseSearch(None, time_s, None, "too little of the picture is tracked tissue")
     usable = (cells.weight > 0).mean(axis=1) > 0.5
     if free_s:
         smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
     else:
-        # As smooth as the smoothest fifth: a contact's motion is not.
+        # Frames about as smooth as the smoothest fifth: motion by a contact is less smooth.
         misfit = cells.misfit(cells.coefficients)
         smooth = usable
         if usable.any():
@@ -175,33 +169,29 @@ def _too_few(free_s: Floats) -> PulseSearch:
 
 def _count(free_s: Floats) -> str:
     span = float(np.ptp(free_s)) if len(free_s) else 0.0
-    return f"the {len(free_s)} frames over {span:.3g} s that could be followed without contact"
+    return f"the {len(free_s)} tracked frames without contact over {span:.3g} s"
 
 
 class _Cells:
-    """The P cells of a surface that are visible in most frames, and the smooth motion that fits them."""
+    """The P cells of a surface that are visible in most frames, and the smooth motion fitted to them."""
 
     def __init__(self, surface: SurfaceMotion, weight: Floats | None = None) -> None:
-        """`weight`: (c,) of the first components, the only ones that are used; None: all of them."""
+        """`weight`: (c,) of the first c components, the only ones used; None: all components."""
         visible = np.stack(surface.visible).astype(np.float64)
         count, rows, columns = visible.shape
         y, x = np.mgrid[:rows, :columns] + 0.5
         places = np.column_stack([x.ravel() / columns, y.ravel() / rows])
         visible = visible.reshape(count, -1)
         self.time_s = np.array(surface.time_s)
-        self.used = np.median(visible, axis=0) > CELLS.visible
-        """(r c,) which of all cells they are."""
-        self.basis = _polynomials(places[self.used])
-        """(P, B)."""
-        self.weight = np.where(visible[:, self.used] > CELLS.visible, visible[:, self.used], 0.0)
-        """(T, P)."""
+        self.used = np.median(visible, axis=0) > CELLS.visible  # (r c,)
+        self.basis = _polynomials(places[self.used])  # (P, B)
+        self.weight = np.where(visible[:, self.used] > CELLS.visible, visible[:, self.used], 0.0)  # (T, P)
         motion = np.stack(surface.motion).reshape(*visible.shape, -1).astype(np.float64)[:, self.used]
-        self.motion = motion if weight is None else motion[..., : len(weight)] * weight
-        """(T, P, C)."""
+        self.motion = motion if weight is None else motion[..., : len(weight)] * weight  # (T, P, C)
 
     @cached_property
     def coefficients(self) -> Floats:
-        """(T, B, C) of the polynomials that fit each frame best."""
+        """Coefficients (T, B, C) of the polynomials that fit each frame best."""
         gram = np.einsum("tp,pa,pb->tab", self.weight, self.basis, self.basis, optimize=True)
         size = gram.shape[1]
         gram += 1e-3 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / size * np.eye(size)
@@ -209,14 +199,14 @@ class _Cells:
         return np.asarray(np.linalg.solve(gram, right), np.float64)
 
     def misfit(self, coefficients: Floats) -> Floats:
-        """(T,) root mean square over cells of what polynomials (T, B, C) leave."""
+        """Root mean square residual (T,) over cells for coefficients (T, B, C)."""
         left = self.motion - np.einsum("pa,tac->tpc", self.basis, coefficients)
         total = (np.square(left).sum(axis=2) * self.weight).sum(axis=1)
         return np.asarray(np.sqrt(total / np.maximum(self.weight.sum(axis=1), 1e-9)), np.float64)
 
     def rest_noise(self, free: Flags) -> Floats:
-        """(P, C) median over the frames `free` (T,) of what smooth motion leaves, as far as it can be noise:
-        motion is measured from the rest frame, whose noise moves the same cells in all of them."""
+        """Median residual (P, C) over the frames `free` (T,), limited to the size of noise: noise of the rest
+        frame displaces a cell equally in all frames."""
         left = self.motion[free] - np.einsum("pa,tac->tpc", self.basis, self.coefficients[free])
         left[self.weight[free] == 0] = np.nan
         enough = (self.weight[free] > 0).mean(axis=0) > 0.5
@@ -231,7 +221,7 @@ class _Cells:
 def _least_trimmed(
     cells: _Cells, usable: Flags, smooth: Flags, rounds: int
 ) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...], Flags]:
-    """What `find_rhythms` gives on the smooth frames, then on those that it explains, and these, (T,)."""
+    """Alternates `find_rhythms` and the selection of the frames (T,) that it explains."""
     free = fitted = smooth
     rhythms: tuple[Rhythm, ...] = ()
     others: tuple[Rhythm, ...] = ()
@@ -244,7 +234,7 @@ def _least_trimmed(
             break
         own = _sum((*rhythms, *others), cells.time_s)
         misfit = cells.misfit(own + (cells.coefficients - own)[fitted].mean(axis=0))
-        # Of them as little is left as of most smooth frames; as of most fitted ones would let contacts in.
+        # The limit is relative to smooth frames: relative to fitted ones it would admit contacts.
         free = usable & (misfit <= CELLS.explained * np.median(misfit[smooth]) + CELLS.noise_px)
         if (free == fitted).all():
             break
@@ -254,12 +244,12 @@ def _least_trimmed(
 def _estimate(
     surface: SurfaceMotion, rhythms: Sequence[Rhythm], others: Sequence[Rhythm], free: Flags, rest_s: float
 ) -> PulseEstimate:
-    """Rhythms of known phase fitted to all components in the frames `free` (T,), with what isn't periodic."""
+    """Fits rhythms of known phase to all components in the frames `free` (T,), with offset and rest noise."""
     cells = _Cells(surface)
     t, coefficients = cells.time_s[free], cells.coefficients[free]
     fitted = fit(t, coefficients.reshape(len(t), -1), (*rhythms, *others), np.eye(coefficients.shape[1]))
     own, others = fitted[: len(rhythms)], fitted[len(rhythms) :]
-    # Where in its path the tissue lay at rest, from all frames: that moment's phase alone would be less sure.
+    # The offset at rest is fitted to all frames, which is more precise than the phase at that moment.
     left = coefficients - _sum(own, t) - (_sum(others, t) - _sum(others, np.array([rest_s])))
     line = np.column_stack([np.ones(len(t)), t - rest_s])
     offset = np.linalg.lstsq(line, left.reshape(len(t), -1), rcond=None)[0][0].reshape(left.shape[1:])
@@ -281,12 +271,12 @@ def _estimate(
 
 
 def _sum(rhythms: Sequence[Rhythm], time_s: Floats) -> Floats:
-    """(T, B, C) coefficients of several rhythms together; 0 of none."""
+    """Sum (T, B, C) of the coefficients of several rhythms; 0 without any."""
     return np.asarray(sum((one.at(time_s) for one in rhythms), np.zeros(1)), np.float64)
 
 
 def _polynomials(at: Floats) -> Floats:
-    """(P, B) products of Legendre polynomials up to `CELLS.degree` at places (P, 2) in 0..1."""
+    """Products (P, B) of Legendre polynomials up to `CELLS.degree` at places (P, 2) in 0..1."""
     x, y = (np.polynomial.legendre.legvander(2 * axis - 1, CELLS.degree) for axis in at.T)
     pairs = [(i, j) for i in range(CELLS.degree + 1) for j in range(CELLS.degree + 1 - i)]
     return np.stack([x[:, i] * y[:, j] for i, j in pairs], axis=1)

@@ -1,11 +1,12 @@
-"""The camera's motion where tissue fills the picture: the similarity in its flow that no contact explains.
+"""Camera motion where tissue fills the picture: the similarity part of the flow that contacts do not explain.
 
-A contact moves all tissue too, most near itself, and always in much the same shape: elasticity is linear. So
-what a frame's motion has besides its similarity is a few shapes times amounts, which no camera changes; each
-has a constant similarity of its own. A Kalman filter (J. Basic Eng. 82, 1960) separates the camera's, which
-changes, from these. Before a shape has been observed without the camera's motion, its similarity is that of
-the least forces on an elastic half-space (Johnson, Contact Mechanics, 1985, ch. 3) that make the rest of it.
-A recording's is smoothed from both ends (Rauch, Tung & Striebel, AIAA J. 3, 1965).
+A contact moves all of the tissue too, most near itself, and in a shape that is nearly constant because
+elasticity is linear. The motion of a frame besides its similarity is therefore a sum of a few shapes times
+amplitudes, which camera motion does not change; each shape comes with a constant similarity of its own. A
+Kalman filter (J. Basic Eng. 82, 1960) separates the similarity of the camera, which changes, from these.
+Until a shape has been observed without camera motion, its similarity is predicted from the smallest forces on
+an elastic half-space (Johnson, Contact Mechanics, 1985, ch. 3) that explain the shape. For recordings the
+estimate is smoothed in both directions (Rauch, Tung & Striebel, AIAA J. 3, 1965).
 """
 
 from __future__ import annotations
@@ -29,49 +30,46 @@ from synth.recording_flow.pulse import CELLS, PulseEstimate, SurfaceMotion, in_c
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Constants of the filter: by hand, on closed forms (tests/.../test_shared_motion.py)."""
+    """Constants of the filter, chosen by hand on closed forms (tests/.../test_shared_motion.py)."""
 
-    least_px: float = 0.3  # of a first or sudden motion that is a camera's
-    impure: float = 0.2  # share of it that may be no similarity
-    jump: float = 5.0  # usual steps: what is sudden
-    usual: int = 8  # steps whose median is usual
-    noise_px: float = 0.02  # of a frame's similarity
-    calm_px: float = 0.005  # by which a camera at rest moves from frame to frame
-    rounds: int = 4  # of a robust fit
-    most: float = 0.7  # quantile over cells: less is left of most; a tool and its shadow are in the rest
-    shapes: int = 4  # of contacts, at most
-    new_px: float = 0.12  # what shapes leave of a motion is another shape's, if it is more
-    new: float = 0.15  # and if it is more than this share of the motion
-    doubt: float = 0.5  # deviation of the half-space's similarity, for a shape of 1 px [px]
-    nodes: int = 8  # of the half-space's lattice, across the picture
+    least_px: float = 0.3  # least length of a first or sudden camera motion
+    impure: float = 0.2  # largest residual of its fit by a similarity, over its length
+    jump: float = 5.0  # least length of a sudden motion over the usual step
+    usual: int = 8  # number of steps whose median is the usual step
+    noise_px: float = 0.02  # noise of the similarity of a frame
+    calm_px: float = 0.005  # step of a camera at rest
+    rounds: int = 4  # iterations of a robust fit
+    most: float = 0.7  # quantile over cells of the residual: a tool and its shadow are above it
+    shapes: int = 4  # most shapes
+    new_px: float = 0.12  # least residual that becomes a new shape
+    new: float = 0.15  # the same over the motion without its similarity
+    doubt: float = 0.5  # standard deviation of the predicted similarity of a shape of 1 px [px]
+    nodes: int = 8  # loads on the half-space across the picture
     poisson: float = 0.45  # of the half-space
-    normal: float = 0.3  # motion across that a load along the view makes, over that of one across
-    blunt: float = 0.7  # of loads, in spacings of the lattice
-    ridge: float = 0.2  # of least forces, over the mean of the Gram matrix's diagonal
+    normal: float = 0.3  # lateral motion by an axial load over that by a lateral load
+    blunt: float = 0.7  # radius of a load, in spacings of the loads
+    ridge: float = 0.2  # regularisation of forces, over the mean diagonal of the Gram matrix
 
 
 MODEL = MotionModel()
 
 
 class SharedMotion:
-    """What of a surface's motion is the camera's, frame by frame."""
+    """Estimates camera motion from the motion of tissue, frame by frame."""
 
     def __init__(self, tissue: Flags, shapes: Floats | None = None) -> None:
-        """At the rest frame. `tissue`: (h, w); `shapes`: (2 P, S) that contacts are known to make, if any."""
+        """Starts at rest with a tissue mask (h, w) and the known shapes (2 P, S) of contacts, if any."""
         self._basis = SimilarityBasis(tissue.shape)
         inside = in_cells(np.zeros((*tissue.shape, 2), np.float32), tissue.astype(np.float32))[1]
         self._inside = inside > 0.5
         rows, columns = inside.shape
         y, x = np.mgrid[:rows, :columns] + 0.5
         at = np.column_stack([x.ravel() / columns, y.ravel() / rows]) * tissue.shape[::-1] - 0.5
-        self._columns = self._basis.design(at)
-        """(2 P, 4) of the P cells' x and y."""
+        self._columns = self._basis.design(at)  # (2 P, 4) for x and y of the P cells
         self._unit = self._rms(self._columns)
         self._prior = _half_space(at, tissue.shape, self._columns)
-        self.shapes = np.zeros((len(self._columns), 0))
-        """(2 P, S) what is no similarity of the contacts' motions, each with a root mean square of 1 px."""
-        self.course: Course = []
-        """Since it first moved."""
+        self.shapes = np.zeros((len(self._columns), 0))  # (2 P, S) with a root mean square of 1 px each
+        self.course: Course = []  # since the first camera motion
         self._grows = shapes is None
         self._state, self._covariance = np.zeros(4), np.zeros((4, 4))
         self._before: tuple[Floats, Floats] | None = None
@@ -85,12 +83,12 @@ class SharedMotion:
     def add(
         self, time_s: float, motion: NDArray[np.float32], visible: NDArray[np.float32]
     ) -> Similarity | None:
-        """Where the camera is in a frame; None: it has stood still since the rest frame.
+        """Adds a frame and returns the camera motion; None: none since the rest frame.
 
         Args:
             time_s: of the frame.
-            motion: (r, c, 2) px of the cells, see `in_cells`.
-            visible: (r, c) share of each that is.
+            motion: (r, c, 2) px, of the cells, see `in_cells`.
+            visible: (r, c) visible share of each cell.
         """
         weight = np.where(visible > CELLS.visible, visible * self._inside, 0.0).ravel().astype(np.float64)
         now = motion.reshape(-1).astype(np.float64)
@@ -115,12 +113,12 @@ class SharedMotion:
         count = len(self._state)
         predicted = self._covariance.copy()
         predicted[range(4), range(4)] += np.square(moves / self._unit) / (1 if change else 2)
-        seen = np.hstack([np.eye(4), *(amount * np.eye(4) for amount in amounts)])
+        observed = np.hstack([np.eye(4), *(amount * np.eye(4) for amount in amounts)])
         noise = np.diag((MODEL.noise_px**2 + left_px**2) / np.square(self._unit) / 2)
-        gain = predicted @ seen.T @ np.linalg.inv(seen @ predicted @ seen.T + noise)
+        gain = predicted @ observed.T @ np.linalg.inv(observed @ predicted @ observed.T + noise)
         last = self._state
-        self._state = last + gain @ (alike - seen @ last)
-        keep = np.eye(count) - gain @ seen
+        self._state = last + gain @ (alike - observed @ last)
+        keep = np.eye(count) - gain @ observed
         self._covariance = keep @ predicted @ keep.T + gain @ noise @ gain.T
         self._past.append((self._state, self._covariance, predicted))
         self._times.append(time_s)
@@ -135,7 +133,7 @@ class SharedMotion:
         return found
 
     def path(self) -> CameraPath | None:
-        """Where the camera was in all frames, by what came after them too; None: it stood still."""
+        """Camera motion in all frames, smoothed with later frames; None: none."""
         if not self._starts:
             return None
         state, covariance, predicted = self._past[-1]
@@ -151,7 +149,7 @@ class SharedMotion:
         return CameraPath(np.array(self._times), (*still, *moved[self._starts - 1 :]))
 
     def _fit(self, motion: Floats, weight: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]:
-        """(4,) similarity, (S,) amounts of shapes, (2 P,) what is left, of the P cells that are visible."""
+        """Robust fit to visible cells: similarity (4,), amplitudes (S,) of shapes and residual (2 P,)."""
         both, left = np.hstack([self._columns, shapes]), motion
         answer, sure = np.zeros(both.shape[1]), weight
         for _ in range(MODEL.rounds):
@@ -163,7 +161,7 @@ class SharedMotion:
         return np.asarray(answer[:4]), np.asarray(answer[4:]), left * np.repeat(weight > 0, 2)
 
     def _learn(self, shape: Floats) -> None:
-        """Another shape, (2 P,), and of which similarity it may be."""
+        """Adds a shape (2 P,) and the prediction of its similarity to the state."""
         both = np.hstack([self._columns, self.shapes])
         shape = shape - both @ np.linalg.lstsq(both, shape, rcond=None)[0]
         shape = shape / self._rms(shape[:, None])[0]
@@ -176,7 +174,7 @@ class SharedMotion:
         self._covariance = covariance
 
     def _sudden(self, now: Floats, weight: Floats, usual: float, since_rest: tuple[float, float]) -> float:
-        """Length of a motion that is a similarity and nothing else, since the frame before or first; or 0."""
+        """Length of a sudden or first motion that is a pure similarity; 0: there is none."""
         found = [] if self._starts else [since_rest]
         if self._before is not None:
             both = np.minimum(weight, self._before[1])
@@ -198,40 +196,40 @@ class SharedMotion:
         return Similarity(self._basis.matrix(state[:4]), deviation, self._length(state[:4]))
 
     def _length(self, answer: Floats) -> float:
+        """Root mean square of a similarity (4,) over the cells [px]."""
         return float(self._rms((self._columns @ answer)[:, None])[0])
 
     @staticmethod
     def _rms(columns: Floats) -> Floats:
-        """(C,) root mean square length of the cells' vectors in columns (2 P, C)."""
+        """Root mean square (C,) over cells of the vectors in columns (2 P, C)."""
         return np.asarray(np.sqrt(2 * np.square(columns).mean(axis=0)), np.float64)
 
     @staticmethod
     def _size(left: Floats, weight: Floats) -> float:
-        """Less than this is left of most cells: of a tool's, or its shadow's, it may be much."""
+        """Size of a residual (2 P,) [px]: a quantile over cells that ignores a tool and its shadow."""
         return float(np.quantile(np.linalg.norm(left.reshape(-1, 2), axis=1)[weight > 0], MODEL.most))
 
 
 def find_path(surface: SurfaceMotion, pulse: PulseEstimate | None) -> CameraPath | None:
-    """The camera's over a recording, of what its pulse leaves; None: it stood still."""
+    """Camera motion over a recording, from the motion without pulsation; None: none."""
     inside = surface.tissue.astype(np.float32)
 
-    def own(time_s: float) -> NDArray[np.float32] | float:
-        return 0.0 if pulse is None else in_cells(pulse.at(time_s)[..., :2], inside)[0]
-
-    def through(shared: SharedMotion) -> SharedMotion:
+    def estimate(shared: SharedMotion) -> SharedMotion:
         for time_s, motion, visible in zip(surface.time_s, surface.motion, surface.visible, strict=True):
-            shared.add(time_s, motion[..., :2] - own(time_s), visible)
+            own = 0.0 if pulse is None else in_cells(pulse.at(time_s)[..., :2], inside)[0]
+            shared.add(time_s, motion[..., :2] - own, visible)
         return shared
 
-    once = through(SharedMotion(surface.tissue))
-    return through(SharedMotion(surface.tissue, once.shapes)).path() if once.course else None
+    first = estimate(SharedMotion(surface.tissue))
+    return estimate(SharedMotion(surface.tissue, first.shapes)).path() if first.course else None
 
 
 def _half_space(at: Floats, size: tuple[int, ...], columns: Floats) -> Floats:
-    """(4, 2 P) the similarity in the motion of cells at places (P, 2) px by forces, of what else it has.
+    """Matrix (4, 2 P) that predicts the similarity of a motion by forces from the rest of the motion.
 
-    Cerruti's and Boussinesq's solutions on a lattice of nodes in and around a picture (h, w), blunted by
-    their spacing; along the view with the share in the plane that blunt tips have on a surface that bulges.
+    The motion of cells at places (P, 2) px follows Cerruti's and Boussinesq's solutions for loads on a
+    lattice in and around a picture (h, w), smoothed over their spacing. The lateral motion by axial loads has
+    the share that blunt tips have on a curved surface.
     """
     apart = size[1] / MODEL.nodes
     x, y = (apart * (np.arange(-1, round(length / apart) + 1) + 0.5) for length in size[::-1])
@@ -243,7 +241,7 @@ def _half_space(at: Floats, size: tuple[int, ...], columns: Floats) -> Floats:
     across_y = [mixed * dx * dy, along + mixed * dy**2, MODEL.normal * dy / r**2]
     moved = np.stack([np.hstack(across_x), np.hstack(across_y)], 1).reshape(2 * len(at), -1)
     inverse = np.linalg.pinv(columns)
-    beside = moved - columns @ (inverse @ moved)
-    gram = beside @ beside.T
+    rest = moved - columns @ (inverse @ moved)
+    gram = rest @ rest.T
     gram += MODEL.ridge * np.trace(gram) / len(gram) * np.eye(len(gram))
-    return np.asarray(inverse @ moved @ np.linalg.solve(gram, beside).T, np.float64)
+    return np.asarray(inverse @ moved @ np.linalg.solve(gram, rest).T, np.float64)

@@ -1,6 +1,6 @@
-"""A film's motion: frames are decoded, shrunk, masked and followed from the rest frame, pulse taken off.
+"""Motion in a video: decodes, downsamples, masks and tracks frames, and removes camera motion and pulsation.
 
-The one way of a film, for `learn predict`, `bench score`, `bench check` and `bench live`.
+`learn predict`, `bench score`, `bench check` and `bench live` all use it.
 """
 
 from __future__ import annotations
@@ -37,31 +37,29 @@ from synth.video.mask_files import MASKS
 from synth.video.read import Picture
 
 A = TypeVar("A", bound=np.generic)
-Size = tuple[int, int]
-"""Height, width [px]."""
+Size = tuple[int, int]  # height, width [px]
 
-_SEARCHED = 12  # frames, and one in so many, that are searched for what is no tissue
-LEAST_COLUMNS = 320
-"""That `shrink` 0 leaves a picture: the networks' grids are no finer."""
+_SEARCHED = 12  # the first frames, and then one in this many, are searched for foreground
+LEAST_COLUMNS = 320  # least width with `shrink` 0: the grids of the networks are no finer
 
 
 @dataclass(frozen=True)
 class RecordingFlowSettings:
-    """How a film is followed."""
+    """Settings for tracking a video."""
 
     backend: str = "tvl1"
     """Flow estimator."""
     shrink: int = 0
-    """Flow is computed on pictures so many times smaller; 0: the most that leaves `LEAST_COLUMNS`."""
+    """Factor by which pictures are downsampled for flow; 0: the largest that leaves `LEAST_COLUMNS`."""
     rate_hz: float | None = 10.0
-    """At most so many frames a second are looked at; None: all."""
+    """Largest number of frames tracked per second; None: all."""
     pulse: bool = True
-    """Whether the tissue's own periodic motion is looked for, and taken off."""
+    """Whether pulsation of the tissue by heart and breath is estimated and removed."""
     masks: str = "auto"
-    """What of tools and highlights is masked, one of `MASKS`."""
+    """Which instruments and highlights are masked, one of `MASKS`."""
 
     def __post_init__(self) -> None:
-        """Raises UserError for a rate or a shrinking that can't be."""
+        """Raises UserError for an invalid rate or factor of downsampling."""
         if self.rate_hz is not None:
             as_positive("rate_hz (None: every frame)", self.rate_hz)
         if self.shrink not in range(65):
@@ -69,67 +67,62 @@ class RecordingFlowSettings:
 
 
 def everywhere(size: Size) -> Flags:
-    """(H, W) True: all of the picture is tissue."""
+    """Tissue mask (H, W) that covers the whole picture."""
     return np.ones(size, bool)
 
 
 @dataclass(frozen=True)
 class Footage:
-    """What is followed."""
+    """A video to be tracked."""
 
-    pictures: Iterable[Picture]
-    """Its frames in order, from the first on."""
-    name: str
-    """For messages."""
-    tissue: Callable[[Size], Flags] = everywhere
-    """(H, W) where there is tissue in the rest frame."""
+    pictures: Iterable[Picture]  # all frames in order
+    name: str  # for messages
+    tissue: Callable[[Size], Flags] = everywhere  # (H, W) tissue mask of the rest frame
+    # (H, W) instrument mask of a frame, None: empty; if the function is None, instruments are detected.
     tool: Callable[[int, Size], Flags | None] | None = None
-    """(H, W) where the tool is in a frame, None for nowhere; if not given it is found in the pictures."""
     rest_frame: int = 0
-    only: Container[int] | None = None
-    """Numbers of the frames that are followed, the rest frame's among them; None: all."""
+    only: Container[int] | None = None  # numbers of the frames to track, with the rest frame; None: all
 
 
-class SecondView(Protocol):
-    """A second eye or a depth camera."""
+class DepthSource(Protocol):
+    """A right camera or a depth camera."""
 
-    scale_mm_per_px: float
-    """Of the film's own pixels."""
+    scale_mm_per_px: float  # of the original pixels of the video
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
-        """Motion in space of a frame that could be followed, None if it lacks it; first of the rest frame."""
+        """Motion in three dimensions of a trusted frame, the rest frame first; None: picture missing."""
         ...
 
     def depth_mm(self) -> Map | None:
-        """(h, w) along the view in the frame last followed, NaN where it is not known; None: nowhere."""
+        """Depth (h, w) along the optical axis in the last frame, NaN where unknown; None: unknown."""
         ...
 
 
 class Pace(Protocol):
-    """When the frames of a stream arrive."""
+    """Times at which the frames of a stream arrive."""
 
     def start(self, time_s: float) -> None:
-        """The rest frame, of that time on the film's clock, has been worked on."""
+        """Starts the clock when the rest frame, at this time of the video, has been processed."""
         ...
 
     def is_due(self, index: int, time_s: float) -> bool:
-        """Whether a frame is worked on: waits until it arrives."""
+        """Waits until a frame arrives and returns whether it is processed."""
         ...
 
     def spare_s(self, time_s: float) -> float:
-        """How long it is to a frame's arrival [s]."""
+        """Time until a frame arrives [s]."""
         ...
 
 
 @dataclass(frozen=True)
 class _Steadied(Picture):
-    """A frame shrunk, as a camera at rest would have taken it."""
+    """A downsampled frame without the camera motion found on its surroundings."""
 
     camera: Similarity | None = None
 
 
 class VideoFlow:
-    """Follows one film, once; what it finds out on the way stands in its attributes."""
+    """Tracks one video, once; results over the whole video are attributes."""
 
     def __init__(
         self,
@@ -137,50 +130,43 @@ class VideoFlow:
         settings: RecordingFlowSettings,
         flow: LocalFlow | None = None,
         pulse: PulseSearch | None = None,
-        second: SecondView | None = None,
+        depth: DepthSource | None = None,
         pace: Pace | None = None,
         watch: Stopwatch | None = None,
     ) -> None:
-        """Nothing is decoded yet.
+        """Decodes nothing yet.
 
         Args:
-            footage: what is followed.
-            settings: how.
-            flow: where flow is computed, closed by the caller; None: in this process.
-            pulse: what a first pass found, and the camera's motion; taken off every frame.
-            second: what shows motion in space, if there is something.
-            pace: of a stream; None: every frame has its turn. Flow runs once before its start, for loading is
-                no latency.
-            watch: what the time spent is added to; None: one of its own.
+            footage: the video.
+            settings: of the tracking.
+            flow: computes the flow and is closed by the caller; None: in this process.
+            pulse: pulsation and camera motion from a first pass, removed from every frame.
+            depth: source of motion in three dimensions, if any.
+            pace: of a stream; None: every frame is processed. Flow runs once before the stream starts, so
+                that compilation does not add to the latency.
+            watch: collects the time spent; None: a new one.
 
         Raises:
-            UserError: no such masks.
+            UserError: no such kind of masks.
         """
         if settings.masks not in MASKS:
             raise UserError(f"masks: no kind {settings.masks!r}; there are {', '.join(MASKS)}")
         self.footage, self.settings, self.watch = footage, settings, watch or Stopwatch()
-        self.pulse, self.second, self.summary = pulse, second, TrackingSummary()
-        self.removed = None if pulse is None else pulse.pulse
-        """What is taken off the motion of every frame."""
-        self.tissue = np.zeros((0, 0), bool)
-        """(h, w), shrunk as the pictures are; empty before the rest frame."""
-        self.shrink, self.size = settings.shrink, (0, 0)
-        """How many times smaller than `size`, height and width of the film's own pictures, these are."""
-        self.rest_s: float | None = None
-        """Time of the rest frame, if it has one."""
-        self.decoded = self.peak_bytes = 0
-        """Frames, and memory of the flow's own process."""
-        self.found: list[Finding] = []
-        """What was found wrong on the way; see `findings`."""
-        self.faults: VideoFaults | None = None
-        """What its pictures suffer from; None before the rest frame."""
+        self.pulse, self.summary = pulse, TrackingSummary()
+        self.removed = None if pulse is None else pulse.pulse  # subtracted from the motion of every frame
+        self.tissue = np.zeros((0, 0), bool)  # (h, w) on the downsampled pixels; empty before the rest frame
+        self.shrink, self.size = settings.shrink, (0, 0)  # factor of downsampling; height, width of the video
+        self.rest_s: float | None = None  # time of the rest frame, if known
+        self.decoded = self.peak_bytes = 0  # number of frames; memory of the flow process
+        self.faults: VideoFaults | None = None  # None before the rest frame
+        self._depth, self._findings = depth, list[Finding]()
         self._flow, self._pace = flow or LocalFlow(), pace
         self._camera: CameraTracker | None = None  # from the rest frame on
         self._path = None if pulse is None else pulse.camera
-        self._shared: SharedMotion | None = None  # of a stream whose tissue fills the picture
-        self._course: Course = []  # the camera's, found on the tissue
-        self._foreground: ForegroundSearch | None = None  # not of a stream
-        self._surface: SurfaceMotion | None = None  # only where a pulse is to be found
+        self._shared: SharedMotion | None = None  # only for a stream whose tissue fills the picture
+        self._course: Course = []  # of the camera, found on the tissue
+        self._foreground: ForegroundSearch | None = None  # not for a stream
+        self._surface: SurfaceMotion | None = None  # only for a search for pulsation
         self._depth_weights: list[float] = []
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
@@ -188,20 +174,20 @@ class VideoFlow:
         self._fault, self._rest_rgb, self._changes = "", np.zeros((0, 0, 3), np.uint8), False
 
     def frames(self, progress: Callable[[int], None] = lambda done: None) -> Iterator[FrameMotion]:
-        """The frames that are followed, the rest frame first, holding a few at a time.
+        """Yields the motion of tracked frames, the rest frame first, with a few frames in memory.
 
-        With flow elsewhere, the caller has its turn while the flow of the next frame is on its way.
+        If flow runs in another process, it computes the next frame while the caller processes this one.
 
         Args:
-            progress: told after every decoded frame how many there were.
+            progress: called after every decoded frame with their number.
 
         Raises:
-            UserError: unreadable film, no tissue, masks or frames of another size, no such estimator.
+            UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
         """
         try:
             yield from self._frames(progress)
         except BrokenExecutor:
-            raise UserError("the process that computes the flow ended; out of memory?") from None
+            raise UserError("the flow process ended unexpectedly: is it out of memory?") from None
 
     def _frames(self, progress: Callable[[int], None]) -> Iterator[FrameMotion]:
         pictures = iter(self.footage.pictures)
@@ -213,13 +199,13 @@ class VideoFlow:
                 break
             self.decoded += 1
             if self.faults is not None and picture.time_s is not None:
-                self.faults.see(picture.index, picture.time_s, picture.rgb)
-            while waiting and self._is_there(waiting[0][2], picture.time_s):
+                self.faults.add_decoded(picture.index, picture.time_s, picture.rgb)
+            while waiting and self._is_ready(waiting[0][2], picture.time_s):
                 yield self._finish(*waiting.popleft())
             if self._is_wanted(picture.index, picture.time_s):
                 is_rest = self.tissue.size == 0
                 if is_rest:
-                    self._measure(picture)
+                    self._start(picture)
                 small, proposal, masking_s = self._prepare(picture)
                 if is_rest:
                     yield self._begin(small, proposal, masking_s)
@@ -228,7 +214,7 @@ class VideoFlow:
                 elif self._fault:
                     nothing = FrameMotion.none(self.tissue.shape, trusted=False)
                     self.summary.add(nothing, self.tissue)
-                    yield self._in_space(self._pictured(nothing, small, masking_s))
+                    yield self._with_depth(self._with_picture(nothing, small, masking_s))
                 else:
                     waiting.append((small, masking_s, self._flow.submit(small.rgb, proposal)))
                 if len(waiting) > self._flow.ahead:
@@ -238,9 +224,9 @@ class VideoFlow:
             yield self._finish(*one)
 
     def find_pulse(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
-        """The tissue's own motion, and the camera's where tissue fills the picture; all frames are through.
+        """Estimates pulsation, and camera motion where tissue fills the picture, after the last frame.
 
-        None where there is neither, or it is off.
+        Returns None if there is neither, or if `pulse` is off in the settings.
 
         Args:
             free_s: spans without contact, if known [s].
@@ -261,49 +247,49 @@ class VideoFlow:
 
     @property
     def findings(self) -> list[Finding]:
-        """What is wrong with this film, once it is through."""
+        """Findings on the video, after the last frame."""
         fault = ""
         if self._fault:
             fault = f"the rest frame is {self._fault}"
         elif self.summary.frames and not self._changes:
             fault = "the picture never changes"
-        between = [] if self._foreground is None else self._foreground.findings
+        foreground = [] if self._foreground is None else self._foreground.findings
         moved = [] if self._camera is None else self._camera.describe(self.shrink)
         faults = [] if self.faults is None or fault else self.faults.findings()
         course = self._course or ([] if self._shared is None else self._shared.course)
         if course:
-            how = "found on tissue alone, of which a contact or a pulse may move all that shows"
+            how = "it is estimated on tissue alone, which contacts and pulsation move too"
             moved.append(f"{describe_course(course, self.shrink)}; {how}")
         bad = [Finding("bad", "pictures", fault)] if fault else []
-        return [*bad, *self.found, *between, *faults, *(Finding("odd", "camera", one) for one in moved)]
+        camera = [Finding("odd", "camera", one) for one in moved]
+        return [*bad, *self._findings, *foreground, *faults, *camera]
 
     @property
     def fault(self) -> str:
-        """Why nothing of this film is a measurement, once it is through; empty if something may be."""
+        """Reason why no number is valid, after the last frame; empty if there is none."""
         return first_fault(self.findings)
 
     @property
     def notes(self) -> list[str]:
-        """What was done to the film that its user should know; complete when all frames are through, and
-        the pulse looked for."""
+        """Sentences on the processing for reports, after the last frame and the search for pulsation."""
         missed = "" if self.pulse is None or self.fault else self.pulse.describe()
-        shrunk = [f"flow is computed on pictures {self.shrink} times smaller"] if self.shrink > 1 else []
-        left_out = [f"{n} of {self.decoded} frames {why} left out" for why, n in self._left_out.items()]
+        shrunk = [f"pictures are downsampled {self.shrink} times for flow"] if self.shrink > 1 else []
+        left_out = [f"left out: {n} of {self.decoded} frames {why}" for why, n in self._left_out.items()]
         return shrunk + left_out + ([missed] if missed else [])
 
     def _is_wanted(self, index: int, time_s: float | None) -> bool:
-        """Whether a frame is looked at; what isn't is counted."""
+        """Whether a frame is tracked; others are counted by reason."""
         if index < self.footage.rest_frame:
             reason = "before the rest frame"
         elif time_s is None:
             reason = "without a time"
         elif self.footage.only is not None and index not in self.footage.only:
-            reason = "not looked at"
+            reason = "outside the selection"
         elif time_s <= self._last_s:
-            reason = "whose time stands still or runs back"
-        # A fifth of the period early is in time.
+            reason = "whose time does not increase"
+        # A frame may be early by a fifth of the period.
         elif time_s < self._due_s - 0.2 * self._period_s:
-            reason = f"beyond {self.settings.rate_hz:g} a second"
+            reason = f"beyond {self.settings.rate_hz:g} per second"
         else:
             first = self._due_s == -math.inf
             due_s = time_s if first else max(self._due_s, time_s - 0.2 * self._period_s)
@@ -312,33 +298,35 @@ class VideoFlow:
         self._left_out[reason] += 1
         return time_s is None and index == self.footage.rest_frame
 
-    def _measure(self, rest: Picture) -> None:
-        """Sizes and tissue, from the rest frame."""
+    def _start(self, rest: Picture) -> None:
+        """Sets sizes and the tissue mask from the rest frame."""
         self.size = (rest.rgb.shape[0], rest.rgb.shape[1])
         self.shrink = self.settings.shrink or max(1, self.size[1] // LEAST_COLUMNS)
         tissue, bars = self.footage.tissue(self.size), find_bars(rest.rgb)
         if is_inside_out(tissue):
-            self._odd("tissue", "tissue.png marks the picture's border and not its middle: is it inverted?")
+            inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
+            self._findings.append(Finding("odd", "tissue", inverted))
         if (tissue & bars).any():
-            share = f"{100 * bars.mean():.0f}% of the picture are black bars, not taken for tissue"
-            self._odd("pictures", share)
+            share = f"{100 * bars.mean():.0f}% of the picture are black bars, removed from the tissue mask"
+            self._findings.append(Finding("odd", "pictures", share))
         self.tissue = shrink_mask(tissue & ~bars, self.shrink, 127)
         if not self.tissue.any():
-            raise UserError(f"{self.footage.name}: the picture of the tissue marks no tissue")
+            raise UserError(f"{self.footage.name}: the tissue mask marks no tissue")
         self.faults = VideoFaults(rest.rgb, shrink_picture(rest.rgb, self.shrink), self.tissue)
         self.rest_s = rest.time_s
         if self.settings.pulse and self.pulse is None:
             self._surface = SurfaceMotion(self.tissue)
 
     def _prepare(self, picture: Picture) -> tuple[_Steadied, Proposal, float]:
-        """A frame shrunk, its camera's motion undone, what of it may be no tissue, and the time [s]."""
+        """The downsampled frame without camera motion, its mask proposals, and the time spent [s]."""
         height, width = picture.rgb.shape[:2]
         if (height, width) != self.size:
-            raise UserError(f"frame {picture.index}: {width} x {height}, the rest frame is another size")
+            known = f"{self.size[1]} x {self.size[0]}"
+            raise UserError(f"frame {picture.index} is {width} x {height} px, but the rest frame is {known}")
         began = time.perf_counter()
         rgb, view = shrink_picture(picture.rgb, self.shrink), None
         if self.faults is not None and picture.time_s is not None:
-            self.faults.look(picture.time_s, picture.rgb, rgb)
+            self.faults.add_tracked(picture.time_s, picture.rgb, rgb)
         if self._camera is not None:
             with self.watch.stage("camera"):
                 if self._path is None:
@@ -353,11 +341,8 @@ class VideoFlow:
             proposal = self._mask(picture.index, rgb, view)
         return _Steadied(picture.index, picture.time_s, rgb, view), proposal, time.perf_counter() - began
 
-    def _odd(self, what: str, said: str) -> None:
-        self.found.append(Finding("odd", what, said))
-
     def _mask(self, index: int, rgb: Rgb, view: Similarity | None) -> Proposal:
-        """What of a frame is no tissue, or may be none."""
+        """Mask proposals of a frame."""
         kind, nothing = self.settings.masks, np.zeros(rgb.shape[:2], bool)
         glare = nothing if kind in ("none", "tool") else mask_detection.glare(rgb)
         tool = known = nothing
@@ -369,20 +354,18 @@ class VideoFlow:
                 known = known if view is None else view.undo(known.astype(np.uint8) * 255) > 127
         if view is not None:
             known = known | view.outside(known.shape)
-        return (
-            Proposal(glare, tool, known)
-            if kind == "auto"
-            else Proposal(nothing, nothing, glare | tool | known)
-        )
+        if kind == "auto":
+            return Proposal(glare, tool, known)
+        return Proposal(nothing, nothing, glare | tool | known)
 
     def _begin(self, small: _Steadied, proposal: Proposal, masking_s: float) -> FrameMotion:
-        """Starts the flow: nothing has moved."""
+        """Starts the flow and returns the rest frame without motion."""
         self._fault, self._rest_rgb = find_fault(small.rgb, self.tissue), small.rgb
         frame = FrameMotion.none(self.tissue.shape, trusted=not self._fault)
         if not self._fault:
             self._flow.begin(self.settings.backend, small.rgb, proposal, self.tissue)
             self._camera = CameraTracker(small.rgb, self.tissue, proposal.either | proposal.known)
-            # What all tissue shares may be its pulse, which is looked for first.
+            # Shared motion of the tissue may be pulsation; a search for it comes first.
             if self._camera.is_blind and self._surface is None and self._path is None:
                 self._shared = SharedMotion(self.tissue)
             if self._pace is not None:
@@ -390,10 +373,11 @@ class VideoFlow:
             frame = replace(frame, confidence=(self.tissue & ~proposal.known).astype(np.float32))
             if self._pace is None:
                 self._foreground = ForegroundSearch(self.tissue, self.shrink)
-        return self._looked_at(self._in_space(self._pictured(replace(frame, is_rest=True), small, masking_s)))
+        frame = self._with_picture(replace(frame, is_rest=True), small, masking_s)
+        return self._searched(self._with_depth(frame))
 
-    def _is_there(self, flow: Future[FrameMotion], time_s: float | None) -> bool:
-        """Whether a flow is there, or will be before a frame of that time arrives, which is waited for."""
+    def _is_ready(self, flow: Future[FrameMotion], time_s: float | None) -> bool:
+        """Waits for a flow until a frame of this time arrives; returns whether the flow is ready."""
         try:
             flow.result(0.0 if self._pace is None else self._pace.spare_s(time_s or 0.0))
         except TimeoutError:
@@ -401,8 +385,8 @@ class VideoFlow:
         return True
 
     def _finish(self, small: _Steadied, masking_s: float, flow: Future[FrameMotion]) -> FrameMotion:
-        """The motion of a frame whose flow was submitted, in space too, and without the pulse."""
-        frame = self._pictured(flow.result(), small, masking_s)
+        """The motion of a frame after its flow: without camera motion and pulsation, in stereo with depth."""
+        frame = self._with_picture(flow.result(), small, masking_s)
         if self._shared is not None and frame.trusted and small.time_s is not None:
             frame = self._without_camera(frame, small.time_s, self._shared)
         if frame.camera is not None:
@@ -412,54 +396,54 @@ class VideoFlow:
             frame = replace(frame, trusted=False)
         self.watch.add("flow", frame.cpu_s, frame.wall_s)
         self.peak_bytes = max(self.peak_bytes, frame.peak_bytes)
-        frame = self._in_space(frame)
+        frame = self._with_depth(frame)
         self.summary.add(frame, self.tissue)
-        return self._without_pulse(self._looked_at(frame))
+        return self._without_pulse(self._searched(frame))
 
     def _without_camera(self, frame: FrameMotion, time_s: float, shared: SharedMotion) -> FrameMotion:
-        """The same as a camera at rest had taken it, by what its tissue shares besides the pulse."""
+        """Removes the camera motion found on the tissue, after pulsation is subtracted."""
         began, moved = time.process_time(), frame.flow
         if self.removed is not None:
             moved = moved - self.removed.at(time_s)[..., :2]
         view = shared.add(time_s, *in_cells(moved, frame.confidence * self.tissue))
         if view is not None:
-            rgb = frame.rgb if self.second is None else view.undo(frame.rgb)
+            rgb = frame.rgb if self._depth is None else view.undo(frame.rgb)
             frame = replace(frame, flow=view.steady(frame.flow), rgb=rgb, camera=view)
         self.watch.add("camera", time.process_time() - began, 0.0)
         return frame
 
-    def _pictured(self, frame: FrameMotion, small: _Steadied, masking_s: float) -> FrameMotion:
+    def _with_picture(self, frame: FrameMotion, small: _Steadied, masking_s: float) -> FrameMotion:
         frame = replace(frame, index=small.index, time_s=small.time_s, rgb=small.rgb)
         return replace(frame, camera=small.camera, masking_s=masking_s)
 
-    def _in_space(self, frame: FrameMotion) -> FrameMotion:
-        """The same with what the second eye shows of it; nothing of a frame that was not followed."""
-        if self.second is None:
+    def _with_depth(self, frame: FrameMotion) -> FrameMotion:
+        """Adds motion in three dimensions; without it a frame is lost."""
+        if self._depth is None:
             return frame
-        with self.watch.stage("second eye"):
-            moved = self.second.follow(frame, self) if frame.trusted else None
+        with self.watch.stage("stereo"):
+            moved = self._depth.follow(frame, self) if frame.trusted else None
             if moved is None:
                 return replace(frame, trusted=False, motion=Moved.nothing(self.tissue.shape))
             return replace(frame, motion=moved)
 
-    def _looked_at(self, frame: FrameMotion) -> FrameMotion:
-        """The same, which was searched for what is no tissue if it is one of the first, or each twelfth."""
+    def _searched(self, frame: FrameMotion) -> FrameMotion:
+        """Searches the first frames, and then each twelfth, for foreground."""
         count = self.summary.frames
         if self._foreground is not None and (count <= _SEARCHED or count % _SEARCHED == 0):
             with self.watch.stage("mask"):
-                depth = self.second.depth_mm() if self.second is not None and frame.trusted else None
+                depth = self._depth.depth_mm() if self._depth is not None and frame.trusted else None
                 self._foreground.add(frame, depth)
         return frame
 
     def _without_pulse(self, frame: FrameMotion) -> FrameMotion:
-        """The same with the pulse taken off; before it is known, the frame is one to find it in."""
+        """Subtracts known pulsation, or adds the frame to the search for it."""
         moved, time_s = frame.motion, frame.time_s
         assert time_s is not None
-        px_mm = np.float32(1.0 if self.second is None else self.second.scale_mm_per_px * self.shrink)
+        px_mm = np.float32(1.0 if self._depth is None else self._depth.scale_mm_per_px * self.shrink)
         if self._surface is not None and frame.trusted:
             parts = [frame.flow]
             if moved is not None:
-                # The flow itself is looked in, not x and y in space, which have the noise of depth in them.
+                # The search uses the flow, because lateral motion in mm has the noise of depth.
                 parts += [moved.motion[..., 2:] / px_mm, moved.motion[..., :2] / px_mm]
                 across, along = (float(np.median(moved.deviation[..., k][self.tissue])) for k in (0, 2))
                 self._depth_weights.append(across / max(along, 1e-9))
@@ -473,15 +457,15 @@ class VideoFlow:
 
 
 def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
-    """An array (H, W[, C]) `shrink` times smaller; what doesn't fill a pixel is cut off."""
+    """Downsamples an array (H, W[, C]) by `shrink`; a remainder at the right and bottom is cropped."""
     if shrink == 1:
         return picture
     size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))
-    # Cut to a multiple, so that a pixel of the small picture is exactly shrink x shrink of the large one.
+    # Cropped to a multiple, so that a pixel of the small picture is shrink x shrink pixels of the large one.
     cut = picture[: size[1] * shrink, : size[0] * shrink]
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
 
 
 def shrink_mask(mask: Flags, shrink: int, above: int) -> Flags:
-    """The same of a mask (H, W): True where more than `above` of 255 parts of a pixel are."""
+    """Downsamples a mask (H, W); True where more than `above` / 255 of a pixel is True."""
     return np.asarray(shrink_picture(mask.astype(np.uint8) * 255, shrink) > above)

@@ -1,4 +1,4 @@
-"""Masked TV-L1 by whole tensors: the oracle of `synth.flow.tvl1`, whose equations and symbols these are."""
+"""Masked TV-L1 on whole tensors with the equations and symbols of `synth.flow.tvl1`, as its reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WEIGHT_LIMITS = 0.45, 1.5
 
 
 def solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
-    """All warps of a level; flow (B, 2, H, W) px, weight (B, 1, H, W)."""
+    """Runs all warps of a level; flow (B, 2, H, W) px, weight (B, 1, H, W)."""
     dual = flow.new_zeros(2, *flow.shape)
     for _ in range(s.warps):
         flow, dual = step(level, flow, dual, weight, s)
@@ -21,10 +21,10 @@ def solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> 
 
 
 def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> tuple[Tensor, Tensor]:
-    """One warp: linearise r about `flow`, weigh it, minimise. dual: (2, B, 2, H, W), its x and y parts."""
-    warped, seen = warp(level.now, level.now_usable, flow)
-    mask = level.rest_usable * seen
-    # The gradient of the *warped* picture is what the rest frame's must equal: it turns and stretches with w.
+    """One warp: linearises r about `flow`, weights it and minimises. dual: (2, B, 2, H, W), x and y parts."""
+    warped, visible = warp(level.now, level.now_usable, flow)
+    mask = level.rest_usable * visible
+    # The gradient of the warped picture, which rotates and stretches with w, must equal that at rest.
     before = torch.cat([level.rest, s.gradient * derivative(level.rest)], 1)
     after = torch.cat([warped, s.gradient * derivative(warped)], 1)
     residual = after - before  # (B, 3, H, W)
@@ -50,7 +50,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settin
 
 
 def noise_weight(residual: Tensor, mask: Tensor, noise: float) -> Tensor:
-    """(noise / median of |r| in the mask) squared, within limits; 1 if nothing is seen. (B, 1, 1, 1)."""
+    """(noise / median of |r| in the mask) squared, within limits; 1 for an empty mask. (B, 1, 1, 1)."""
     some = residual[..., ::2, ::2]
     square = torch.where(mask[..., ::2, ::2] > 0, (some * some).sum(1, keepdim=True), torch.nan)
     found = torch.nan_to_num(square.flatten(1).nanmedian(dim=1).values, nan=noise**2)
@@ -65,7 +65,7 @@ def primal_dual(
     Args:
         flow: (B, 2, H, W) px.
         dual: (2, B, 2, H, W), its x and y parts.
-        straight, cross, shift: (B, 2, H, W), (B, 1, H, W), (B, 2, H, W): the prox as an affine map.
+        straight, cross, shift: (B, 2, H, W), (B, 1, H, W), (B, 2, H, W), the affine proximal map.
         huber: (B, 1, H, W) or a number, h [px/px].
         s: settings.
     """
@@ -95,8 +95,8 @@ def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
     y = torch.arange(height, dtype=now.dtype)[:, None]
     at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)
     picture = F.grid_sample(now, at, mode="bicubic", padding_mode="border", align_corners=False)
-    seen = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
-    return picture, (seen > 0.9).to(now.dtype)
+    visible = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return picture, (visible > 0.9).to(now.dtype)
 
 
 def derivative(field: Tensor) -> Tensor:
@@ -109,21 +109,6 @@ def derivative(field: Tensor) -> Tensor:
 
 
 def median3(field: Tensor) -> Tensor:
-    """3x3 median of every channel, (B, C, H, W).
-
-    Sorts the columns; the median is that of the largest low, the middle mid and the smallest high.
-    """
+    """3x3 median of every channel, (B, C, H, W)."""
     wide = F.pad(field, (1, 1, 1, 1), "replicate")
-    a, b, c = wide[..., :-2, :], wide[..., 1:-1, :], wide[..., 2:, :]
-    low, high = torch.minimum(a, b), torch.maximum(a, b)
-    middle, high = torch.minimum(high, c), torch.maximum(high, c)
-    low, middle = torch.minimum(low, middle), torch.maximum(low, middle)
-
-    def sides(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return f[..., :-2], f[..., 1:-1], f[..., 2:]
-
-    lows, (m0, m1, m2), highs = sides(low), sides(middle), sides(high)
-    top = torch.maximum(torch.maximum(lows[0], lows[1]), lows[2])
-    bottom = torch.minimum(torch.minimum(highs[0], highs[1]), highs[2])
-    mid = torch.maximum(torch.minimum(m0, m1), torch.minimum(torch.maximum(m0, m1), m2))
-    return torch.maximum(torch.minimum(top, mid), torch.minimum(torch.maximum(top, mid), bottom))
+    return wide.unfold(2, 3, 1).unfold(3, 3, 1).flatten(-2).median(-1).values

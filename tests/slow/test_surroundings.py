@@ -1,4 +1,4 @@
-"""Odd surroundings change no byte of a dataset: the folder's name, a clock that jumps."""
+"""A dataset does not depend on the name of its folder or on the system clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from synth.engine import run as engine
 from synth.job.schema import Job
 
 JOB = Job(sequences=4, frames=5, render={"size": (160, 120)}, flow={"backend": "ideal"})
-# Found by every Python process, workers too: each look at the clock is in another year than the one before.
+# Imported by every Python process, workers too: each reading of the clock is years from the previous one.
 JUMPING = """
 import itertools, time
 real, jumps = time.time, itertools.cycle((-40, 0, 40, 7))
@@ -20,7 +20,7 @@ time.time_ns = lambda: int(time.time() * 1e9)
 """
 
 
-def test_an_odd_name_and_a_jumping_clock_change_nothing(tmp_path: Path) -> None:
+def test_an_unusual_name_and_a_jumping_clock_change_nothing(tmp_path: Path) -> None:
     calm = engine.run_job(JOB, tmp_path / "calm", options("sequence"), Silent())
     odd = engine.run_job(JOB, tmp_path / "größe μm 脳 'out'", options("sequence"), Silent())
     assert odd.content_hash == calm.content_hash

@@ -1,4 +1,4 @@
-"""Flow in a process of its own: the same answers, errors that arrive, and an end whatever happens."""
+"""Flow in another process: errors are passed on, and the process ends with its parent."""
 
 from __future__ import annotations
 
@@ -12,19 +12,13 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from fake_recording import texture
 
 from bench.tracking.flow_process import FlowProcess
 from synth.errors import UserError
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
 from synth.video.read import Picture
-
-
-def pictures() -> tuple[np.ndarray, np.ndarray, Proposal]:
-    rng = np.random.default_rng(3)
-    rest = np.kron(rng.integers(40, 220, (16, 20)), np.ones((4, 4)))[..., None].repeat(3, 2).astype(np.uint8)
-    nothing = np.zeros(rest.shape[:2], bool)
-    return rest, np.roll(rest, 2, axis=1), Proposal(nothing, nothing, nothing)
 
 
 @pytest.fixture
@@ -34,17 +28,18 @@ def elsewhere() -> Iterator[FlowProcess]:
 
 
 @pytest.mark.slow
-def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -> None:
-    rest, moved, free = pictures()
+def test_errors_and_the_end_of_the_process_are_reported(elsewhere: FlowProcess) -> None:
+    rest = texture(64, 80)
+    moved, free = np.roll(rest, 2, axis=1), Proposal(*np.zeros((3, 64, 80), bool))
     with pytest.raises(UserError, match="no estimator"):
         elsewhere.begin("nonesuch", rest, free, ~free.known)
     elsewhere.begin("dis", rest, free, ~free.known)
     with pytest.raises(UserError, match="does not fit"):
         elsewhere.submit(moved[:-1], free).result()
     worker = elsewhere._pool.submit(os.getpid).result()
-    os.kill(worker, signal.SIGINT)  # a terminal's Ctrl-C reaches every process; this one is closed instead
+    os.kill(worker, signal.SIGINT)  # Ctrl-C in a terminal reaches every process; it must not end this one
     assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
-    footage = Footage([Picture(k, k / 25, one) for k, one in enumerate((rest, moved))], "film")
+    footage = Footage([Picture(k, k / 25, one) for k, one in enumerate((rest, moved))], "video")
     frames = VideoFlow(footage, RecordingFlowSettings("dis", 1, None, masks="none"), elsewhere).frames()
     assert next(frames).is_rest
     os.kill(worker, signal.SIGKILL)
@@ -53,7 +48,7 @@ def test_errors_of_the_flow_arrive_and_its_end_is_said(elsewhere: FlowProcess) -
 
 
 @pytest.mark.slow
-def test_it_does_not_outlive_a_killed_parent() -> None:
+def test_the_process_ends_when_its_parent_is_killed() -> None:
     script = (
         "import os, time; from bench.tracking.flow_process import FlowProcess; flow = FlowProcess();"
         "print(flow._pool.submit(os.getpid).result(), flush=True); time.sleep(60)"

@@ -8,20 +8,10 @@ import torch
 import torch.nn.functional as F
 from tensor_tvl1 import solve_level
 
+from evidence.flow.scenes import noise_field
 from synth.flow import image, tvl1
 from synth.flow.image import Level
 from synth.flow.tvl1 import Tvl1, TVL1Settings
-
-
-def picture(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Coarse and fine noise as RGB."""
-    made = np.zeros(shape)
-    for period in (4, 12, 40):
-        small = rng.normal(size=(shape[0] // period + 3, shape[1] // period + 3))
-        wide = F.interpolate(torch.from_numpy(small)[None, None], scale_factor=period, mode="bicubic")
-        made += wide[0, 0, : shape[0], : shape[1]].numpy()
-    grey = np.clip(120 + 30 * made, 0, 255).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
 
 
 @pytest.mark.parametrize(
@@ -32,7 +22,8 @@ def test_flow_equals_that_of_the_tensor_code(
     shape: tuple[int, int], settings: TVL1Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(3)
-    rest = picture(rng, shape)
+    grey = 120 + 30 * sum(noise_field(shape, period, rng) for period in (4, 12, 40))
+    rest = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
     now = np.roll(rest, (2, -3), (0, 1))
     usable, now_usable = np.ones(shape, bool), np.ones(shape, bool)
     usable[20:40, 30:60] = False

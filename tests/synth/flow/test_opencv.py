@@ -99,9 +99,9 @@ def test_invalid_results_of_an_estimator_are_reported_with_its_name(wrong: str) 
         track.track(Wrong(), frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
 
 
-def test_opencv_is_deterministic() -> None:
+def test_estimators_are_deterministic() -> None:
     (pair,) = pairs(Recipe(size=128), 1, 13)
-    for name in ("opencv-tvl1", "dis"):
+    for name in ("tvl1", "opencv-tvl1", "dis"):
         flows = [estimator.create(name).flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)[0]
                  for _ in range(5)]  # fmt: skip
         for flow in flows[1:]:

@@ -49,13 +49,6 @@ def test_pull_with_tool_highlights_and_light() -> None:
     assert np.mean(hidden) < 0.5
 
 
-def test_cpu_is_deterministic() -> None:
-    (pair,) = pairs(Recipe(size=96, pull=5), 1, 4)
-    pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable
-    flow, again = (Tvl1().flow(*pictures)[0] for _ in range(2))
-    np.testing.assert_array_equal(flow, again)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (31, 57)])
 def test_small_and_odd_pictures(size: tuple[int, int]) -> None:
     picture = np.random.default_rng(0).integers(0, 255, (*size, 3), dtype=np.uint8)

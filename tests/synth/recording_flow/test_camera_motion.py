@@ -1,4 +1,4 @@
-"""The camera's own motion: found on surroundings and on tissue; a contact's motion is none."""
+"""Camera motion estimated on the surroundings of the tissue."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(H, W, 3) a picture that is known between its pixels: waves of 6 to 25 px."""
+    """(H, W, 3) an analytic picture: waves of 6 to 25 px."""
     rng = np.random.default_rng(0)
     waves = [rng.uniform(6, 25) for _ in range(40)]
     turns, phases = rng.uniform(0, 2 * np.pi, (2, 40))
@@ -31,14 +31,14 @@ def texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]
 
 
 def moved(dx: float, dy: float, scale: float = 1.0, degrees: float = 0.0) -> Places:
-    """What of the picture at rest a moved camera's pixels show."""
+    """Positions in the rest frame that the pixels of a moved camera show."""
     c, s = np.cos(np.radians(degrees)) / scale, np.sin(np.radians(degrees)) / scale
     x, y = X - 80 - dx, Y - 60 - dy
     return c * x + s * y + 80, -s * x + c * y + 60
 
 
 @pytest.mark.parametrize("motion", [(3, 4), (0.4, -0.3), (0, 0, 1.03), (0, 0, 1, 2), (18, -11, 1.02, -1)])
-def test_a_similarity_is_found_and_undone(motion: tuple[float, ...]) -> None:
+def test_a_similarity_is_estimated_and_undone(motion: tuple[float, ...]) -> None:
     rest, now = texture(X, Y), texture(*moved(*motion))
     found = CameraTracker(rest, OPENING, ~EVERYWHERE).find(now, 1.0)
     assert found is not None
@@ -50,29 +50,28 @@ def test_a_similarity_is_found_and_undone(motion: tuple[float, ...]) -> None:
     assert found.deviation_px < 0.05
 
 
-def test_a_bump_is_no_motion_of_the_tissue_and_is_named() -> None:
+def test_a_camera_bump_is_removed_from_the_motion_and_reported() -> None:
     pictures = [Picture(t, t / 8, texture(*moved(0, 5 * (t > 2)))) for t in range(6)]
-    film = VideoFlow(
-        Footage(pictures, "film", lambda size: OPENING), RecordingFlowSettings("dis", 1, None, False, "none")
-    )
-    frames = list(film.frames())
+    settings = RecordingFlowSettings("dis", 1, None, False, "none")
+    video = VideoFlow(Footage(pictures, "video", lambda size: OPENING), settings)
+    frames = list(video.frames())
     assert all(np.array_equal(one.rgb, two.rgb) for one, two in zip(frames[:3], pictures[:3], strict=True))
     assert max(np.median(np.abs(one.flow[OPENING])) for one in frames) < 0.05
     assert all(one.trusted for one in frames)
-    # Its pictures, drawn without noise, are named as repeated too.
-    (finding,) = [one for one in film.findings if one.what == "camera"]
+    # The pictures have no noise and are therefore reported as repeated too.
+    (finding,) = [one for one in video.findings if one.what == "camera"]
     assert finding.state == "odd"
-    assert all(said in finding.message for said in ("5 px", "0.375 s"))
+    assert all(part in finding.message for part in ("5 px", "0.375 s"))
 
 
-def test_confidence_stands_for_the_cameras_deviation_too() -> None:
+def test_confidence_includes_the_deviation_of_the_camera() -> None:
     own = np.array([[0.1, 0.3, 1.0]], np.float32)
     both = deviation(add_deviation(of_deviation(own), 0.4))
     assert both == pytest.approx(np.hypot(own, 0.4), rel=1e-4)
     assert not add_deviation(np.zeros((1, 1), np.float32), 0.4).any()
 
 
-def test_tissue_that_the_mask_leaves_out_is_no_camera() -> None:
+def test_tissue_outside_the_mask_is_not_taken_for_camera_motion() -> None:
     pulled = 1.5 / (1 + np.hypot(X - 80, Y - 60) / 20)
     frames = texture(X, Y), texture(X - pulled, Y - 0.3 * pulled)
     part = np.hypot(X - 80, Y - 60) < 30

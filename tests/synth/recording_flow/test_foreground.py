@@ -1,4 +1,4 @@
-"""Things in front of tissue whose motion and depth are formulas."""
+"""Foreground objects on tissue of analytic motion and depth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ROD = (np.abs(Y - 60) < 8) & (X < 90)
 
 
 def load(peak_px: float) -> NDArray[np.float32]:
-    """Motion of a half-space beside a load at (90, 60), which falls as 1 / r (Cerruti)."""
+    """Motion of a half-space around a load at (90, 60), which falls as 1 / r (Cerruti)."""
     x, y = X - 90, Y - 60
     r = np.sqrt(x**2 + y**2 + 17.0**2)
     return peak_px * 17 * np.stack([(0.55 / r + 0.45 * x * x / r**3), 0.45 * x * y / r**3], -1)
@@ -41,13 +41,13 @@ def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(pea
     assert len(moved) == (peak_px > 1)
     high = found(tissue, np.where(ROD, flat - 6, flat))
     assert len(high) == 1
-    for said in moved + high:
-        x, y = map(int, re.findall(r"\d+", said)[:2])
+    for message in moved + high:
+        x, y = map(int, re.findall(r"\d+", message)[:2])
         assert ROD[max(y - 10, 0) : y + 10, x].any()
     assert found(rigid, np.where(ROD, flat - 6, flat), masked=True) == []
 
 
-def test_the_surface_is_the_tissues_and_a_slope_no_jump() -> None:
+def test_the_surface_follows_the_tissue_and_a_slope_is_not_a_jump() -> None:
     flat = (300 + X / 50 + X * Y / 9000).astype(np.float32)
     surface, deviation = fit_surface(np.where(ROD, flat - 6, flat), np.ones(SHAPE, bool))
     assert np.abs(surface - flat).max() < 1e-3

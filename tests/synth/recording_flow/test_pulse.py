@@ -1,4 +1,4 @@
-"""The tissue's own motion: found where there is one, left where there is none, told from contacts."""
+"""Pulsation of the tissue: found where there is one, not found in contacts or noise alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AWAY = (X - 0.2) ** 2 + (Y + 0.1) ** 2
 CONTACT = np.stack([np.exp(-AWAY / 0.05) + 0.1 / (1 + 4 * AWAY), 0.3 * np.exp(-AWAY / 0.08)], axis=-1)
 
 
-def film(
+def simulate(
     seconds: float = 20.0,
     heart_mm: float = 0.4,
     breath_mm: float = 0.25,
@@ -28,7 +28,7 @@ def film(
     wander: float = 0.0,
     rest_px: float = 0.0,
 ) -> tuple[SurfaceMotion, NDArray[np.float64], list[NDArray[np.float64]]]:
-    """What is tracked, its times, and the tissue's own motion and the rest frame's noise [px]."""
+    """Tracked motion, its times, and the pulsation with the noise of the rest frame [px]."""
     rng = np.random.default_rng(0)
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.02, 0.02, round(10 * seconds))
     load = np.zeros_like(time)
@@ -45,8 +45,8 @@ def film(
     at_rest = rng.normal(0, rest_px, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
     for t, force in zip(time, load, strict=True):
         turn = 2 * np.pi * 1.2 * t + wander * np.sin(2 * np.pi * t / seconds)
-        beat = heart_mm * (np.sin(turn) + 0.3 * np.sin(2 * turn)) * HEART
-        own = (beat + breath_mm * np.sin(2 * np.pi * 0.25 * t + 1) * BREATH) / MM_PER_PX
+        heart = heart_mm * (np.sin(turn) + 0.3 * np.sin(2 * turn)) * HEART
+        own = (heart + breath_mm * np.sin(2 * np.pi * 0.25 * t + 1) * BREATH) / MM_PER_PX
         lay.append(own)
         noise = rng.normal(0, 0.05, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
         flow = own - lay[0] + force * contact_mm / MM_PER_PX * CONTACT + noise + at_rest
@@ -54,8 +54,8 @@ def film(
     return surface, time, [own - lay[0] + at_rest for own in lay]
 
 
-def left(pulse: PulseEstimate, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
-    """Root mean square of what is wrongly left in or taken off [mm]."""
+def error_mm(pulse: PulseEstimate, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
+    """Root mean square error of the pulsation [mm]."""
     return MM_PER_PX * float(
         np.sqrt(np.mean([np.square(pulse.at(t) - own).mean() for t, own in zip(time, truth, strict=True)]))
     )
@@ -63,12 +63,12 @@ def left(pulse: PulseEstimate, time: NDArray[np.float64], truth: list[NDArray[np
 
 @pytest.mark.slow
 def test_heart_and_breath_between_contacts_are_found() -> None:
-    surface, time, truth = film()
+    surface, time, truth = simulate()
     pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert [rhythm.rate_hz for rhythm in pulse.rhythms] == pytest.approx([1.2, 0.25], rel=0.01)
-    assert left(pulse, time, truth) < 0.01
-    # The heart's way from one end to the other, by its definition.
+    assert error_mm(pulse, time, truth) < 0.01
+    # The amplitude of the heart by definition: half of the peak-to-peak motion.
     turn = np.linspace(0, 2 * np.pi, 200)
     wave = np.ptp(np.sin(turn) + 0.3 * np.sin(2 * turn)) / 2
     expected = 0.4 * wave * np.median(np.linalg.norm(HEART, axis=-1))
@@ -76,26 +76,27 @@ def test_heart_and_breath_between_contacts_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_the_rest_frames_own_noise_is_taken_off_but_nothing_larger() -> None:
-    surface, time, truth = film(rest_px=0.06)
+def test_noise_of_the_rest_frame_is_removed_up_to_a_limit() -> None:
+    surface, time, truth = simulate(rest_px=0.06)
     pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
-    assert left(pulse, time, truth) < 0.7 * left(replace(pulse, rest_noise=0 * pulse.rest_noise), time, truth)
-    surface, time, _ = film(rest_px=0.5)
+    without = replace(pulse, rest_noise=0 * pulse.rest_noise)
+    assert error_mm(pulse, time, truth) < 0.7 * error_mm(without, time, truth)
+    surface, time, _ = simulate(rest_px=0.5)
     pulse = find_pulse(surface, time[0]).pulse
     assert pulse is not None
     assert np.linalg.norm(pulse.rest_noise, axis=-1).max() == pytest.approx(0.15, abs=0.01)
 
 
 @pytest.mark.parametrize("period_s", [None, 2.0, 0.9])
-def test_contacts_alone_are_no_pulse_periodic_ones_neither(period_s: float | None) -> None:
-    surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, period_s=period_s)
+def test_contacts_alone_are_no_pulse_even_if_periodic(period_s: float | None) -> None:
+    surface, time, _ = simulate(heart_mm=0.0, breath_mm=0.0, period_s=period_s)
     assert find_pulse(surface, float(time[0])).pulse is None
 
 
-def test_noise_alone_and_a_short_film_are_no_pulse() -> None:
-    surface, time, _ = film(heart_mm=0.0, breath_mm=0.0, contact_mm=0.0)
+def test_noise_alone_and_a_short_video_give_no_pulse() -> None:
+    surface, time, _ = simulate(heart_mm=0.0, breath_mm=0.0, contact_mm=0.0)
     assert find_pulse(surface, float(time[0])).pulse is None
-    surface, time, _ = film(seconds=2.5)
+    surface, time, _ = simulate(seconds=2.5)
     found = find_pulse(surface, float(time[0]))
     assert (found.pulse, len(found.free_s), found.rates_hz) == (None, 25, None)

@@ -1,4 +1,4 @@
-"""The camera where tissue fills the picture: told from contacts by closed forms, and from a pulse."""
+"""Camera motion where tissue fills the picture, separated from contacts and pulsation of analytic motion."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ def turn(frame: int) -> tuple[float, ...]:
     return (0.0, 0.0, 0.0, -2.8) if frame > 6 else (0.0, 0.0, 0.0, 0.0)
 
 
-def sway(frame: int) -> tuple[float, ...]:
+def drift(frame: int) -> tuple[float, ...]:
     return (3 * np.sin(frame / 2), 4 * np.sin(frame / 3), 0.3 * np.sin(frame / 5), 0.5 * np.sin(frame / 4))
 
 
 def dragged(px: float) -> NDArray[np.float64]:
-    """(H, W, 2) of a tangential load on a disc of 10 px: outside, a point's (Cerruti, 1882)."""
+    """(H, W, 2) motion by a tangential load on a disc of 10 px: outside, that of a point (Cerruti, 1882)."""
     x, y, nu = X - 60, Y - 70, 0.48
     r = np.maximum(np.hypot(x, y), 10)
     return px * np.dstack([(1 - nu) / r + nu * x**2 / r**3, nu * x * y / r**3]) * 10
 
 
 def press(frame: int) -> float:
-    """Twice up and down, with rests."""
+    """Two presses, with rests between them."""
     return max(0.0, float(np.sin(2 * np.pi * (frame - 3) / 12))) if frame > 3 else 0.0
 
 
 def filmed(camera: Motion, px: float) -> tuple[SurfaceMotion, list[NDArray[np.float64]]]:
-    """The motion of a film with noise, and the camera's matrices."""
+    """Noisy motion over a video, and the matrices of the camera."""
     rng, surface, matrices = np.random.default_rng(1), SurfaceMotion(EVERYWHERE), []
     for frame, time_s in zip(range(1, FRAMES), TIME, strict=True):
         there = np.dstack([X, Y]) + dragged(px * press(frame))
@@ -75,19 +75,19 @@ def off_px(found: Similarity | None, matrix: NDArray[np.float64]) -> float:
 
 
 @pytest.mark.parametrize("px", [0.0, 0.5, 3.0, 10.0])
-def test_what_a_contact_moves_is_not_the_cameras(px: float) -> None:
+def test_a_contact_is_not_taken_for_camera_motion(px: float) -> None:
     assert find_path(filmed(still, px)[0], None) is None
 
 
 @pytest.mark.parametrize("camera", [bump, zoom, turn])
 @pytest.mark.parametrize("px", [0.5, 3.0, 8.0])
-def test_a_camera_is_told_from_a_contact(camera: Motion, px: float) -> None:
+def test_camera_motion_is_separated_from_a_contact(camera: Motion, px: float) -> None:
     surface, matrices = filmed(camera, px)
     path = find_path(surface, None)
     assert path is not None
     off = [off_px(path.at(time_s), matrix) for time_s, matrix in zip(TIME, matrices, strict=True)]
     assert max(off) < 0.1
-    # A stream knows only what came before.
+    # A stream uses past frames only.
     shared = SharedMotion(EVERYWHERE)
     frames = zip(surface.time_s, surface.motion, surface.visible, strict=True)
     live = [shared.add(time_s, motion, visible) for time_s, motion, visible in frames]
@@ -95,8 +95,8 @@ def test_a_camera_is_told_from_a_contact(camera: Motion, px: float) -> None:
 
 
 @pytest.mark.parametrize("px", [0.5, 3.0])
-def test_a_sway_under_a_contact_is_as_uncertain_as_it_says(px: float) -> None:
-    surface, matrices = filmed(sway, px)
+def test_the_deviation_of_a_drift_under_a_contact_covers_its_error(px: float) -> None:
+    surface, matrices = filmed(drift, px)
     path = find_path(surface, None)
     assert path is not None
     free = [frame for frame in range(1, FRAMES) if not press(frame)]
@@ -107,32 +107,31 @@ def test_a_sway_under_a_contact_is_as_uncertain_as_it_says(px: float) -> None:
     assert off.max() < 0.25 * px + 0.1
 
 
-def test_between_frames_a_path_is_where_it_was() -> None:
+def test_between_frames_a_path_has_the_last_position() -> None:
     one = Similarity(np.eye(2, 3))
     path = CameraPath(np.array([1.0, 2.0]), (None, one))
     assert [path.at(time_s) for time_s in (0.5, 1.5, 2.0, 9.0)] == [None, None, one, one]
 
 
-def film(shift_px: NDArray[np.float64], found: PulseSearch | None = None, pulse: bool = True) -> VideoFlow:
+def track(shift_px: NDArray[np.float64], found: PulseSearch | None = None, pulse: bool = True) -> VideoFlow:
     pictures = [Picture(t, t / 10, texture(*moved(0, y))) for t, y in enumerate(shift_px)]
-    return VideoFlow(
-        Footage(pictures, "film"), RecordingFlowSettings("dis", 1, None, pulse, "none"), pulse=found
-    )
+    settings = RecordingFlowSettings("dis", 1, None, pulse, "none")
+    return VideoFlow(Footage(pictures, "video"), settings, pulse=found)
 
 
-def test_a_bump_is_taken_off_and_named() -> None:
-    video = film(np.array([0.0, 0, 0, 5, 5, 5]), pulse=False)
+def test_a_bump_is_removed_and_reported() -> None:
+    video = track(np.array([0.0, 0, 0, 5, 5, 5]), pulse=False)
     assert max(np.median(np.abs(one.flow)) for one in video.frames()) < 0.05
     (finding,) = [one for one in video.findings if one.what == "camera"]
     assert finding.state == "odd"
-    assert all(said in finding.message for said in ("5 px", "0.3 s"))
+    assert all(part in finding.message for part in ("5 px", "0.3 s"))
 
 
-def test_a_pulse_is_no_camera() -> None:
+def test_pulsation_is_not_taken_for_camera_motion() -> None:
     time_s = np.arange(70) / 10
-    beat = 1.5 * np.sin(2 * np.pi * 0.9 * time_s)
-    once = film(beat)
-    assert np.median(list(once.frames())[3].flow, axis=(0, 1))[1] == pytest.approx(beat[3], abs=0.1)
+    pulse = 1.5 * np.sin(2 * np.pi * 0.9 * time_s)
+    once = track(pulse)
+    assert np.median(list(once.frames())[3].flow, axis=(0, 1))[1] == pytest.approx(pulse[3], abs=0.1)
     found = once.find_pulse()
     assert found is not None
     assert found.camera is None
@@ -140,10 +139,10 @@ def test_a_pulse_is_no_camera() -> None:
     assert found.pulse.rhythms[0].rate_hz == pytest.approx(0.9, abs=0.03)
 
 
-def test_a_recordings_bump_is_taken_off_the_second_time_through() -> None:
+def test_the_bump_of_a_recording_is_removed_in_the_second_pass() -> None:
     shift = np.where(np.arange(12) > 4, 5.0, 0.0)
-    once = film(shift)
+    once = track(shift)
     assert np.median(list(once.frames())[-1].flow, axis=(0, 1))[1] == pytest.approx(5, abs=0.1)
-    again = film(shift, once.find_pulse())
+    again = track(shift, once.find_pulse())
     assert max(np.median(np.abs(one.flow)) for one in again.frames()) < 0.05
     assert [one.what for one in again.findings].count("camera") == 1
