@@ -1,4 +1,4 @@
-"""`python -m bench`: the command without its script."""
+"""`python -m bench`: the `bench` command."""
 
 from bench.cli import app
 

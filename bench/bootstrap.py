@@ -1,4 +1,4 @@
-"""The stationary bootstrap: intervals for curves whose samples depend on their neighbours. SciPy has none."""
+"""The stationary bootstrap: intervals for curves with correlated samples. SciPy has none."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def block_length(x: Curve) -> float:
 
 
 def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """How often each of `n` samples is drawn in each stationary bootstrap resample, (resamples, n).
+    """Counts of each of `n` samples in each stationary bootstrap resample, (resamples, n).
 
     Politis and Romano, "The stationary bootstrap" (JASA 1994): blocks of geometric length from uniform
     starts on the circle of samples.
@@ -68,6 +68,5 @@ def interval(values: Curve) -> Interval:
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return (float("nan"), float("nan"))
-    tail = (1 - LEVEL) / 2
-    low, high = np.quantile(values, [tail, 1 - tail])
+    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return (float(low), float(high))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="bench",
     cls=Commands,
-    help="Measures: recordings against force sensors, methods against one another.",
+    help="Scores recordings against their force sensors, and compares methods.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
@@ -29,9 +29,9 @@ app = typer.Typer(
 
 Backend = Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")]
-Phantom = Annotated[bool, typer.Option("--phantom", help="It shows a phantom: forces beyond 50 N are meant.")]
+Phantom = Annotated[bool, typer.Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
 Masks = Annotated[
-    str, typer.Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png: the tool.")
+    str, typer.Option(help="auto, none, glare, tool, both, or a folder of tool masks NNNNNN.png or mask.png.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
@@ -46,33 +46,34 @@ def score(
         typer.Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for score.json and report.html; NAME-score.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
     ] = None,
     flow: Backend = "tvl1",
     shrink: Annotated[
-        int, typer.Option(min=0, max=8, help="Flow on pictures this many times smaller; 0: to 320 columns.")
+        int,
+        typer.Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns."),
     ] = 0,
-    rate: Annotated[
-        float, typer.Option(min=0.0, help="At most so many frames a second are looked at; 0: all.")
-    ] = 10.0,
+    rate: Annotated[float, typer.Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
     pulse: Annotated[
-        bool, typer.Option(help="Take heart and breath off the motion, before any method reads it.")
+        bool, typer.Option(help="Remove heartbeat and breathing from the motion before estimating force.")
     ] = True,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
     train: Annotated[
-        Path | None, typer.Option(help="The model's training data: simpler methods are fitted on it too.")
+        Path | None,
+        typer.Option(help="The model's training data, to fit the baselines on it too."),
     ] = None,
     also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
     region: Annotated[
-        str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: only this part of the picture is followed.")
+        str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")
     ] = "",
     json: Json = False,
 ) -> None:
-    """Force from a recording's video, scored against its sensor: score.json and report.html.
+    """Estimates force from a recording's video and scores it against the sensor: score.json, report.html.
 
-    Exit code 2, and no table, where no number may be said of it.
+    Prints no table and exits with code 2 if the recording can't be measured.
     """
     from bench.recording.folder import open_recording
     from synth.recording_flow.video_flow import RecordingFlowSettings
@@ -92,10 +93,10 @@ def pool(
         list[Path], typer.Argument(help="Folders that `bench score` wrote, or their score.json.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pooled result.")],
-    by: Annotated[str, typer.Option(help="What made the scores, for the page; else this command.")] = "",
+    by: Annotated[str, typer.Option(help="Command shown on the page; default: this one.")] = "",
     json: Json = False,
 ) -> None:
-    """Scores of several recordings as one: means, intervals over specimens, one table and chart."""
+    """Pools the scores of several recordings: means, intervals over specimens, one table and chart."""
     from bench.scoring import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
@@ -104,8 +105,8 @@ def pool(
 
 
 @app.command(epilog="Example: bench init recording")
-def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it may be there.")]) -> None:
-    """Writes a recording's meta.yaml in which every key is explained."""
+def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it may exist.")]) -> None:
+    """Writes a recording's meta.yaml with an explanation of every key."""
     from bench.recording.meta import commented
 
     path = recording / "meta.yaml"
@@ -121,11 +122,11 @@ def check(
     recording: Annotated[Path, typer.Argument(help="Recording folder.")],
     phantom: Phantom = False,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG to write: tissue, masks and flow on five of its frames.")
+        Path | None, typer.Option(help="PNG to write: tissue, masks and flow on five frames.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Says what of a recording is usable and what is missing. Exit code 2 if nothing is."""
+    """Reports what of a recording is usable and what is missing. Exits with code 2 if it can't be used."""
     from dataclasses import asdict
 
     from bench.recording import check as checking
@@ -133,7 +134,7 @@ def check(
     from synth.system.text_lines import hang
 
     if picture is not None:
-        make_folder(picture.parent)  # before the film is looked at
+        make_folder(picture.parent)  # fails before the video is decoded
     found = checking.check_recording(recording, phantom, picture)
     if json:
         print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
@@ -153,21 +154,21 @@ def import_(
         typer.Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
-    scale: Annotated[str | None, typer.Option(help="mm a pixel, or unknown; else fill in meta.yaml.")] = None,
+    scale: Annotated[str | None, typer.Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
     young: Young = None,
     use: Annotated[
         list[str] | None,
         typer.Option(
-            help="ROLE=NAME where one is to be named: frames, frame_time, force, force_time, tip, fps; "
-            "of a ROS bag right, depth, calibration, right_calibration too."
+            help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, tip, fps; "
+            "in a ROS bag also right, depth, calibration, right_calibration."
         ),
     ] = None,
     newtons: Annotated[
-        float, typer.Option(min=1e-6, help="Newtons in the source's unit of force: 0.001 if it is in mN.")
+        float, typer.Option(min=1e-6, help="Newtons per unit of force in the source: 0.001 for mN.")
     ] = 1.0,
     json: Json = False,
 ) -> None:
-    """Turns another system's recording into a recording folder."""
+    """Converts another system's recording into a recording folder."""
     from bench.importers import registry
     from synth.system.terminal import counting
     from synth.video.pixel_scale import read_scale
@@ -196,16 +197,16 @@ def import_(
 )
 def from_dataset(
     dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder that gets one recording a sequence.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for one recording per sequence.")],
     sequence: Annotated[int | None, typer.Option(help="Only this sequence.")] = None,
     unseen_by: Annotated[
         list[Path] | None,
-        typer.Option(help="Only the first sequence that this model was not trained on; repeat for more."),
+        typer.Option(help="Only the first sequence this model was not trained on; repeat for more models."),
     ] = None,
     footage: Annotated[Literal["png", "mp4"], typer.Option(help="Lossless pictures or H.264.")] = "png",
     json: Json = False,
 ) -> None:
-    """Writes sealed sequences as recording folders, to be scored as real ones are."""
+    """Writes sealed sequences as recording folders, to be scored like real recordings."""
     from bench.recording.from_sequence import export_recording
     from learn.checkpoint import read_card
     from learn.inference.shipped import find_model
@@ -215,20 +216,16 @@ def from_dataset(
     if not chosen:
         raise UserError(f"{dataset}: holds no finished sequence {sequence}")
     if unseen_by:
-        seen = set[str]().union(*(read_card(find_model(model)).used for model in unseen_by))
-        chosen = [s for s in chosen if s.attrs["content_hash"] not in seen][:1]
+        trained = set[str]().union(*(read_card(find_model(model)).used for model in unseen_by))
+        chosen = [s for s in chosen if s.attrs["content_hash"] not in trained][:1]
     if not chosen:
         raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")
-    _print_paths([export_recording(s, out / f"{s.index:06d}", footage) for s in chosen], json)
-
-
-def _print_paths(recordings: list[Path], json: bool) -> None:
-    names = [str(path) for path in recordings]
+    names = [str(export_recording(s, out / f"{s.index:06d}", footage)) for s in chosen]
     print(json_.dumps({"recordings": names}) if json else "\n".join(names))
 
 
 def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
-    """The words A=B of a repeated option as a dictionary; UserError for one of another form."""
+    """The A=B values of a repeated option as a dictionary. UserError if one has another form."""
     named = {}
     for word in words or ():
         name, sign, value = word.partition("=")
@@ -248,7 +245,7 @@ def _score(
     also: Mapping[str, str | Path] | None = None,
     **more: Any,
 ) -> None:
-    """Scores a recording, writes into `folder`, prints; `also`: further models; `more`: of `bench.score`."""
+    """Scores a recording, writes into `folder` and prints; `also`: more models; `more`: for `bench.score`."""
     from rich.console import Console
     from threadpoolctl import threadpool_limits
 
@@ -259,7 +256,7 @@ def _score(
     from learn.inference.shipped import require_model
     from learn.training.threads import set_threads
 
-    # NumPy's BLAS too: a second thread of its own waits for a core that the flow has.
+    # NumPy's BLAS too: its threads would compete with the flow for the same cores.
     threadpool_limits(set_threads(None))
     result = score(
         opened,
@@ -283,7 +280,7 @@ def _score(
         console.print(report.terminal_table(result))
     for note in result.notes:
         console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    # A path is to be copied: never broken into lines.
+    # Never wrapped, so that the path can be copied.
     console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
     if result.refused:
         raise typer.Exit(2)
@@ -293,25 +290,25 @@ def _score(
 def live(
     video: Annotated[
         Path,
-        typer.Argument(help="Video; its first frame is the rest frame, a tissue.png beside it its tissue."),
+        typer.Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
     ],
     model: Annotated[
         Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
     ] = None,
     scale: Annotated[
-        str | None, typer.Option(help="mm a pixel of the video, or unknown; needed with a model.")
+        str | None, typer.Option(help="mm per pixel of the video, or unknown; needed with a model.")
     ] = None,
     young: Young = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[int, typer.Option(min=1, max=8, help="Pictures this many times smaller.")] = 1,
+    shrink: Annotated[int, typer.Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
-    every: Annotated[bool, typer.Option("--every", help="Work on every frame, however late.")] = False,
+    every: Annotated[bool, typer.Option("--every", help="Process every frame, however late.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Masks, flow and force of a video as it runs: latency percentiles and dropped frames."""
+    """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""
     from functools import partial
 
     from threadpoolctl import threadpool_limits
@@ -328,7 +325,7 @@ def live(
     kind, files = read_choice(masks)
     drawn = video.parent / "tissue.png"
     tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
-    # Without a scale there is no force: flow alone is what is asked for.
+    # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
     method = None if model is None else Model(model)
 
@@ -366,7 +363,7 @@ def live(
 
 
 def _rectangle(text: str) -> tuple[int, int, int, int] | None:
-    """Of LEFT,TOP,WIDTH,HEIGHT; None of nothing. UserError if it isn't that."""
+    """Parses LEFT,TOP,WIDTH,HEIGHT; None if empty. UserError for anything else."""
     if not text:
         return None
     try:

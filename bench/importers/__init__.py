@@ -1,1 +1,1 @@
-"""Recordings of other systems, turned into recording folders."""
+"""Importers: recordings of other systems, converted into recording folders."""

@@ -1,4 +1,4 @@
-"""Calibrations as ROS has them (sensor_msgs/CameraInfo), turned into OpenCV's."""
+"""ROS camera calibrations (sensor_msgs/CameraInfo) in OpenCV's convention."""
 
 from __future__ import annotations
 
@@ -15,34 +15,30 @@ _TERMS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera, and how it lies to the pair that it is of."""
+    """A camera and its pose in its stereo pair."""
 
-    K: Floats
-    """(3, 3) px."""
-    distortion: Floats
-    """(D,) in OpenCV's order."""
-    turn: Floats
-    """(3, 3) from its axes to the pair's, whose rows are epipolar lines."""
-    shift_mm: float
-    """x of the pair's left lens in the pair's axes, seen from this one."""
+    K: Floats  # (3, 3) px
+    distortion: Floats  # (D,) in OpenCV's order
+    turn: Floats  # (3, 3) rotation from its axes to the rectified pair's
+    shift_mm: float  # x of the left lens in the rectified axes, with this lens at the origin
 
 
 def read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> Lens:
-    """Of a topic's message.
+    """The camera of a calibration message.
 
     Args:
-        topic: its name.
+        topic: the message's topic.
         info: the message, of ROS 1 or 2.
-        pictures: the topic of its pictures; of one named `image_rect...` they are rectified already.
-        size: width, height of them [px].
+        pictures: the topic of the camera's pictures; those named `image_rect...` are already rectified.
+        size: width and height of the pictures [px].
 
     Raises:
-        UserError: it is no calibration, or of pictures of another size.
+        UserError: no calibration, or one for pictures of another size.
     """
     K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
     if (info.width, info.height) != size:
-        made = f"{info.width} x {info.height}"
-        raise UserError(f"{topic}: is of pictures of {made} px, {pictures} has {size[0]} x {size[1]}")
+        calibrated = f"{info.width} x {info.height}"
+        raise UserError(f"{topic}: calibrated at {calibrated} px, but {pictures} has {size[0]} x {size[1]}")
     K, P = K.reshape(3, 3), P.reshape(3, 4)
     if not (np.isfinite([*K.flat, *P.flat]).all() and min(K[0, 0], K[1, 1], P[0, 0], P[1, 1]) > 0):
         raise UserError(f"{topic}: the camera isn't calibrated (K or P is 0)")
@@ -50,29 +46,31 @@ def read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> Le
     if image_name(pictures).startswith("image_rect"):
         return Lens(P[:, :3], np.zeros(5), np.eye(3), shift_mm)
     if D.any() and len(D) not in _TERMS.get(info.distortion_model, ()):
-        raise UserError(f"{topic}: {len(D)} terms of distortion {info.distortion_model}, not one of OpenCV's")
+        raise UserError(
+            f"{topic}: distortion {info.distortion_model} with {len(D)} terms is not one of OpenCV's models"
+        )
     return Lens(K, D if D.any() else np.zeros(5), R.reshape(3, 3), shift_mm)
 
 
 def image_name(topic: str) -> str:
-    """The last part of the name of a topic of pictures, without its transport."""
+    """The last part of a picture topic's name, without its transport."""
     return [part for part in topic.split("/") if not part.startswith("compressed")][-1]
 
 
 def info_name(topic: str) -> str:
-    """Where ROS puts the calibration of a topic of pictures."""
+    """The topic on which ROS publishes the calibration of a picture topic."""
     return topic[: topic.rindex(image_name(topic))] + "camera_info"
 
 
 def join_pair(left: Lens, right: Lens) -> dict[str, Floats]:
-    """K1, D1, K2, D2, R, T [mm] as OpenCV's `stereoCalibrate` gives them: x_right = R x_left + T.
+    """K1, D1, K2, D2, R, T [mm] as in OpenCV's `stereoCalibrate`: x_right = R x_left + T.
 
     Raises:
-        UserError: they have no baseline.
+        UserError: the baseline is 0.
     """
-    across = right.shift_mm - left.shift_mm
-    if not across:
-        raise UserError("the calibrations have no baseline (P[0, 3] of the right eye's camera_info)")
-    rotation, translation = right.turn.T @ left.turn, right.turn.T @ [[across], [0.0], [0.0]]
+    baseline = right.shift_mm - left.shift_mm
+    if not baseline:
+        raise UserError("the calibrations have no baseline (P[0, 3] of the right camera's camera_info)")
+    rotation, translation = right.turn.T @ left.turn, right.turn.T @ [[baseline], [0.0], [0.0]]
     lenses = {"K1": left.K, "D1": left.distortion, "K2": right.K, "D2": right.distortion}
     return {**lenses, "R": rotation, "T": translation}

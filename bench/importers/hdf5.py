@@ -1,4 +1,4 @@
-"""HDF5 files: arrays under names that every lab chooses for itself."""
+"""HDF5 files, whose array names differ between labs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from synth.system.checked_file import refuse_large
 
 _LARGEST_CHUNK = 1 << 30
 
-_USUAL = {
+_COMMON_NAMES = {
     "frames": ("frames", "images", "image", "rgb", "video", "color"),
     "frame_time": ("frame_time", "frame_times", "frame_timestamps", "timestamps", "timestamp", "time", "t"),
     "force": ("force", "forces", "wrench", "ft"),
@@ -26,11 +26,11 @@ _USUAL = {
 def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,), tip (T, 3).
 
-    Arrays are found by their usual names anywhere in the file, or named by `use`. Without times of its own,
-    force as long as the frames takes theirs.
+    Arrays are found by common names anywhere in the file, or named by `use`. A force array without times has
+    those of the frames.
 
     Raises:
-        UserError: arrays missing, ambiguous or of the wrong shape.
+        UserError: an array is missing, ambiguous or of the wrong shape.
     """
     import h5py
 
@@ -42,10 +42,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     chosen = {role: _choose(role, use, arrays) for role in ROLES}
     frames, times = chosen["frames"], chosen["frame_time"]
     if frames is None or times is None:
-        raise UserError(
-            f"{source}: no {'frames' if frames is None else 'frame_time'} found; say --use; "
-            f"there are {', '.join(sorted(arrays)) or 'no arrays'}"
-        )
+        missing = "frames" if frames is None else "frame_time"
+        there = ", ".join(sorted(arrays)) or "no arrays"
+        raise UserError(f"{source}: no {missing} found; name them with --use; the file has {there}")
     for role, array in chosen.items():
         if array is not None:
             _refuse_odd(source, role, array)
@@ -70,21 +69,21 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
-    """UserError for an array that is elsewhere, holds no numbers or is too long; nothing of it is read."""
+    """Raises UserError for an array in other files, without numbers or too long, before it is read."""
     if array.external or array.is_virtual:
-        raise UserError(f"{source}: {array.name} lies in other files, which are not opened")
+        raise UserError(f"{source}: {array.name} is stored in other files, which are not opened")
     if array.dtype.kind not in "fiu" or array.ndim == 0:
-        raise UserError(f"{source}: {array.name}, {array.shape} {array.dtype}, is no row of numbers")
+        raise UserError(f"{source}: {array.name}, {array.shape} {array.dtype}, is not an array of numbers")
     chunk = int(np.prod(array.chunks or (1,), dtype=object)) * array.dtype.itemsize
     if chunk > _LARGEST_CHUNK or (role != "frames" and array.size > 6 * MOST_FRAMES):
-        raise UserError(f"{source}: {array.name} is too large to be read")
+        raise UserError(f"{source}: {array.name} is too large to read")
 
 
 def _choose(role: str, use: dict[str, str], arrays: dict[str, Any]) -> Any:
-    """The array for a role: the one named, else that of the first of its usual names; None without."""
+    """The array for a role: the one named, else the first under a common name; None without."""
     if role in use:
         return arrays[one_of(role, use[role].strip("/"), sorted(arrays), "array") or ""]
     by_name = [
-        [name for name in arrays if name.rsplit("/", 1)[-1].lower() == usual] for usual in _USUAL[role]
+        [name for name in arrays if name.rsplit("/", 1)[-1].lower() == one] for one in _COMMON_NAMES[role]
     ]
     return arrays.get(one_of(role, None, next(filter(None, by_name), []), "array") or "")

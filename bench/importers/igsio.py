@@ -1,4 +1,4 @@
-"""PLUS/IGSIO sequences: a MetaImage whose header carries fields a frame, read by SimpleITK."""
+"""PLUS/IGSIO sequences: a MetaImage with header fields for every frame, read by SimpleITK."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a sequence.
 
     `Timestamp` is the frame's time, `Force` (one or three numbers) its force, and the translation of a
-    `*TipToWorldTransform` the tip. Frames whose tracker says INVALID have no tip.
+    `*TipToWorldTransform` the tip. Frames whose tracker status is not OK have no tip.
 
     Raises:
         UserError: not a MetaImage, or no times.
@@ -42,7 +42,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     fields = _fields(reader)
     size = reader.GetSize()
     if len(size) != 3 or size[2] > MOST_FRAMES:
-        raise UserError(f"{source}: no sequence of pictures, or too long a one")
+        raise UserError(f"{source}: not a sequence of pictures, or one of more than {MOST_FRAMES} frames")
     count = size[2]
     refuse_large(size[0], size[1])
     stamp = use.get("frame_time", "Timestamp")
@@ -55,9 +55,8 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     force = _force(source, fields, count, use, notes)
     tip = _tip(source, fields, times, use)
     if "UltrasoundImageOrientation" in reader.GetMetaDataKeys():
-        notes.append(
-            f"orientation {reader.GetMetaData('UltrasoundImageOrientation')}: pictures are as stored"
-        )
+        orientation = reader.GetMetaData("UltrasoundImageOrientation")
+        notes.append(f"orientation {orientation}: pictures are imported as stored")
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         for k in range(count):
@@ -70,16 +69,14 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 
 def _refuse_elsewhere(source: Path) -> None:
-    """UserError for a head that names another file for its pictures, or has none of a MetaImage's lines."""
+    """Raises UserError for a header that names another file for its pictures, or is not a MetaImage's."""
     with checked_file.open_file(source, _LARGEST_BYTES) as file:
         while line := file.readline(_LONGEST_LINE):
             key, _, value = line.partition(b"=")
             if key.strip() == b"ElementDataFile":
                 if value.strip() == b"LOCAL":
                     return
-                raise UserError(
-                    f"{source}: its pictures lie in another file, which is not opened; write .mha"
-                )
+                raise UserError(f"{source}: its pictures are in another file, which is not opened; use .mha")
             if not value or len(line) == _LONGEST_LINE:
                 break
     raise UserError(f"{source}: not a readable MetaImage")
@@ -94,20 +91,20 @@ def _fields(reader: Any) -> Fields:
 
 
 def _force(source: Path, fields: Fields, count: int, use: dict[str, str], notes: list[str]) -> Floats:
-    """(T, 3), NaN where a frame has none; (0, 3) without such a field."""
+    """(T, 3), NaN where a frame has none; (0, 3) without a field of force."""
     names = sorted(fields) if "force" in use else [name for name in fields if name.lower() == "force"]
     name = one_of("force", use.get("force"), names, "field")
     if name is None:
         return np.zeros((0, 3))
     force = _column(source, name, fields[name], count, (1, 3))
     if force.shape[1] == 1:
-        notes.append(f"{name} is one number a frame: taken as a size, in fx_n")
+        notes.append(f"{name} is one number per frame: imported as a magnitude, in fx_n")
         force = np.column_stack([force, np.zeros((count, 2))])
     return force
 
 
 def _tip(source: Path, fields: Fields, times: Floats, use: dict[str, str]) -> Floats:
-    """(M, 4) time and place of the frames whose tracker saw the tip."""
+    """(M, 4) time and position of the tip in the frames where it was tracked."""
     names = sorted(fields) if "tip" in use else [n for n in fields if n.endswith("TipToWorldTransform")]
     name = one_of("tip", use.get("tip"), names, "field")
     if name is None:
@@ -123,10 +120,10 @@ def _column(source: Path, name: str, values: dict[int, str], count: int, widths:
     rows = {k: text.split() for k, text in values.items() if k < count}
     width = max((len(row) for row in rows.values()), default=0)
     if width not in widths:
-        raise UserError(f"{source}: field {name} holds {width} numbers a frame, expected {widths[-1]}")
+        raise UserError(f"{source}: field {name} holds {width} numbers per frame, expected {widths[-1]}")
     out = np.full((count, width), np.nan)
     for k, row in rows.items():
-        if len(row) != width:  # one number would be taken for all
+        if len(row) != width:  # a single number would be broadcast
             raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers")
         out[k] = [float(word) for word in row]
     return out

@@ -1,4 +1,4 @@
-"""What comes without a container: folders of pictures, .npy arrays, CSV tables as ROS tools write them."""
+"""Files without a container: folders of pictures, .npy arrays, CSV tables as ROS tools write them."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _NANOSECONDS = 1e15  # larger numbers are no seconds of any clock: `rostopic ech
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """A folder of pictures, in the order of their numbers, or an .npy of (T, H, W[, C]).
+    """Opens a folder of pictures, in the order of their numbers, or an .npy of (T, H, W[, C]).
 
-    Times are those of `--use frame_time=TABLE.csv`, or frames over `--use fps=RATE`. Forces are those of
+    Times come from `--use frame_time=TABLE.csv`, or from `--use fps=RATE`. Forces come from
     `--use force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n.
 
     Raises:
@@ -41,7 +41,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 
 def _read_forces(path: Path) -> tuple[Floats, Floats]:
-    """Times (N,) s and forces (N, 3) in the table's unit. UserError if it has no such columns."""
+    """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
     header = csv_table.read_header(path)
     names = next((names for names in _FORCES if set(names) <= set(header)), None)
     if names is None:
@@ -50,7 +50,7 @@ def _read_forces(path: Path) -> tuple[Floats, Floats]:
 
 
 def _seconds(path: Path, header: list[str]) -> Floats:
-    """(N,) s of a table's rows."""
+    """Times of a table's rows, (N,) s."""
     if set(_STAMP) <= set(header):
         stamp = csv_table.read_csv(path, _STAMP)
         return np.asarray(stamp[_STAMP[0]] + 1e-9 * stamp[_STAMP[1]], np.float64)
@@ -70,7 +70,7 @@ def _times(source: Path, use: dict[str, str], count: int) -> Floats:
         return times
     rate = float(use.get("fps", "nan"))
     if not (np.isfinite(rate) and rate > 0):
-        raise UserError(f"{source}: pictures without times; say --use frame_time=TABLE.csv or --use fps=RATE")
+        raise UserError(f"{source}: pictures without times; add --use frame_time=TABLE.csv or --use fps=RATE")
     return np.arange(count) / rate
 
 
@@ -80,7 +80,7 @@ def _folder(folder: Path) -> tuple[_Pictures, int]:
 
 
 def _array(path: Path) -> tuple[_Pictures, int]:
-    film = np.load(path, mmap_mode="r", allow_pickle=False)
-    if film.ndim not in (3, 4):
-        raise UserError(f"{path}: an array of shape {film.shape}, expected (T, H, W) or (T, H, W, C)")
-    return lambda: (np.asarray(picture) for picture in film), len(film)
+    frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    if frames.ndim not in (3, 4):
+        raise UserError(f"{path}: an array of shape {frames.shape}, expected (T, H, W) or (T, H, W, C)")
+    return lambda: (np.asarray(picture) for picture in frames), len(frames)

@@ -1,7 +1,7 @@
-"""`bench import`: recordings that other systems wrote, turned into recording folders.
+"""`bench import`: recordings of other systems, converted into recording folders.
 
 PLUS/IGSIO sequences (.mha, .igs.mha), ROS bags (.bag, .mcap, .db3, ROS 2 folders) and HDF5 files are read by
-the libraries kept for them; what comes out is the layout that everything else here reads.
+the libraries made for these formats; the result has the layout that `bench.recording` reads.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from synth.video.file_numbers import natural_order
 
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
-"""What a source may hold; `--use ROLE=NAME` says under which name; `--use fps=RATE` times bare pictures."""
+"""Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
 BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")
-"""What a ROS bag may: each a topic."""
+"""Parts of a ROS bag; each is a topic."""
 _STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _PLAIN = "bench.importers.plain_files"
 _MAKERS = {
@@ -44,40 +44,33 @@ _LEAST_PX = 8
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 10.0
 
-MOST_FRAMES = 10_000_000
-"""That a source may say it has, and times that a sensor may have in it."""
+MOST_FRAMES = 10_000_000  # of a source, and samples of a sensor
 
 
 @dataclass(frozen=True)
 class SecondView:
-    """What a right eye or a depth camera saw of the frames, its pictures not yet decoded."""
+    """Pictures of the right camera or the depth camera, not yet decoded."""
 
     kind: Literal["right", "depth"]
-    frame: NDArray[np.int64]
-    """(M,) number of the frame that each of its pictures is of; -1: of none."""
+    frame: NDArray[np.int64]  # (M,) number of the frame that belongs to each picture; -1: none
     pictures: Callable[[], Iterator[NDArray[Any]]]
-    """Gives them in order: RGB (H, W, 3) uint8, or depth (H, W) mm, uint16 or float32; 0 or NaN: unknown."""
-    lens: Mapping[str, object] | None = None
-    """The section `depth` of meta.yaml; None: unknown, or of a right eye."""
+    """The pictures in order: RGB (H, W, 3) uint8, or depth (H, W) mm, uint16 or float32; 0, NaN: unknown."""
+    lens: Mapping[str, object] | None = None  # section `depth` of meta.yaml; None: unknown, or stereo
     pair: Mapping[str, Floats] | None = None
-    """K1, D1, K2, D2, R, T [mm] of both eyes, as OpenCV has them; None: unknown, or of depth."""
+    """OpenCV's K1, D1, K2, D2, R, T [mm] of the stereo pair; None: unknown, or a depth camera."""
 
 
 @dataclass(frozen=True)
 class Intake:
-    """What a source holds, its pictures not yet decoded."""
+    """The contents of a source; its pictures are not yet decoded."""
 
-    times_s: Floats
-    """(T,) of the frames [s]."""
+    times_s: Floats  # (T,) of the frames [s]
     pictures: Callable[[], Iterator[NDArray[Any]]]
-    """Gives the T frames in order, grey (H, W) or RGB[A] (H, W, C) uint8 or uint16; of `read_source`
+    """The T frames in order: grey (H, W) or RGB[A] (H, W, C) uint8 or uint16; after `read_source`
     (H, W, 3) uint8."""
-    force_s: Floats = field(default_factory=lambda: np.zeros(0))
-    """(N,) [s]; empty if the source holds no force."""
-    force: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """(N, 3) in the source's unit."""
-    tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))
-    """(M, 4) time [s] and the tool's tip [mm]."""
+    force_s: Floats = field(default_factory=lambda: np.zeros(0))  # (N,) s; empty: no force
+    force: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) in the source's unit
+    tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))  # (M, 4) time [s], tool tip [mm]
     notes: tuple[str, ...] = ()
     second: SecondView | None = None
 
@@ -87,17 +80,18 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
 
     Args:
         source: the file, or the folder of a ROS 2 bag.
-        use: role → name in the source, where there is a choice.
+        use: role → name in the source, where the choice is ambiguous.
 
     Raises:
-        UserError: another format, a library that is not installed, nothing usable, or an ambiguous choice.
+        UserError: unknown format, a library that is not installed, no usable contents, an ambiguous choice.
     """
     if not source.is_dir():
         checked_file.check_file(source, _LARGEST_BYTES)
     maker = _MAKERS.get(source.suffix.lower())
     if source.is_dir():
-        bag = (source / "metadata.yaml").is_file()
-        maker = "bench.importers.rosbag" if bag else _PLAIN if _holds_bare_pictures(source) else None
+        bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
+        pictures_only = not recording and picture_files(source)
+        maker = "bench.importers.rosbag" if bag else _PLAIN if pictures_only else None
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
@@ -105,7 +99,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
         )
     roles = BAG_ROLES if maker.endswith("rosbag") else (*ROLES, "fps")
     if unknown := sorted(set(use or {}) - set(roles)):
-        raise UserError(f"--use {unknown[0]}=...: of {source.name}, one of {', '.join(roles)}")
+        raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
     with _damage_as_user_error(source):
         found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
@@ -115,20 +109,20 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
             size = None
             for k, picture in enumerate(map(_as_rgb, found.pictures())):
                 if picture.shape != (size := size or picture.shape):
-                    raise UserError(f"{source}: frame {k} is of another size than those before it")
+                    raise UserError(f"{source}: frame {k} has another size than the frames before it")
                 yield picture
 
-    def beside(view: SecondView) -> Iterator[NDArray[Any]]:
+    def second_pictures(view: SecondView) -> Iterator[NDArray[Any]]:
         with _damage_as_user_error(source):
             yield from map(_as_rgb, view.pictures()) if view.kind == "right" else view.pictures()
 
-    second = found.second and replace(found.second, pictures=partial(beside, found.second))
+    second = found.second and replace(found.second, pictures=partial(second_pictures, found.second))
     return replace(found, pictures=pictures, second=second)
 
 
 @contextmanager
 def _damage_as_user_error(source: Path) -> Iterator[None]:
-    """What the libraries raise over a damaged file, and that is nearly anything, as one line."""
+    """Turns what libraries raise over a damaged file, which may be any exception, into one line."""
     try:
         yield
     except (UserError, KeyboardInterrupt, GeneratorExit):
@@ -136,18 +130,17 @@ def _damage_as_user_error(source: Path) -> Iterator[None]:
     except ImportError as error:
         raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
-        what = first_line(error)
-        raise UserError(f"{source}: damaged, or not what its name says ({what})") from error
+        raise UserError(f"{source}: damaged, or its name has a wrong ending ({first_line(error)})") from error
 
 
 def _refuse_odd(source: Path, found: Intake) -> None:
-    """UserError for times that are none, or in another unit than seconds, or not as many as forces."""
+    """Raises UserError for times that are not seconds, or not as many as the forces."""
     if len(found.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
     for what, times in (("frame", found.times_s), ("force", found.force_s), ("tip", found.tip[:, 0])):
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         if not (np.abs(times) < _LATEST_S).all() or step >= _LONGEST_STEP_S:
-            raise UserError(f"{source}: the times of {what}s, {step:g} s apart: are they in seconds?")
+            raise UserError(f"{source}: {what} times are {step:g} s apart: are they in seconds?")
     if len(found.force_s) != len(found.force):
         raise UserError(f"{source}: {len(found.force)} forces, {len(found.force_s)} times for them")
     if other := clocks.find_other_unit(found.times_s, found.force_s):
@@ -159,20 +152,20 @@ def write_recording(
 ) -> Path:
     """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
 
-    Of a second eye right/ and stereo.yaml too, of a depth camera depth/.
+    A right camera adds right/ and stereo.yaml, a depth camera depth/.
 
     Args:
-        found: of `read_source`.
+        found: from `read_source`.
         out: must not exist.
-        newtons: newtons in the source's unit of force.
+        newtons: newtons per unit of force in the source.
         about: contents of meta.yaml.
-        progress: told how many frames are written.
+        progress: called with the number of frames written.
 
     Raises:
         UserError: the folder exists, or a picture can't be decoded.
     """
     with writer.write_whole_folder(out) as part:
-        # Lossless, and at times that rise, as the container needs them; frames.csv keeps the true ones.
+        # The container requires rising times; frames.csv has the true ones.
         steps = np.maximum(np.diff(found.times_s), 1e-3)
         rising = found.times_s[0] + np.cumsum([0.0, *steps])
         writer.write_video(part / "video.mp4", found.pictures(), rising, crf=0, progress=progress)
@@ -199,36 +192,31 @@ def picture_files(folder: Path) -> list[Path]:
 
 
 def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
-    """The name for a role: the wanted one, the only one, or none.
+    """The name for a role: the requested one, else the only one, else None.
 
     Raises:
-        UserError: the wanted one isn't there, or there are several and none is wanted.
+        UserError: the requested one is missing, or there are several and none is requested.
     """
     if wanted is not None:
         if wanted not in names:
             raise UserError(f"--use {role}={wanted}: no such {what}; there are {', '.join(names) or 'none'}")
         return wanted
     if len(names) > 1:
-        raise UserError(f"several {what}s could be the {role}: say --use {role}=NAME; {', '.join(names)}")
+        raise UserError(f"several {what}s could be the {role}: add --use {role}=NAME; {', '.join(names)}")
     return names[0] if names else None
 
 
-def _holds_bare_pictures(folder: Path) -> bool:
-    """Whether there are pictures, and the folder is no recording already."""
-    return not (folder / "meta.yaml").is_file() and bool(picture_files(folder))
-
-
 def _as_rgb(picture: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey or colour as (H, W, 3) uint8 sRGB; 16-bit levels are cut to 8. UserError for others."""
+    """Converts grey or colour to (H, W, 3) uint8 sRGB; 16 bits are cut to 8. UserError for other types."""
     if picture.dtype == np.uint16:
         picture = (picture >> 8).astype(np.uint8)
     if picture.ndim == 2 or picture.shape[2] == 1:
         picture = np.repeat(picture.reshape(*picture.shape[:2], 1), 3, axis=2)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
         kind = f"{picture.shape} {picture.dtype}"
-        raise UserError(f"pictures of {kind}: grey, 3 or 4 channels of 8 or 16 bits are read")
+        raise UserError(f"pictures of {kind}: expected 1, 3 or 4 channels of 8 or 16 bits")
     height, width = picture.shape[:2]
     if min(height, width) < _LEAST_PX:
-        raise UserError(f"pictures of {width} x {height} pixels: at least {_LEAST_PX} a side are needed")
+        raise UserError(f"pictures of {width} x {height} px: each side must have at least {_LEAST_PX} px")
     refuse_large(width, height)
     return np.ascontiguousarray(picture[..., :3])

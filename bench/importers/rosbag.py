@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags (also a lone .mcap or .db3), read by rosbags without any ROS installed."""
+"""ROS 1 and ROS 2 bags (also a single .mcap or .db3), read by rosbags without a ROS installation."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ _TIPS = (
 _LENSES = ("sensor_msgs/msg/CameraInfo",)
 _CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-_HEADER = 12  # bytes before the PNG of a compressed depth picture
+_HEADER = 12  # bytes before the PNG in a compressed depth picture
 
 _Read = Callable[[Path, Any], NDArray[Any]]
 _Pictures = Callable[..., Iterator[NDArray[Any]]]
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a bag: the only topic of pictures, of forces and of poses, or those named by `use`.
+    """Opens a bag: its only topic of pictures, of forces and of poses, or those named by `use`.
 
-    Times are the messages' own stamps; a topic whose stamps are all zero falls back on the bag's. Positions,
-    in metres by the ROS convention, become mm. With `right` or `depth` named, each picture there goes with
-    the frame that is nearest in time, by half a frame at most.
+    Times are the messages' header stamps; if a topic's stamps are all zero, the bag's times. Positions, in
+    metres by the ROS convention, become mm. Each picture of the topic `right` or `depth` is assigned to the
+    nearest frame, at most half a frame interval away.
 
     Raises:
-        UserError: no pictures, several topics of a kind, an unknown encoding, or as `camera_info`.
+        UserError: no pictures, several topics of a kind, an unknown encoding, or as in `camera_info`.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -61,9 +61,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
                 yield read(source, message)
 
     with opened() as bag:
-        beside = use.get("right") or use.get("depth")
+        second = use.get("right") or use.get("depth")
         topics = {
-            role: _topic(bag, role, kinds, use, beside)
+            role: _topic(bag, role, kinds, use, second)
             for role, kinds in (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))
         }
         if topics["frames"] is None:
@@ -72,31 +72,30 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         force = _table(bag, topics["force"], _vector, 3)
         tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
         found = Intake(stamps, partial(pictures, topics["frames"]), force[:, 0], force[:, 1:], tip)
-        if beside is not None:
+        if second is not None:
             return _add_second(bag, found, topics["frames"], use, pictures)
         if lone := {"calibration", "right_calibration"} & use.keys():
-            raise UserError(f"--use {min(lone)}=...: goes with right=TOPIC or depth=TOPIC")
+            raise UserError(f"--use {min(lone)}=...: requires right=TOPIC or depth=TOPIC")
         return found
 
 
 def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictures: _Pictures) -> Intake:
-    """With a right eye's pictures or depth; frames before the first of them and after the last are left out.
+    """Adds the right or depth camera; frames before its first picture and after its last are left out.
 
-    What the lenses are is said by the topics `calibration` and `right_calibration`, else by the `camera_info`
-    that lies beside the pictures.
+    Calibrations are the topics `calibration` and `right_calibration`, else the pictures' own `camera_info`.
     """
     kind: Literal["right", "depth"] = "right" if "right" in use else "depth"
     if {"right", "depth"} <= use.keys():
-        raise UserError("--use right=... and depth=...: a recording has one of them")
+        raise UserError("--use right=... and depth=...: give one of them")
     topic = _topic(bag, kind, _PICTURES, use) or ""
     frame = partners(_table(bag, topic, lambda message: (), 0)[:, 0], found.times_s)
     if (frame < 0).all():
-        raise UserError(f"{topic}: none of its pictures is of the time of a frame of {frames}")
+        raise UserError(f"{topic}: no picture is at the time of a frame of {frames}")
     first, last = int(frame[frame >= 0].min()), int(frame.max())
     times = found.times_s[first : last + 1]
-    notes = [f"{topic}: pictures of {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
+    notes = [f"{topic}: pictures for {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
     if len(times) < len(found.times_s):
-        notes.append(f"frames before {first} and after {last}, which have none, are left out")
+        notes.append(f"frames before {first} and after {last} have none and are left out")
     left = _lens(bag, frames, use.get("calibration"), next(pictures(frames)))
     view = SecondView(kind, np.where(frame < 0, -1, frame - first), partial(pictures, topic))
     if kind == "right":
@@ -105,14 +104,14 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     else:
         view = replace(view, pictures=partial(pictures, topic, _depth))
         if left is not None:
-            notes.append(f"{topic} is taken as registered to {frames}: pixel for pixel, seen by its lens")
+            notes.append(f"{topic} is assumed to be registered to {frames}, pixel by pixel")
             about = {"focal_px": float(left.K[0, 0]), "centre_px": left.K[:2, 2].tolist()}
             view = replace(view, lens=about)
             if left.distortion.any():
-                notes.append(f"{frames} has distortion, of which depth knows nothing")
+                notes.append(f"the distortion of {frames} is ignored for depth")
     if view.pair is None and view.lens is None:
         section = {"right": "stereo", "depth": "depth"}[kind]
-        notes.append(f"calibrations are missing (camera_info): meta.yaml still needs {section}")
+        notes.append(f"no calibration found (camera_info): add {section} to meta.yaml")
     return replace(
         found,
         times_s=times,
@@ -123,11 +122,11 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
 
 
 def partners(times_s: Floats, frames_s: Floats) -> NDArray[np.int64]:
-    """Which frame each picture of another camera is of, (M,): both are the other's nearest; -1: none.
+    """The frame of each picture of another camera, (M,), mutually nearest in time; -1: none.
 
     Args:
-        times_s: (M,) of its pictures [s].
-        frames_s: (T,) of the frames [s].
+        times_s: (M,) times of the pictures [s].
+        frames_s: (T,) times of the frames [s].
     """
     frame, picture = _nearest(times_s, frames_s), _nearest(frames_s, times_s)
     apart = np.abs(times_s - frames_s[frame])
@@ -136,7 +135,7 @@ def partners(times_s: Floats, frames_s: Floats) -> NDArray[np.int64]:
 
 
 def _nearest(times_s: Floats, among_s: Floats) -> NDArray[np.int64]:
-    """Which of `among_s` is nearest to each of (N,) times."""
+    """Index into `among_s` of the time nearest to each of (N,) times."""
     order = np.argsort(among_s, kind="stable")
     rising = among_s[order]
     return order[np.searchsorted((rising[1:] + rising[:-1]) / 2, times_s)]
@@ -144,25 +143,25 @@ def _nearest(times_s: Floats, among_s: Floats) -> NDArray[np.int64]:
 
 def _lens(bag: Any, pictures: str, named: str | None, picture: NDArray[Any]) -> Lens | None:
     names = sorted({c.topic for c in bag.connections if c.msgtype in _LENSES})
-    beside = camera_info.info_name(pictures)
-    topic = one_of("calibration", named or beside, names, "topic") if named or beside in names else None
-    if topic is None:
+    usual = camera_info.info_name(pictures)
+    if not named and usual not in names:
         return None
+    topic = one_of("calibration", named or usual, names, "topic") or usual
     _, info = next(_messages(bag, topic))
     return camera_info.read_lens(topic, info, pictures, (picture.shape[1], picture.shape[0]))
 
 
 def _refuse_elsewhere(folder: Path) -> None:
-    """UserError for a bag whose metadata.yaml is none, or names files that don't lie in its folder."""
+    """Raises UserError for a metadata.yaml without files, or with files outside the bag's folder."""
     path = folder / "metadata.yaml"
-    told = checked_file.read_yaml(path)
-    about = told.get("rosbag2_bagfile_information") if isinstance(told, dict) else None
+    tree = checked_file.read_yaml(path)
+    about = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
     names = about.get("relative_file_paths") if isinstance(about, dict) else None
     if not isinstance(names, list):
-        raise UserError(f"{path}: doesn't say which files hold the bag")
+        raise UserError(f"{path}: relative_file_paths is missing")
     for name in map(str, names):
         if name != Path(name).name:
-            raise UserError(f"{path}: names {name}, which is not in its folder")
+            raise UserError(f"{path}: {name} is not in the bag's folder")
         checked_file.check_file(folder / name, _LARGEST_BYTES)
 
 
@@ -174,9 +173,9 @@ def _topic(
 
 
 def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
-    """Time on the bag's own clock [s] and message, in the bag's order; nothing of no topic."""
+    """Time on the bag's clock [s] and message, in the bag's order; none without a topic."""
     chosen = [c for c in bag.connections if c.topic == topic]
-    if not chosen:  # of which rosbags would give every message
+    if not chosen:  # with an empty list rosbags would yield every message
         return
     for connection, logged, raw in bag.messages(chosen):
         yield 1e-9 * logged, bag.deserialize(raw, connection.msgtype)
@@ -185,7 +184,7 @@ def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
 def _table(
     bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int
 ) -> NDArray[np.float64]:
-    """(N, 1 + width) times [s] and what is read of each message; one clock for all of them."""
+    """Times [s] and values of a topic's messages, (N, 1 + width), all on one clock."""
     rows = [
         (logged, message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec, *read(message))
         for logged, message in _messages(bag, topic)
@@ -215,28 +214,26 @@ def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
         return checked_file.decode_picture(bytes(message.data)).astype(np.uint8)[..., ::-1]
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
-        raise UserError(f"{source}: pictures in encoding {message.encoding}; {', '.join(_CHANNELS)} are read")
+        raise UserError(f"{source}: picture encoding {message.encoding}; supported: {', '.join(_CHANNELS)}")
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     picture = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
     if message.encoding.startswith(("bgr", "8UC3")):
-        picture = picture[..., [2, 1, 0]]  # opacity is of no use
+        picture = picture[..., [2, 1, 0]]  # without opacity
     return picture
 
 
 def _depth(source: Path, message: Any) -> NDArray[Any]:
-    """(H, W) mm, uint16 or float32: 16-bit pictures are in mm and floats in metres, by ROS's REP 118."""
+    """Depth (H, W) mm, uint16 or float32; by ROS's REP 118 16-bit pictures are in mm, floats in metres."""
     if hasattr(message, "format"):
         if "compressedDepth" in message.format and message.format.startswith("32FC1"):
-            raise UserError(
-                f"{source}: {message.format} holds inverse depth, which isn't read; decompress it"
-            )
+            raise UserError(f"{source}: inverse depth ({message.format}) is not supported; decompress it")
         data = bytes(message.data)[_HEADER * ("compressedDepth" in message.format) :]
         found = checked_file.decode_picture(data, cv2.IMREAD_UNCHANGED)
         if found.dtype != np.uint16 or found.ndim != 2:
-            raise UserError(f"{source}: depth in {message.format}, not in 16 bits")
+            raise UserError(f"{source}: depth in {message.format} is not 16-bit")
         return found
     if message.encoding not in _DEPTHS:
-        raise UserError(f"{source}: depth in encoding {message.encoding}; {', '.join(_DEPTHS)} are read")
+        raise UserError(f"{source}: depth encoding {message.encoding}; supported: {', '.join(_DEPTHS)}")
     kind = np.dtype((">" if message.is_bigendian else "<") + _DEPTHS[message.encoding])
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
     found = np.ascontiguousarray(rows[:, : message.width * kind.itemsize]).view(kind)

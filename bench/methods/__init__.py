@@ -1,1 +1,1 @@
-"""What answers with a force: networks, baselines, physics."""
+"""Force estimators: networks, baselines, physics and their fusion."""

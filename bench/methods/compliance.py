@@ -1,8 +1,8 @@
-"""What unit loads on the surface do to what a camera sees: the linear map that physics inverts.
+"""The compliance: observed surface displacement under unit loads, the linear map that physics inverts.
 
-Built from `synth.fem` on a procedural block seen straight from above, with a mesh of its own. A recording
-doesn't tell the pose of the camera or the shape of the brain, so neither does the map know them. What it may
-tell of the tissue (`TissueKind`) is a small grid of maps, kept on disk once they are built.
+Computed by `synth.fem` on a procedural block viewed from straight above, with a mesh of its own. A recording
+does not determine the camera's pose or the brain's shape, so the compliance does not depend on them. For the
+tissue (`TissueKind`) there is a small grid of compliances, cached on disk.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
-# A recording doesn't tell the brain's shape: the default job's.
+# A recording does not determine the brain's shape: that of the default job.
 _ANATOMY = schema.AnatomySection()
 OPENING_MM = _ANATOMY.craniotomy.radius_mm
 _OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))  # no skull near
@@ -48,37 +48,36 @@ Edge = Literal["bonded", "slipping", "free"]
 
 @dataclass(frozen=True)
 class TissueKind:
-    """What the displacement under a load depends on, but for E."""
+    """Parameters, other than E, that determine the displacement under a load."""
 
-    edge: Edge = "bonded"  # how the skull holds the tissue round the opening; `free`: there is none
-    membrane: float = 0.0
-    """Thickness times Young's modulus of the membrane over E of the tissue [mm]; 0: none."""
+    edge: Edge = "bonded"  # how the skull holds the tissue around the opening; `free`: no skull
+    membrane: float = 0.0  # its thickness times Young's modulus over E of the tissue [mm]; 0: none
     poisson: float = 0.4
-    stretch: float = 1.0  # of the membrane at rest: above 1 its tension resists being bent
+    stretch: float = 1.0  # of the membrane at rest; above 1 its tension resists bending
 
 
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """Displacement seen at points of the opening for loads at nodes of it, E = 1 kPa."""
+    """Displacement at points of the opening under loads at nodes of it, E = 1 kPa."""
 
     matrix: Floats
-    """(C P, 3 K): displacement [mm], x of every point, then y, then z if a second eye sees it (C = 3), for x,
-    y, z loads of 1 mN a node."""
-    points: Floats  # (P, 2) where displacement is seen, camera x, y from the opening's centre [mm]
-    nodes: Floats  # (K, 2) where loads stand, same axes [mm]
+    """(C P, 3 K): displacement [mm], x of every point, then y, then in stereo z (C = 3), under x, y, z loads
+    of 1 mN per node."""
+    points: Floats  # (P, 2) camera x, y from the opening's centre [mm]
+    nodes: Floats  # (K, 2) positions of the loads, same axes [mm]
     node_area: Floats  # (K,) mm^2
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticBlock:
-    """A procedural block seen from straight above, E = 1 kPa."""
+    """A procedural block viewed from straight above, E = 1 kPa."""
 
     volume: Tets
     system: System
 
     @classmethod
     def build(cls, tets: int, tissue: TissueKind | None = None) -> ElasticBlock:
-        """A linear block of about that many second-order tetrahedra."""
+        """A linear block of about `tets` second-order tetrahedra."""
         tissue = tissue or TissueKind()
         free = tissue.edge == "free"
         volume = tetrahedra.block(
@@ -88,25 +87,25 @@ class ElasticBlock:
             slips=tissue.edge == "slipping",
         )
         sheet = MembraneSheet(tissue.membrane, tissue.stretch) if tissue.membrane else None
-        law = "neo-hookean" if tissue.stretch > 1 else "linear"  # a linear sheet knows no tension
+        law = "neo-hookean" if tissue.stretch > 1 else "linear"  # a linear sheet has no tension
         return cls(volume, assemble(volume, law, tissue.poisson, sheet))
 
     def embed(self, xy: Floats) -> Embedding:
-        """How surface points (P, 2), camera x, y [mm], ride on the volume."""
+        """The embedding of surface points (P, 2), camera x, y [mm], in the volume."""
         world = xy * np.array([1.0, -1.0])
         on_dome = np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)])
         return surface_embedding.embed(self.volume, on_dome)
 
 
 def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
-    """What the camera sees, (P, C, ...) mm at points, of a volume's motion (N, 3, ...) mm in world axes."""
+    """Motion (P, C, ...) mm of points in camera axes, from a volume's (N, 3, ...) mm in world axes."""
     return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], embedding.move(moved)), np.float64)
 
 
 def build(components: int, tissue: TissueKind) -> Compliance:
-    """Solves one linear problem a node and axis, on one factorisation (4 CPU-s), or reads what was solved.
+    """The compliance: one linear problem per node and axis with one factorisation (4 CPU-s), or the cache.
 
-    `components`: of the displacement that is observed: 2 monocular, 3 stereo.
+    `components`: of the observed displacement: 2 monocular, 3 stereo.
     """
     points, nodes = _lattices()
     matrix = _stored(tissue)[: components * len(points)]
@@ -117,7 +116,7 @@ def build(components: int, tissue: TissueKind) -> Compliance:
 
 @lru_cache(maxsize=4)
 def _stored(tissue: TissueKind) -> NDArray[np.float32]:
-    """(3 P, 3 K) from this user's cache, or solved and stored there."""
+    """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
     return cache.cached(
         "compliance/npy",
@@ -142,13 +141,13 @@ def _lattices() -> tuple[Floats, Floats]:
 
 def _solved(tissue: TissueKind) -> Floats:
     block, (points, nodes) = ElasticBlock.build(_TETS, tissue), _lattices()
-    seen, held = block.embed(points), block.embed(nodes)
+    observed, loaded = block.embed(points), block.embed(nodes)
     columns = np.empty((len(nodes), 3, 3, len(points)))
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
         for axis in range(3):
             unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])
-            u = block.system.solve(held.gather(unit))
-            columns[some, axis] = picture(seen, u, 3).transpose(2, 1, 0)
+            u = block.system.solve(loaded.gather(unit))
+            columns[some, axis] = picture(observed, u, 3).transpose(2, 1, 0)
     return columns.transpose(2, 3, 0, 1).reshape(3 * len(points), 3 * len(nodes))
 
 

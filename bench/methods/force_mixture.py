@@ -1,4 +1,4 @@
-"""What is likely of a force: a mixture of Gaussians, what another answer adds to it, and an interval."""
+"""A probability distribution of a force as a mixture of Gaussians, and the interval of its magnitude."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri, softmax
 
-_DRAWS = 400  # by hand: a quantile of 0.05 is then of 20
-_SURELY = 6.25  # 90% of a chi-squared of three degrees of freedom: zero is within the interval
+_DRAWS = 400  # by hand: 20 draws lie below a quantile of 0.05
+_SURELY = 6.25  # 90% quantile of chi-squared with 3 degrees of freedom; below it 0 is in the interval
 
 
 @dataclass(frozen=True, eq=False)
 class ForceMixture:
-    """What a method holds likely of a force, as a mixture of M Gaussians."""
+    """A method's probability distribution of a force, a mixture of M Gaussians."""
 
-    weight: NDArray[np.float64]  # (M,) that add up to 1
+    weight: NDArray[np.float64]  # (M,) with sum 1
     force: NDArray[np.float64]  # (M, 3), mN or, over E, mN/kPa
     covariance: NDArray[np.float64]  # (M, 3, 3)
-    common: float = 0.0  # relative deviation by which all may be off alike, which is not in `covariance`
+    common: float = 0.0  # relative standard deviation common to all components, not in `covariance`
 
     @property
     def mean(self) -> NDArray[np.float64]:
@@ -29,16 +29,16 @@ class ForceMixture:
         return np.asarray(self.weight @ self.force, np.float64)
 
     def times(self, factor: float) -> ForceMixture:
-        """The same of forces so many times as large."""
+        """The distribution of forces `factor` times as large."""
         return replace(self, force=factor * self.force, covariance=factor**2 * self.covariance)
 
     def with_gain(self, gain: float) -> ForceMixture:
-        """The same where every force may be off by a factor of that relative deviation too."""
+        """The distribution with a further relative standard deviation `gain` of every force."""
         along = np.einsum("ma,mb->mab", self.force, self.force)
         return replace(self, covariance=self.covariance + gain**2 * along)
 
     def observe(self, force: NDArray[np.float64], covariance: NDArray[np.float64]) -> ForceMixture:
-        """What is likely once another says `force` (3,), which errs by `covariance` (3, 3) independently.
+        """The posterior after an independent estimate `force` (3,) with error `covariance` (3, 3).
 
         A product of Gaussians (Bishop, Pattern Recognition and Machine Learning, 2006, section 2.3).
         """
@@ -54,7 +54,7 @@ class ForceMixture:
 
 
 def mix(parts: Sequence[ForceMixture], weight: NDArray[np.float64]) -> ForceMixture:
-    """All of them, each as likely as its `weight`, which add up to 1."""
+    """The mixture of distributions with weights of sum 1."""
     return ForceMixture(
         np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
         np.concatenate([one.force for one in parts]),
@@ -62,15 +62,15 @@ def mix(parts: Sequence[ForceMixture], weight: NDArray[np.float64]) -> ForceMixt
     )
 
 
-def size_interval(found: ForceMixture, gain: float, eyes: int = 2) -> tuple[float, float]:
-    """90% interval of the force's size, in its unit, by draws that are the same every time.
+def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[float, float]:
+    """90% interval of the force's magnitude, in its unit, by reproducible draws.
 
-    `gain`: relative deviation that multiplies all, beside `found.common`. From 0 on where 0 itself is within
-    90%; of one eye then up to the 98th percentile, for a press along the view, hardly seen, is a small part
-    of what is likely.
+    `gain`: relative standard deviation of all forces, in addition to `found.common`. The interval starts at 0
+    if 0 is in the 90% region; with one camera it then ends at the 98th percentile, because pressing along the
+    optical axis, which hardly shows in the picture, is a small part of the distribution.
     """
     gain = float(np.hypot(gain, found.common))
-    size = float(np.linalg.norm(found.mean))  # the length of a mean may be less than most lengths
+    size = float(np.linalg.norm(found.mean))  # may be less than most drawn magnitudes
     weight = found.weight / found.weight.sum()
     drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS)
     root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(3))
@@ -79,7 +79,7 @@ def size_interval(found: ForceMixture, gain: float, eyes: int = 2) -> tuple[floa
     sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * factor)
     spread = np.cov(forces.T) + 1e-12 * np.eye(3)
     if found.mean @ np.linalg.solve(spread, found.mean) < _SURELY:
-        return 0.0, max(float(np.quantile(sizes, 0.9 if eyes == 2 else 0.98)), size)
+        return 0.0, max(float(np.quantile(sizes, 0.9 if cameras == 2 else 0.98)), size)
     low, high = np.quantile(sizes, (0.05, 0.95))
     return min(float(low), size), max(float(high), size)
 

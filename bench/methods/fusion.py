@@ -1,7 +1,7 @@
-"""Network and physics as one estimate, each weighed by its stated error.
+"""Fusion of network and physics, each weighted by its stated error.
 
-The estimate of physics is a mixture over contacts and tissues. The network's is one more observation of the
-same force: it draws each component towards itself, and those that it contradicts lose weight.
+The estimate of physics is a mixture over contacts and tissues. The network's estimate is a further
+observation of the same force: it shifts each component, and components that contradict it lose weight.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from bench.methods.force_mixture import size_interval
 from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
 from synth.errors import UserError
 
-# Both are chosen on even sequences of mission-ood; odd ones: docs/results/scoring/fusion.
-_COMMON = 0.3  # relative deviation of what both err by alike
-_CAUTION = 1.5  # factor of the network's stated deviation: recordings are less like its training
+# Both are chosen on even sequences of mission-ood; for the odd ones see docs/results/scoring/fusion.
+_COMMON = 0.3  # relative standard deviation of the two methods' common error
+_CAUTION = 1.5  # factor of the network's stated deviation: recordings differ from its training data
 
 
 class Fusion:
-    """Two methods of the table that state their errors, as one; see the module."""
+    """The fusion of two methods that state their errors; see the module."""
 
     def __init__(self, network: str, physics: str) -> None:
-        """Names of the two."""
+        """Names of the two methods."""
         self.parts = network, physics
         self._share, self._alone = 0.0, 0
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """Raises UserError: it has no estimate of its own."""
+        """Raises UserError: a fusion needs the estimates of its parts."""
         raise UserError(f"a fusion of {' and '.join(self.parts)} needs their estimates: score it with them")
 
     def fuse(
-        self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
+        self, estimates: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, cameras: int
     ) -> list[ForceEstimate]:
-        """See `FusedEstimate`; where one states no error the network's estimate stands alone."""
+        """See `FusedEstimate`; the network's estimate alone where one of the two states no error."""
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
-        for frame in answers:
+        for frame in estimates:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
                 found.append(replace(network, likely=None))
@@ -46,7 +46,7 @@ class Fusion:
                 continue
             spread = _CAUTION**2 * network.likely.covariance[0]
             both = physics.likely.observe(network.likely.mean, spread)
-            found.append(ForceEstimate(both.mean, None, *size_interval(both, gain, eyes)))
+            found.append(ForceEstimate(both.mean, None, *size_interval(both, gain, cameras)))
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
         self._share = pulled / apart if apart else 0.0
@@ -54,8 +54,8 @@ class Fusion:
 
     @property
     def notes(self) -> list[str]:
-        """What each weighed over the film."""
+        """The weights of the two methods over the video."""
         network, physics = self.parts
         if self._alone:
-            return [f"{self._alone} frames are of {network} alone: one of the two states no error"]
-        return [f"where they differ {network} weighs {self._share:.0%} and {physics} {1 - self._share:.0%}"]
+            return [f"{self._alone} frames use {network} alone: one of the two methods states no error"]
+        return [f"weights where they differ: {network} {self._share:.0%}, {physics} {1 - self._share:.0%}"]

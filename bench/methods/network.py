@@ -1,4 +1,4 @@
-"""Trained models behind the bench's protocol of methods."""
+"""Trained models as methods."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 
 class Model:
-    """A model of `learn train`. Without a known E it answers for tissue of 1 kPa."""
+    """A model of `learn train`. Without a known E its forces are those of tissue of 1 kPa."""
 
     def __init__(self, model: Path | Predictor) -> None:
-        """`model`: the model itself, or its folder, made into a quick graph. UserError if unreadable."""
+        """`model`: the model itself, or its folder, loaded as an optimised graph. UserError if unreadable."""
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._estimator: tuple[MethodContext, ForceEstimator] | None = None
 
     @property
     def identity(self) -> str:
-        """Equal of networks that answer alike: the hash of the weights, and the gain they are used with."""
+        """Hash of the weights and gain of the force: equal for networks with equal estimates."""
         card = self.predictor.card
         return f"{card.weights_hash} x {card.force_gain:g}"
 
     @property
     def origin(self) -> str:
-        """Where it is from, for a person."""
+        """Where the model comes from, in words."""
         card = self.predictor.card
         name = find_name(card)
-        return f"{name}, comes along" if name else f"trained on {len(card.split.get('fit', []))} sequences"
+        return f"{name}, pretrained" if name else f"trained on {len(card.split.get('fit', []))} sequences"
 
     def described(self) -> dict[str, object]:
-        """What the model is, for the report."""
+        """The model's properties, for the report."""
         settings = self.predictor.card.settings
         return {
             "preset_size": settings.size,
@@ -54,32 +54,32 @@ class Model:
 
     @property
     def notes(self) -> list[str]:
-        """What is to be known of how the last recording was read, once it is."""
+        """Notes on the estimates of the last recording."""
         return [] if self._estimator is None else self._estimator[1].notes + self._estimator[1].interval_notes
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        return self._answer(flow, confidence, None, scene, picture)
+        return self._estimate(flow, confidence, None, scene, picture)
 
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        """See `Uses3D`; a network of one eye reads flow all the same."""
-        return self._answer(flow, confidence, moved, scene, picture)
+        """See `Uses3D`; a monocular network uses the flow only."""
+        return self._estimate(flow, confidence, moved, scene, picture)
 
-    def _answer(
+    def _estimate(
         self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         if self._estimator is None or self._estimator[0] is not scene:
             about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
             self._estimator = scene, ForceEstimator(self.predictor, *about)
         found = self._estimator[1].estimate(FrameMotion(flow, confidence, motion=moved))
-        answer = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
+        estimate = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
         if not found.bands:
-            return answer
+            return estimate
         band = found.bands[LEVEL]
         likely = None
         if np.isfinite(found.force_mn).all():
             deviation = (band.axes_high[0] - band.axes_low[0]) / (2 * ndtri(0.5 + LEVEL / 2))
             likely = ForceMixture(np.ones(1), found.force_mn[None], np.diag(deviation**2)[None])
-        return replace(answer, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=likely)
+        return replace(estimate, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=likely)

@@ -1,8 +1,8 @@
-"""Physics as a method of the bench: `posterior` on every frame, the tissue weighed by the whole video.
+"""Physics as a method: `posterior` on every frame, with tissue parameters weighted by the whole video.
 
-Frames are estimated once the video is over: the span without contact gives the tissue's own motion, the
-strongest frames together its edge, membrane and Poisson's ratio. A picture that is wanted before rests on the
-strongest frame until then.
+Frames are estimated at the end of the video: spans without contact give the tissue's own motion, the frames
+with the largest motion its edge, membrane and Poisson's ratio. A force map requested earlier uses the frame
+with the largest motion so far.
 """
 
 from __future__ import annotations
@@ -33,38 +33,38 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TissueConstants:
-    """Tissues and how they are weighed; by hand where no source is given."""
+    """Candidate tissues and constants of their weights; by hand where no source is given."""
 
     membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0)  # stiffness over E
-    stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in a living head 1 to 3% (design.md)
-    thin_mm: float = 5.0  # on another mesh bare tissue looks like a membrane of up to this (design.md)
+    stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
+    thin_mm: float = 5.0  # on another mesh bare tissue is taken for a membrane of up to this (design.md)
     intact: float = 0.33  # prior probability of a membrane
-    poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # likeliest first
-    wide: float = 1.2  # openings' radii that tissue reaches which no skull holds round an opening
+    poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
+    wide: float = 1.2  # radius of the visible tissue, in openings, above which no skull edge is assumed
     temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
-    strongest: int = 8  # frames that weigh tissues, every third
-    stronger: float = 1.3  # displacement over that of the last weighing, for a picture to weigh them anew
-    least: float = 0.05  # weight of a second tissue to be used
-    gain: float = 0.25  # relative deviation of the force by relief, pose and the law at large strain
+    strongest: int = 8  # frames that weight the tissues, every third
+    stronger: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
+    least: float = 0.05  # weight from which a second tissue is used
+    gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
     stiffness: float = 0.5
-    """The same by a membrane's stiffness; of even sequences of mission-ood (evidence.scoring.fusion)."""
+    """The same from a membrane's stiffness; from even sequences of mission-ood (evidence.scoring.fusion)."""
 
 
 TISSUES = TissueConstants()
 
 
 @dataclass(frozen=True)
-class Film:
-    """What is known of a video by now."""
+class TissueWeights:
+    """The most likely tissues of a video, given its frames so far."""
 
     tissues: tuple[TissueKind, ...]
-    weight: Floats  # of each tissue; they add up to 1
+    weight: Floats  # of each tissue, with sum 1
     own_mm: Floats  # (C,) size of the tissue's own motion
-    membrane: float  # how likely there is one that is not thin, of all tissues that were asked about
+    membrane: float  # probability of a membrane that is not thin, over all candidate tissues
 
 
 class Physics:
-    """See the module; `Revising`, and without a picture NaN until then."""
+    """A `Revising` method, see the module; without a force map its estimates are NaN until `revise`."""
 
     def __init__(self) -> None:
         self._scene: MethodContext | None = None
@@ -84,59 +84,60 @@ class Physics:
     def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         """See `Revising`."""
         assert self._scene is not None
-        own = [one for one, free in zip(self._seen, contact_free, strict=True) if free and one.size_mm > 0]
-        components = len(self._seen[0].moved)
-        basis = posterior.load_basis(components, grid_of(self._scene)[0])
-        self._film = weigh_tissues(self._scene, self._seen, posterior.own_motion(basis, own))
+        own = [one for one, free in zip(self._frames, contact_free, strict=True) if free and one.size_mm > 0]
+        components = len(self._frames[0].moved)
+        basis = posterior.load_basis(components, candidate_tissues(self._scene)[0])
+        self._weights = weigh_tissues(self._scene, self._frames, posterior.own_motion(basis, own))
         self._contact_free = int(contact_free.sum())
-        return widen_small_forces([self._answer(one, False) for one in self._seen])
+        return widen_small_forces([self._estimate(one, False) for one in self._frames])
 
     @property
     def notes(self) -> list[str]:
-        """What the video says of the tissue."""
+        """What the video shows about the tissue."""
         if self._scene is None:
             return []
-        own = self._film.own_mm
-        said = f"the tissue moves by itself by {', '.join(f'{one:.2g}' for one in own)} mm along x, y, z"
+        sizes = ", ".join(f"{one:.2g}" for one in self._weights.own_mm)
+        own = f"the tissue's own motion is {sizes} mm along x, y, z"
         if not self._contact_free:
-            said = (
-                "no span without contact is known on the film's clock (sensor.free_s, or pulse.free_s where "
-                "clocks are found by correlation): what the tissue does by itself is taken for loads"
+            own = (
+                "no span without contact is given on the video's clock (sensor.free_s, or pulse.free_s where "
+                "clocks are found by correlation): the tissue's own motion is attributed to loads"
             )
-        return [describe(self._film, self._scene), said]
+        return [describe(self._weights, self._scene), own]
 
     def _add(self, moved: Field, spread: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         if self._scene is not scene:
             self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
-            self._seen: list[Observation] = []
-            self._contact_free, self._weighed = 0, 0.0
-            self._film = Film(grid_of(scene)[:1], np.ones(1), np.zeros(moved.shape[2]), TISSUES.intact)
+            self._frames: list[Observation] = []
+            self._contact_free, self._weighed_mm = 0, 0.0
+            first, still = candidate_tissues(scene)[:1], np.zeros(moved.shape[2])
+            self._weights = TissueWeights(first, np.ones(1), still, TISSUES.intact)
         mean = self._view.resample.mean
         moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
-        seen = observe(moved, spread, self._view.mask)
-        self._seen.append(seen)
+        frame = observe(moved, spread, self._view.mask)
+        self._frames.append(frame)
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
-        if seen.signal_mm > max(TISSUES.stronger * self._weighed, posterior.MODEL.least_mm):
-            self._weighed = seen.signal_mm
-            self._film = weigh_tissues(scene, self._seen[-1:], self._film.own_mm)
-        return self._answer(seen, picture)
+        if frame.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
+            self._weighed_mm = frame.signal_mm
+            self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
+        return self._estimate(frame, picture)
 
-    def _answer(self, seen: Observation, picture: bool) -> ForceEstimate:
+    def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
         young = assumed_young(self._scene.young_kpa)
-        found = infer(self._film, seen)
-        covered = float(self._film.weight @ [one.membrane > 0 for one in self._film.tissues])
+        found = infer(self._weights, frame)
+        covered = float(self._weights.weight @ [one.membrane > 0 for one in self._weights.tissues])
         force = replace(found.force, common=TISSUES.stiffness * covered)
-        gain, eyes = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(seen.moved) - 1
-        low, high = size_interval(force, gain, eyes)
+        gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
+        low, high = size_interval(force, gain, cameras)
         density = np.float32(young) * self._picture(found) if picture else None
         likely = force.times(young).with_gain(TISSUES.gain)
         return ForceEstimate(young * force.mean, density, young * low, young * high, likely)
 
     def _picture(self, found: Posterior) -> Field:
-        """(H, W) kPa a kPa of E, on the rest frame's pixels."""
-        basis = posterior.load_basis(len(self._film.own_mm), self._film.tissues[0])
+        """The force density over E, (H, W), on the rest frame's pixels."""
+        basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         known, resample = basis.known, self._view.resample
         step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
         at = np.rint(known.nodes / step).astype(int)
@@ -152,8 +153,8 @@ class Physics:
         return np.asarray(shown, np.float32)
 
 
-def grid_of(scene: MethodContext) -> tuple[TissueKind, ...]:
-    """The tissues that a recording may be of, with the likeliest Poisson's ratio of those it allows."""
+def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
+    """The tissues that agree with meta.yaml, each with the most likely Poisson's ratio in its range."""
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
     low, high = scene.poisson
     middle = next((nu for nu in TISSUES.poisson if low <= nu <= high), round((low + high) / 2, 3))
@@ -175,16 +176,16 @@ def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
     return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
-def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Floats) -> Film:
-    """Tissues weighed by the strongest frames; Poisson's ratio at the likeliest edge and membrane."""
-    strongest = sorted(seen, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
+def weigh_tissues(scene: MethodContext, frames: Sequence[Observation], own_mm: Floats) -> TissueWeights:
+    """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
+    strongest = sorted(frames, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [one for one in strongest if one.size_mm > 0]
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
         return TISSUES.temper * sum(posterior.infer(basis, one, own_mm).evidence for one in strongest)
 
-    tissues = list(grid_of(scene))
+    tissues = list(candidate_tissues(scene))
     score = [
         evidence(one) + np.log(prior)
         for one, prior in zip(tissues, _prior(tissues, scene.membrane), strict=True)
@@ -192,27 +193,28 @@ def weigh_tissues(scene: MethodContext, seen: Sequence[Observation], own_mm: Flo
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
-    told = evidence(tissues[best]) if others else 0.0
-    score[best] -= np.log(1 + len(others))  # they share what it was thought beforehand
+    first = evidence(tissues[best]) if others else 0.0
+    score[best] -= np.log(1 + len(others))  # the ratios share its prior probability
     for nu in others:
         tissues.append(replace(tissues[best], poisson=nu))
-        score.append(score[best] + evidence(tissues[-1]) - told)
+        score.append(score[best] + evidence(tissues[-1]) - first)
     weight = softmax(score)
-    kept = np.argsort(-weight)[: max(1, min(2, int((weight > TISSUES.least).sum())))]
+    used = np.argsort(-weight)[: max(1, min(2, int((weight > TISSUES.least).sum())))]
     covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])
-    return Film(tuple(tissues[k] for k in kept), weight[kept] / weight[kept].sum(), own_mm, covered)
+    return TissueWeights(tuple(tissues[k] for k in used), weight[used] / weight[used].sum(), own_mm, covered)
 
 
-def infer(film: Film, seen: Observation) -> Posterior:
-    """A frame's loads, the tissues mixed by their weights."""
+def infer(weights: TissueWeights, frame: Observation) -> Posterior:
+    """The posterior of a frame's loads, as a mixture over tissues."""
+    components, weight = len(weights.own_mm), weights.weight
     found = [
-        posterior.infer(posterior.load_basis(len(film.own_mm), one), seen, film.own_mm)
-        for one in film.tissues
+        posterior.infer(posterior.load_basis(components, one), frame, weights.own_mm)
+        for one in weights.tissues
     ]
     return Posterior(
-        float(film.weight @ [one.evidence for one in found]),
-        mix([one.force for one in found], film.weight),
-        sum((share * one.load for share, one in zip(film.weight, found, strict=True)), np.zeros(())),
+        float(weight @ [one.evidence for one in found]),
+        mix([one.force for one in found], weight),
+        sum((share * one.load for share, one in zip(weight, found, strict=True)), np.zeros(())),
     )
 
 
@@ -223,7 +225,10 @@ def _places() -> Floats:
 
 
 def observe(moved: Field, spread: Field, mask: Field) -> Observation:
-    """At the compliance's points, displacement and its deviation (C, N, N) mm on `GRID`; mask (N, N)."""
+    """Samples displacement and its deviation, (C, N, N) mm on `GRID`, at the compliance's points.
+
+    `mask`: (N, N) of the tissue; outside it the deviation is infinite.
+    """
     at = _places()
     inside = map_coordinates(mask, at, order=1, mode="constant") > 0.5
     values = [
@@ -233,20 +238,21 @@ def observe(moved: Field, spread: Field, mask: Field) -> Observation:
     return Observation(np.where(inside, values[0], 0.0), np.where(inside, values[1], np.inf))
 
 
-def describe(film: Film, scene: MethodContext) -> str:
-    """What the film says of the tissue, for a person."""
-    edge, nu = film.tissues[0].edge, film.tissues[0].poisson
-    said = f"its edge {edge}, Poisson's ratio {nu:g}"
+def describe(weights: TissueWeights, scene: MethodContext) -> str:
+    """The most likely tissue, in words."""
+    edge, nu = weights.tissues[0].edge, weights.tissues[0].poisson
+    rest = f"tissue edge {edge}, Poisson's ratio {nu:g}"
     if scene.membrane != "unknown":
-        return f"a membrane is stated: {scene.membrane}; {said}"
+        return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
     young = assumed_young(scene.young_kpa) if scene.young_kpa else 1.0
-    bare, covered = max(1 - film.membrane, 1e-3), max(film.membrane, 1e-3)
+    bare, covered = max(1 - weights.membrane, 1e-3), max(weights.membrane, 1e-3)
     if covered <= bare:
         least = f"no evidence for a membrane above {TISSUES.thin_mm * young:.2g} {unit}"
-        return f"{least}, odds {bare / covered:.3g} : 1 against; {said}"
-    stiff = np.array([one.membrane for one in film.tissues])
+        return f"{least}, odds {bare / covered:.3g} : 1 against; {rest}"
+    stiff = np.array([one.membrane for one in weights.tissues])
     thick, about = stiff > TISSUES.thin_mm, ""
     if thick.any():
-        about = f" of about {float(np.average(stiff[thick], weights=film.weight[thick])) * young:.2g} {unit}"
-    return f"evidence for a membrane{about}, odds {covered / bare:.3g} : 1; {said}"
+        mean_mm = float(np.average(stiff[thick], weights=weights.weight[thick]))
+        about = f" of about {mean_mm * young:.2g} {unit}"
+    return f"evidence for a membrane{about}, odds {covered / bare:.3g} : 1; {rest}"

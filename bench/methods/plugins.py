@@ -1,4 +1,4 @@
-"""Methods of other packages, found by their entry points and scored beside ours."""
+"""Methods of other packages, found by their entry points and scored next to ours."""
 
 from __future__ import annotations
 
@@ -15,78 +15,77 @@ from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
 METHODS = Registry("sulcus.method", "method", "method", {})
-"""Methods of other packages: an entry point is a callable without arguments that gives a `Method`."""
+"""Entry points of methods: callables without arguments that return a `Method`."""
 
-_MOST_MN = 1e12  # more is an error and no force
+_MOST_MN = 1e12  # larger forces are errors
 
 
 class Plugged:
-    """A method of somebody else's; what goes wrong in it is one line that names it."""
+    """A method of another package or script; its errors become one line that names it."""
 
     def __init__(self, method: Any, label: str) -> None:
         self._method, self._label = method, label
+        # Set only where the method has them, for the protocols `Uses3D` and `Revising`.
         if isinstance(method, Uses3D):
-            self.in_space = partial(self._asked, method.in_space)
-            """See `Uses3D`."""
+            self.in_space = partial(self._call, method.in_space)
         if isinstance(method, Revising):
-            self.revise = self._revised
-            """See `Revising`."""
+            self.revise = self._revise
 
     @property
     def notes(self) -> list[str]:
-        """What it says is to be known of how it read the recording."""
+        """The method's notes on the recording."""
         with as_user_error(self._label):
             return [str(note) for note in getattr(self._method, "notes", ())]
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        return self._asked(self._method, flow, confidence, scene, picture)
+        return self._call(self._method, flow, confidence, scene, picture)
 
-    def _revised(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def _revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         with as_user_error(self._label):
-            answers = list(self._method.revise(contact_free.copy()))
-            if len(answers) != len(contact_free):
-                raise TypeError(f"revises {len(answers)} frames of {len(contact_free)}")
-        return [self._checked(one, None) for one in answers]
+            estimates = list(self._method.revise(contact_free.copy()))
+            if len(estimates) != len(contact_free):
+                raise TypeError(f"revises {len(estimates)} frames of {len(contact_free)}")
+        return [self._checked(one, None) for one in estimates]
 
-    def _asked(self, ask: Any, *told: Any) -> ForceEstimate:
+    def _call(self, method: Any, *values: Any) -> ForceEstimate:
         with as_user_error(self._label):
-            answer = ask(*copy.deepcopy(told[:-2]), *told[-2:])  # the next method sees what it saw
-        return self._checked(answer, told[0].shape[:2])
+            # A copy, so that a method that writes to its input does not change that of the next.
+            estimate = method(*copy.deepcopy(values[:-2]), *values[-2:])
+        return self._checked(estimate, values[0].shape[:2])
 
-    def _checked(self, answer: Any, size: tuple[int, ...] | None) -> ForceEstimate:
-        """`size`: of the pictures that it may give a density on; None: of none."""
+    def _checked(self, estimate: Any, size: tuple[int, ...] | None) -> ForceEstimate:
+        """`size`: height and width that a density must have; None: a density is dropped."""
         density = None
         with as_user_error(self._label):
-            if not isinstance(answer, ForceEstimate):
-                raise TypeError(f"answers {type(answer).__name__}, expected ForceEstimate")
-            force = np.asarray(answer.force_mn, np.float64)
+            if not isinstance(estimate, ForceEstimate):
+                raise TypeError(f"returned {type(estimate).__name__}, expected ForceEstimate")
+            force = np.asarray(estimate.force_mn, np.float64)
         if force.shape != (3,):
-            raise UserError(f"{self._label}: gives force of shape {force.shape}, expected (3,)")
-        if (np.abs(force) > _MOST_MN).any() or answer.low_mn > answer.high_mn:
-            size_mn = f"force {force.tolist()} mN in [{answer.low_mn:g}, {answer.high_mn:g}]"
-            raise UserError(f"{self._label}: gives {size_mn}, which can't be")
-        if answer.density is not None and size is not None:
-            density = check_answer(self._label, "density", answer.density, size)
-        return replace(answer, force_mn=force, density=density)
+            raise UserError(f"{self._label}: returned force of shape {force.shape}, expected (3,)")
+        if (np.abs(force) > _MOST_MN).any() or estimate.low_mn > estimate.high_mn:
+            interval = f"[{estimate.low_mn:g}, {estimate.high_mn:g}]"
+            raise UserError(f"{self._label}: returned the impossible force {force.tolist()} mN in {interval}")
+        if estimate.density is not None and size is not None:
+            density = check_answer(self._label, "density", estimate.density, size)
+        return replace(estimate, force_mn=force, density=density)
 
 
 def installed() -> dict[str, Method]:
-    """The methods that installed packages offer, made anew, by name.
+    """New methods of installed packages, by name.
 
     Raises:
-        UserError: one does not load, or is no callable.
+        UserError: one can't be loaded or called.
     """
-    return {name: _load(name) for name in METHODS.names()}
+    methods: dict[str, Method] = {}
+    for name in METHODS.names():
+        method, label = METHODS.load(name), METHODS.label(name)
+        if not callable(method):
+            raise UserError(f"{label}: not a method, it can't be called")
+        methods[name] = Plugged(method, label)
+    return methods
 
 
 def sources() -> dict[str, str]:
-    """Package and version that each plug-in's method comes from."""
+    """Package and version of each plug-in's method."""
     return {name: METHODS.source(name) for name in METHODS.names()}
-
-
-def _load(name: str) -> Method:
-    method = METHODS.load(name)
-    if not callable(method):
-        raise UserError(f"{METHODS.label(name)}: is no method, it cannot be called")
-    return Plugged(method, METHODS.label(name))

@@ -2,14 +2,14 @@
 
     d = C f / E + N a + e
 
-d: displacement at P points, C the compliance. Loads f are smooth ones spread over the opening, and a contact
-of unknown place and width on top; both sizes are by marginal likelihood, each frame. N a is the tissue's own
-motion, six polynomials of second degree a component with given sizes, marginalised. e has flow's stated
-deviations, multiplied as its errors are correlated, and a share of the displacement itself: what the
-compliance, of another shape than the tissue, cannot explain.
+d: displacement at P points, C: the compliance. Loads f are smooth loads spread over the opening, plus one
+contact of unknown position and width; the sizes of both follow from the marginal likelihood of each frame.
+N a is the tissue's own motion, six polynomials of second degree per component with given sizes, marginalised.
+e has the flow's stated deviations, enlarged because its errors are correlated, and a share of the
+displacement, which the compliance cannot explain because it is computed for another shape than the tissue's.
 
-All is Gaussian but place, width and the sizes, which are summed over a grid (Bishop, Pattern Recognition and
-Machine Learning, 2006, ch. 3; rank-3 updates of the evidence by the matrix determinant lemma).
+Everything is Gaussian except position, width and sizes, which are summed over a grid (Bishop, Pattern
+Recognition and Machine Learning, 2006, ch. 3; rank-3 updates of evidence by the matrix determinant lemma).
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ Axes = tuple[float, float, float]
 class ModelConstants:
     """Constants of the model, by hand where no source is given; errors: docs/results/scoring/fusion."""
 
-    rank: int = 100  # directions of displacement that are kept of the compliance
+    rank: int = 100  # directions of displacement retained of the compliance
     smooth_mm: float = 2.0  # correlation length of the smooth loads
-    smooth: tuple[float, ...] = (0.03, 0.15, 0.75)  # deviations of their total, a component [mN/kPa]
+    smooth: tuple[float, ...] = (0.03, 0.15, 0.75)  # deviations of their total, per component [mN/kPa]
     radii_mm: tuple[float, ...] = (2.4, 3.4, 4.8)  # of contacts, whose load falls as (1 - r^2 / R^2)^2
-    reach_mm: float = 9.5  # of contacts from the middle of the opening, whose radius is 12
+    reach_mm: float = 9.5  # largest distance of a contact from the centre of the opening, whose radius is 12
     contacts: tuple[Axes, ...] = ((1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
     """Deviations of a contact's force along x, y, z [mN/kPa]: F / (E a^2) of 0.03 to 0.3."""
     presses: tuple[Axes, ...] = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
@@ -46,9 +46,9 @@ class ModelConstants:
     their interval, with them 10 (docs/design.md)."""
     correlated: float = 3.0  # factor of flow's variances: errors at neighbouring points are correlated
     misfit: float = 0.1  # share of the local displacement that the compliance cannot explain
-    around_mm: float = 1.5  # what is local: of each point alone 80, not 90, of 100 draws are held (design.md)
-    unmet: float = 2.0  # factor of the tissue's own motion: few frames don't show a whole rhythm (science.md)
-    least_mm: float = 0.005  # of flow's deviation, whatever is stated
+    around_mm: float = 1.5  # range of "local": with each point alone coverage is 80%, not 90% (design.md)
+    unmet: float = 2.0  # factor of the tissue's own motion: few frames miss parts of a rhythm (science.md)
+    least_mm: float = 0.005  # lower limit of flow's deviation
     draws: int = 128  # of hypotheses in a posterior
 
 
@@ -60,13 +60,13 @@ class LoadBasis:
     """A compliance in the few directions of displacement that smooth loads can cause, E = 1 kPa."""
 
     motion: Floats  # (C P, R + 6 C) mm: orthonormal directions, then the polynomials
-    size: Floats  # (R,) deviation along each for loads of unit size
-    force: Floats  # (3, R) total force of a coefficient [mN/mm]
-    unseen: Floats  # (3,) variance of the total force in the directions left out, loads of unit size
+    size: Floats  # (R,) standard deviation along each direction under loads of unit size
+    force: Floats  # (3, R) total force per coefficient [mN/mm]
+    omitted: Floats  # (3,) variance of the total force in the omitted directions, loads of unit size
     contacts: NDArray[np.float32]  # (R, H, 3) coefficients of contacts of 1 mN along each axis
-    loads: Floats  # (3 K, R) mN at the nodes of a coefficient
-    shares: Floats  # (K, H) what each node carries of a contact
-    around: Floats  # (P, P) means over neighbouring points
+    loads: Floats  # (3 K, R) mN at the nodes per coefficient
+    shares: Floats  # (K, H) share of each contact carried by each node
+    around: Floats  # (P, P) weights of means over neighbouring points
     known: compliance.Compliance
 
 
@@ -75,20 +75,20 @@ class Observation:
     """One frame's displacement at the compliance's points."""
 
     moved: Floats  # (C, P) mm
-    deviation: Floats  # (C, P) mm, stated; infinite where nothing is seen
+    deviation: Floats  # (C, P) mm, stated; infinite where no tissue is visible
 
     @property
     def size_mm(self) -> float:
-        """Root mean square of what is seen."""
-        seen = np.isfinite(self.deviation)
-        return float(np.sqrt(np.mean(self.moved[seen] ** 2))) if seen.any() else 0.0
+        """Root mean square displacement where tissue is visible."""
+        visible = np.isfinite(self.deviation)
+        return float(np.sqrt(np.mean(self.moved[visible] ** 2))) if visible.any() else 0.0
 
     @property
     def signal_mm(self) -> float:
-        """The same without what the stated deviation alone would make."""
-        seen = np.isfinite(self.deviation)
-        excess = self.moved[seen] ** 2 - self.deviation[seen] ** 2
-        return float(np.sqrt(np.maximum(excess, 0).mean())) if seen.any() else 0.0
+        """Root mean square displacement in excess of the stated deviation."""
+        visible = np.isfinite(self.deviation)
+        excess = self.moved[visible] ** 2 - self.deviation[visible] ** 2
+        return float(np.sqrt(np.maximum(excess, 0).mean())) if visible.any() else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +113,8 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     smooth = np.tensordot(by_node, root, (1, 0)).transpose(0, 2, 1).reshape(len(by_node), -1)
     values, vectors = eigh(smooth.T @ smooth)
     rank, vectors = MODEL.rank, vectors[:, ::-1]
-    seen = np.sqrt(values[: -rank - 1 : -1])
-    motion = smooth @ (vectors[:, :rank] / seen)
+    size = np.sqrt(values[: -rank - 1 : -1])
+    motion = smooth @ (vectors[:, :rank] / size)
     loads = np.tensordot(root, vectors.reshape(count, 3, -1), (1, 0)).reshape(3 * count, -1)
     total = loads.reshape(count, 3, -1).sum(axis=0)
     shares = []
@@ -123,18 +123,18 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
         share = np.clip(1 - apart / radius**2, 0, None) ** 2 * known.node_area[:, None]
         shares.append((share / share.sum(axis=0))[:, within])
     shares_of = np.concatenate(shares, axis=1)
-    seen_by = (motion.T @ known.matrix).reshape(rank, count, 3)
-    contacts = np.einsum("rka,kh->rha", seen_by, shares_of, optimize=True)
+    by_load = (motion.T @ known.matrix).reshape(rank, count, 3)
+    contacts = np.einsum("rka,kh->rha", by_load, shares_of, optimize=True)
     near = np.square(known.points[:, None] - known.points[None]).sum(axis=-1)
     near = np.exp(-near / (2 * MODEL.around_mm**2))
     own = np.kron(np.eye(components), polynomials(known.points))
     return LoadBasis(
         np.hstack([motion, own]),
-        seen,
-        total[:, :rank] / seen,
+        size,
+        total[:, :rank] / size,
         np.square(total[:, rank:]).sum(axis=1),
         contacts.astype(np.float32),
-        loads[:, :rank] / seen,
+        loads[:, :rank] / size,
         shares_of,
         near / near.sum(axis=1, keepdims=True),
         known,
@@ -142,44 +142,44 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
 
 
 def polynomials(points: Floats) -> Floats:
-    """(P, 6) of second degree at points (P, 2) mm, of size 1 at the opening's edge."""
+    """Polynomials of second degree at points (P, 2) mm, (P, 6), of size 1 at the opening's edge."""
     x, y = points.T / OPENING_MM
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
-    """(C,) mm, sizes of the tissue's own motion: of the polynomials' coefficients in frames without contact.
+    """Size of the tissue's own motion, (C,) mm, from the polynomials' coefficients in frames without contact.
 
-    What flow's errors alone would make of them is subtracted (a moment estimate); of no frames they are 0.
+    The contribution of flow's errors is subtracted (a moment estimate); without frames it is 0.
     """
     components = len(basis.motion) // len(basis.known.points)
     found = np.zeros(components)
     terms = polynomials(basis.known.points)
     for axis in range(components if contact_free else 0):
         excess = []
-        for seen in contact_free:
-            weight = 1 / (MODEL.correlated * (seen.deviation[axis] ** 2 + MODEL.least_mm**2))
+        for frame in contact_free:
+            weight = 1 / (MODEL.correlated * (frame.deviation[axis] ** 2 + MODEL.least_mm**2))
             gram = terms.T @ (terms * weight[:, None])
             if np.linalg.cond(gram) < 1e8:
                 inverse = np.linalg.inv(gram)
-                fitted = inverse @ (terms.T @ (weight * seen.moved[axis]))
+                fitted = inverse @ (terms.T @ (weight * frame.moved[axis]))
                 excess.append(fitted**2 - np.diag(inverse))
         found[axis] = MODEL.unmet * np.sqrt(max(float(np.mean(excess)), 0.0)) if excess else 0.0
     return found
 
 
-def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
-    """The loads of a frame.
+def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
+    """The posterior of a frame's loads.
 
     Args:
         basis: of the tissue.
-        seen: the frame's displacement.
-        own_mm: (C,) size of the tissue's own motion, a component.
+        frame: the frame's displacement.
+        own_mm: (C,) size of the tissue's own motion.
     """
     rank, count = len(basis.size), basis.contacts.shape[1]
-    sizes = np.array(MODEL.contacts + (MODEL.presses if len(seen.moved) == 2 else ()))
-    levels, score = _weigh(basis, seen, own_mm, sizes)
-    # Systematic draws: as many of each hypothesis as it is likely, none left out for being one of many.
+    sizes = np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))
+    levels, score = _weigh(basis, frame, own_mm, sizes)
+    # Systematic draws: each hypothesis is drawn in proportion to its probability, however many there are.
     likely = np.cumsum(np.exp(score - logsumexp(score)))
     drawn = np.searchsorted(likely, (np.arange(MODEL.draws) + 0.5) / MODEL.draws * likely[-1])
     best, times = np.unique(drawn, return_counts=True)
@@ -195,29 +195,31 @@ def infer(basis: LoadBasis, seen: Observation, own_mm: Floats) -> Posterior:
             h = int(inside % count)
             variance = np.linalg.inv(level.square[h] + np.diag(1 / sizes[inside // count] ** 2))
             contact = variance @ level.pull[h]
-            # What a contact adds to the total, less what the smooth loads then leave to it.
-            moves = level.taken @ basis.contacts[:, h]
-            gives = np.eye(3) - basis.force @ moves
-            force[k] += gives @ contact
-            covariance[k] += gives @ variance @ gives.T
-            mean = mean - moves @ contact
+            # A contact adds its own force and reduces that of the smooth loads.
+            replaced = level.taken @ basis.contacts[:, h]
+            adds = np.eye(3) - basis.force @ replaced
+            force[k] += adds @ contact
+            covariance[k] += adds @ variance @ adds.T
+            mean = mean - replaced @ contact
             carried += part * basis.shares[:, h, None] * contact
         coefficients += part * mean
     load = (basis.loads @ coefficients).reshape(-1, 3) + carried
     return Posterior(float(logsumexp(score)), ForceMixture(share, force, covariance), load)
 
 
-def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -> tuple[list[_Level], Floats]:
-    """Every hypothesis: smooth loads of each size, and log evidence with each contact and without.
+def _weigh(
+    basis: LoadBasis, frame: Observation, own_mm: Floats, sizes: Floats
+) -> tuple[list[_Level], Floats]:
+    """The smooth loads of each size, and the log evidence of every hypothesis, (L (S H + 1),).
 
-    Evidence goes size of the smooth loads by size; within one by `sizes` (S, 3) of a contact and its place,
-    and last without any: (L (S H + 1),).
+    Evidence is ordered by size of the smooth loads; within one by size of the contact (`sizes`, (S, 3)) and
+    its position, and last the hypothesis without a contact.
     """
     rank = len(basis.size)
-    moved = seen.moved.ravel()
-    # Of neighbours: a point's own square would weigh down the points that err upwards.
-    local = basis.around @ np.square(seen.moved).mean(axis=0)
-    noise = MODEL.correlated * (seen.deviation**2 + MODEL.least_mm**2 + MODEL.misfit**2 * local)
+    moved = frame.moved.ravel()
+    # Over neighbours: a point's own square would reduce the weight of points that err upwards.
+    local = basis.around @ np.square(frame.moved).mean(axis=0)
+    noise = MODEL.correlated * (frame.deviation**2 + MODEL.least_mm**2 + MODEL.misfit**2 * local)
     weight = 1 / noise.ravel()
     own = np.repeat(np.square(own_mm), 6)
     columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
@@ -237,15 +239,15 @@ def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -
         alone = -0.5 * (rest - right @ mean + log_det)
         taken = cho_solve(factor, gram[:, :rank])
         left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
-        beside = (left @ flat).reshape(rank, -1, 3)
+        explained = (left @ flat).reshape(rank, -1, 3)
         # Entries (a, b) of each contact's 3 x 3 matrix, summed over directions.
         square = np.empty((count, 3, 3))
         for a in range(3):
-            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], beside)
+            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], explained)
         pull = (right[:rank] - gram[:, :rank].T @ mean) @ flat.astype(np.float64)
         padded = np.zeros((len(prior), 3))
         padded[:rank] = basis.force.T
-        covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.unseen) * spread**2
+        covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.omitted) * spread**2
         total = basis.force @ mean[:rank], covariance
         level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
         levels.append(level)
@@ -260,11 +262,11 @@ def _weigh(basis: LoadBasis, seen: Observation, own_mm: Floats, sizes: Floats) -
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Smooth loads of one size, and what contacts find beside them."""
+    """Smooth loads of one size, and the information on contacts that remains."""
 
     mean: Floats  # (R,) of the smooth loads' coefficients
-    square: Floats  # (H, 3, 3) precision of each contact's force by what the smooth loads can't explain
-    pull: Floats  # (H, 3) that, times the force
-    taken: Floats  # (R, R) what smooth loads take up of a displacement
+    square: Floats  # (H, 3, 3) precision of each contact's force, from what smooth loads can't explain
+    pull: Floats  # (H, 3) that precision times the force
+    taken: Floats  # (R, R) share of a displacement that smooth loads explain
     force: Floats  # (3,) total of the smooth loads
-    covariance: Floats  # (3, 3) of that
+    covariance: Floats  # (3, 3) of that total

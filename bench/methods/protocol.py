@@ -1,4 +1,4 @@
-"""What a method is: displacement to force, frame by frame."""
+"""The protocol of methods (force estimators): displacement to force, frame by frame."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Field = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MethodContext:
-    """What stays the same over a recording, on the pixels flow is computed on."""
+    """A recording's constants, for the pixels that flow is computed on."""
 
     tissue: NDArray[np.bool_]
     """(H, W)."""
     scale_mm_per_px: float
     young_kpa: float | None
+    """None: unknown."""
     membrane: MembraneState = "unknown"
-    """What is known of the tissue's."""
     poisson: tuple[float, float] = (0.4, 0.49)
-    """Between which its Poisson's ratio lies."""
+    """Range of the tissue's Poisson's ratio."""
     young_uncertainty: float = 0.0
     """Relative standard uncertainty of `young_kpa`."""
 
     def __post_init__(self) -> None:
-        """One method can't change what the others are told."""
+        """Makes `tissue` read-only: methods share it."""
         object.__setattr__(self, "tissue", self.tissue.view())
         self.tissue.flags.writeable = False
 
@@ -44,15 +44,15 @@ class ForceEstimate:
     """A method's estimate of one frame."""
 
     force_mn: NDArray[np.float64]
-    """(3,) force on the tissue in camera axes [mN]; a method of magnitudes only puts it into x, rest NaN."""
+    """(3,) force on the tissue in camera axes [mN]; of magnitudes alone in x, with NaN for y and z."""
     density: Field | None = None
-    """(H, W) size of the force density on the rest frame's pixels [kPa], for the pictures."""
+    """(H, W) magnitude of the force density on the rest frame's pixels [kPa], for the force maps."""
     low_mn: float = math.nan
-    """Lower end of the 90% interval of the force's size; NaN of a method that knows none."""
+    """Lower end of the 90% prediction interval of the force's magnitude; NaN: none."""
     high_mn: float = math.nan
     """Upper end."""
     likely: ForceMixture | None = None
-    """What else the force may be, for whoever weighs several methods; the error by E is not in it."""
+    """Probability distribution of the force, for a fusion of methods; without the uncertainty of E."""
 
     @property
     def size_mn(self) -> float:
@@ -60,17 +60,17 @@ class ForceEstimate:
 
 
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
-    """Estimates of a video, intervals of those below a share of the largest force reaching down to 0.
+    """Extends the intervals of a video's small forces, below a share of its largest force, down to 0.
 
-    Tissue creeps: what a press leaves behind moves without a force. The share, a twentieth, is set by hand;
-    docs/results/learn/foreign has what intervals then hold on videos of other simulators and renderers.
+    Tissue creeps: after a press it still moves without a force. The share, a twentieth, is set by hand;
+    docs/results/learn/foreign has the coverage on videos of other simulators and renderers.
     """
     largest = max((one.size_mn for one in estimates), default=0.0)
     return [replace(one, low_mn=0.0) if one.size_mn < share * largest else one for one in estimates]
 
 
 class Method(Protocol):
-    """Displacement to force, frame by frame. Its `notes: list[str]`, if it has any, are read at the end."""
+    """Displacement to force, frame by frame. The report shows its `notes: list[str]`, if it has any."""
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Force of one frame.
@@ -79,14 +79,14 @@ class Method(Protocol):
             flow: (H, W, 2) px from the rest frame.
             confidence: (H, W) in 0..1.
             scene: the recording's constants.
-            picture: whether `density` is wanted.
+            picture: whether `density` is requested.
         """
         ...
 
 
 @runtime_checkable
 class Uses3D(Protocol):
-    """A method that also uses motion in three dimensions, where a recording has a right or a depth camera."""
+    """A method that can use motion in three dimensions, if a recording has a right or a depth camera."""
 
     def in_space(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
@@ -97,27 +97,27 @@ class Uses3D(Protocol):
 
 @runtime_checkable
 class Revising(Protocol):
-    """A method that, once a video is over, estimates all its frames anew."""
+    """A method that estimates all frames again at the end of a video."""
 
     def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
-        """An estimate for each frame since the recording began; no `density` is needed.
+        """An estimate of each frame since the start of the recording, without `density`.
 
-        `contact_free`: (T,) whether nothing touches the tissue, as far as is known.
+        `contact_free`: (T,) whether the tissue is known to be without contact.
         """
         ...
 
 
 @runtime_checkable
 class FusedEstimate(Protocol):
-    """A method whose estimate is made of those of others in the table."""
+    """A method that fuses the estimates of other methods."""
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Their names; the first's `density` is the picture."""
+        """Their names; the first one's `density` is shown."""
         ...
 
     def fuse(
-        self, answers: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, eyes: int
+        self, estimates: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, cameras: int
     ) -> list[ForceEstimate]:
-        """The force of each of a video's frames from the others' estimates; `eyes`: 1 monocular, 2 stereo."""
+        """Forces of a video's frames from the others' estimates; `cameras`: 1 monocular, 2 stereo."""
         ...

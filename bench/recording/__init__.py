@@ -1,1 +1,1 @@
-"""A recording: video, force sensor, description; read, written, checked."""
+"""Recordings: reading, writing and checking folders of video, force sensor and description."""

@@ -1,4 +1,4 @@
-"""What of a recording is usable, missing, or looks wrong: for `bench check` and `bench score`."""
+"""Findings on a recording: what is usable, missing or looks wrong, for `bench check` and `bench score`."""
 
 from __future__ import annotations
 
@@ -22,53 +22,47 @@ from synth.video.read import Picture
 
 _JUMP = 3.0  # median intervals
 _SURGICAL_N = 5.0
-_LOADED = 0.25  # share of the range of force: more is no rest
-_RATE_HZ = 10.0  # frames a second that are looked at unless more are asked for
-_LEAST_PRESS = 5  # frames of a press that settle its gain
-_OFF_ROWS_PX, _OTHER_ROWS_PX = 0.5, 2.0  # of small pictures: the calibration isn't this pair's, or no longer
-_NOISY_MM = 0.16  # depth motion from which on force is no better than with one eye
-# Logarithm of the stated scale over the second eye's: beyond these they contradict each other, and beyond the
-# second, which of them is wrong decides what the force is.
+_LOADED = 0.25  # share of the range of force above which the tissue is not at rest
+_RATE_HZ = 10.0  # default rate of tracked frames
+_LEAST_PRESS = 5  # frames of a press that determine its gain
+_OFF_ROWS_PX, _OTHER_ROWS_PX = 0.5, 2.0  # of reduced frames: an outdated calibration, one of another pair
+_NOISY_MM = 0.16  # depth motion from which force is no better than monocular
+# Logarithm of the stated scale over the stereo scale: from the first they contradict each other, from the
+# second the error of force is too large for any result.
 _OTHER_SCALE, _ANOTHER_SCALE = 0.1, 0.3
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "micrometres": 0.001}
-_LOOKED_AT = 12  # frames that are followed to see whether they can be
+_TRIED = 12  # frames that are tracked to test whether tracking works
 
 
 @dataclass
 class _Checked:
-    """What the checks before have found."""
+    """The findings so far and what later checks need."""
 
     findings: list[Finding] = field(default_factory=list)
     mm_per_px: float | None = None
-    times: list[float] = field(default_factory=list)
-    """Of the usable frames [s]."""
-    timeless: int = 0
-    back: int = 0
-    size: tuple[int, int] = (0, 0)
-    """Height, width [px]."""
+    times: list[float] = field(default_factory=list)  # of the usable frames [s]
+    timeless: int = 0  # frames without a time
+    back: int = 0  # frames whose time runs backwards
+    size: tuple[int, int] = (0, 0)  # height, width [px]
     frames: int = 0
-    last: int = -1
-    """Number of the last frame."""
-    picture: Path | None = None
-    """Where what is tracked is drawn."""
+    last: int = -1  # number of the last frame
+    picture: Path | None = None  # PNG of what is tracked
 
     @property
     def time_s(self) -> NDArray[np.float64]:
         return np.array(self.times)
 
-    def add(self, state: str, what: str, said: str) -> None:
-        self.findings.append(Finding(state, what, said))
+    def add(self, state: str, what: str, message: str) -> None:
+        self.findings.append(Finding(state, what, message))
 
-    def judge(self, fine: bool, what: str, said: str) -> None:
-        """`ok` or `odd`."""
-        self.add("ok" if fine else "odd", what, said)
+    def judge(self, fine: bool, what: str, message: str) -> None:
+        self.add("ok" if fine else "odd", what, message)
 
 
 def check_recording(folder: Path, phantom: bool = False, picture: Path | None = None) -> list[Finding]:
-    """Opens a recording, decodes its pictures and compares what its files say. Raises no UserError.
+    """Opens a recording, decodes its pictures and checks its files against each other. Raises no UserError.
 
-    `phantom`: as of `open_recording`. `picture`: where what is tracked is drawn; of no film that can't be
-    followed.
+    `phantom`: as in `open_recording`. `picture`: PNG of what is tracked, written if tracking works.
     """
     found = _Checked(picture=picture)
     try:
@@ -79,7 +73,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         found.add("odd", "files", note)
     for what, check in (
         ("scale", _check_scale),
-        ("pictures", _check_film),
+        ("pictures", _check_video),
         ("times", _check_times),
         ("sensor", _check_sensor),
         ("press", _check_press),
@@ -95,13 +89,13 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
 def judge(
     recording: Recording, mm_per_px: float, video: VideoFlow, stereo: StereoQuality | None
 ) -> list[Finding]:
-    """What is wrong with a recording whose film was followed: `bench check` and `bench score` say the same.
+    """Findings on a tracked recording, the same in `bench check` and `bench score`.
 
     Args:
         recording: the opened recording.
-        mm_per_px: of its own pixels.
-        video: its film, once it is through.
-        stereo: what its second eye came to, if it has one.
+        mm_per_px: scale of its own pixels.
+        video: its video, tracked to the end.
+        stereo: quality of its right or depth camera, if it has one.
     """
     meta = recording.meta
     found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, video.size[1])]
@@ -110,9 +104,9 @@ def judge(
 
 
 def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
-    """Whether the sensor shows load where there should be none: in `sensor.free_s`, or at the rest frame.
+    """Findings on load where there should be none: in `sensor.free_s`, or at the rest frame.
 
-    Its samples are taken as they stand, for a tare would hide it.
+    Uses raw samples, because a tare would hide the load.
     """
     known = np.isfinite(force.force_mn).all(axis=1)
     t, newtons = force.time_s[known], force.force_mn[known]
@@ -120,96 +114,99 @@ def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
     least, most = float(size.min()), float(size.max())
     found = []
     if most > 1000 * _SURGICAL_N and meta.tissue == "brain":
-        said = f"{most / 1000:.3g} N is much for a brain: is force.csv in newtons?"
-        found.append(Finding("odd", "sensor", said))
+        message = f"{most / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
+        found.append(Finding("odd", "sensor", message))
     offset = {"clock": 0.0, "offset": meta.sync.offset_s}.get(meta.sync.method)
     if rest_s is not None and offset is not None and t[0] <= rest_s - offset <= t[-1]:
         there = float(np.interp(rest_s, t + offset, size))
         if there - least > _LOADED * (most - least):
             best = float(t[size.argmin()] + offset)
-            said = f"the sensor shows {there:.3g} mN at the rest frame; least is {least:.3g} at {best:.3g} s"
-            found.append(Finding("odd", "rest frame", said))
+            lowest = f"the minimum is {least:.3g} mN at {best:.3g} s"
+            message = f"the sensor measures {there:.3g} mN at the rest frame; {lowest}"
+            found.append(Finding("odd", "rest frame", message))
     for start, stop in meta.sensor.free_s:
         inside = newtons[(t >= start) & (t <= stop)]
         if len(inside) > 2:
             low, high = np.percentile(inside, (5, 95), axis=0)
             change = float(np.linalg.norm(high - low))
             if change > _LOADED * np.linalg.norm(np.ptp(newtons, axis=0)):
-                said = f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s"
-                found.append(Finding("odd", "sensor", said))
+                message = f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s"
+                found.append(Finding("odd", "sensor", message))
     return found
 
 
 def judge_stereo(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
-    """Whether a second eye is of this film, at this scale."""
-    found = [Finding("bad", "second eye", f"the second eye {stereo.fault}")] if stereo.fault else []
+    """Findings on the right or depth camera: its pictures, calibration, noise and scale."""
+    found = [Finding("bad", "stereo", f"the right camera {stereo.fault}")] if stereo.fault else []
     if stereo.epipolar_px > _OTHER_ROWS_PX:
-        found.append(Finding("bad", "second eye", f"its rows are {stereo.epipolar_px:.2g} px off"))
+        rows = f"rows of left and right picture are {stereo.epipolar_px:.2g} px off"
+        message = f"{rows}: is the calibration of this camera pair?"
+        found.append(Finding("bad", "stereo", message))
     elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM:
-        found.append(Finding("odd", "second eye", stereo.describe()))
+        found.append(Finding("odd", "stereo", stereo.describe()))
     off = abs(np.log(stereo.mm_per_px / mm_per_px))
     if off > _OTHER_SCALE:
-        said = f"{mm_per_px:.4g} mm/px, but the second eye finds {stereo.mm_per_px:.4g}"
+        message = f"{mm_per_px:.4g} mm/px is stated, but stereo gives {stereo.mm_per_px:.4g}"
         for unit, times in _UNITS_MM.items():
             if abs(np.log(times * stereo.mm_per_px / mm_per_px)) < _ANOTHER_SCALE:
-                said += f": in {unit}? then mm_per_unit is {times:g} times what it is"
-        found.append(Finding("bad" if off > _ANOTHER_SCALE else "odd", "scale", said))
+                message += f": if its calibration is in {unit}, multiply mm_per_unit by {times:g}"
+        found.append(Finding("bad" if off > _ANOTHER_SCALE else "odd", "scale", message))
     return found
 
 
 def is_usable(found: list[Finding]) -> bool:
-    """Whether anything can be predicted from it."""
+    """Whether force can be predicted from the recording."""
     return all(finding.state != "bad" for finding in found)
 
 
 def _check_scale(recording: Recording, found: _Checked) -> None:
-    """Millimetres and kilopascals."""
+    """Scale and stiffness."""
     young = recording.meta.young_kpa
     if young is None:
-        found.add("lack", "stiffness", "young_kpa unknown: only relative force can be had")
+        found.add("lack", "stiffness", "young_kpa unknown: forces are relative")
     elif not judge_young(young):
         found.add("ok", "stiffness", f"E = {young:g} kPa ± {100 * recording.meta.young_uncertainty:.2g}%")
     scale = pixel_scale.find_scale(recording.meta, recording.folder)
     found.mm_per_px = scale.mm_per_px
-    said = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
-    found.add("ok", "scale", said)
+    message = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
+    found.add("ok", "scale", message)
 
 
-def _check_film(recording: Recording, found: _Checked) -> None:
-    """Decodes every picture once, and follows a few as `bench score` would."""
+def _check_video(recording: Recording, found: _Checked) -> None:
+    """Decodes every picture once, and tracks a few as `bench score` does."""
     first = recording.meta.rest_frame
-    numbers = [number for number in recording.numbers() or range(_LOOKED_AT) if number >= first] or [first]
-    only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _LOOKED_AT).astype(int))
+    numbers = [number for number in recording.numbers() or range(_TRIED) if number >= first] or [first]
+    only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _TRIED).astype(int))
     second = RightCamera(recording, found.mm_per_px or 1.0) if recording.has_stereo else None
     pictures = _counted(recording, found)
-    film = replace(recording.film(pictures), only=only)
-    video = VideoFlow(film, RecordingFlowSettings(rate_hz=None, pulse=False), depth=second)
+    footage = replace(recording.as_footage(pictures), only=only)
+    video = VideoFlow(footage, RecordingFlowSettings(rate_hz=None, pulse=False), depth=second)
     try:
-        followed = list(video.frames())
-        if found.picture is not None and followed:
-            write_picture(found.picture, draw_tracking(followed, video.tissue, video.shrink))
+        tracked = list(video.frames())
+        if found.picture is not None and tracked:
+            write_picture(found.picture, draw_tracking(tracked, video.tissue, video.shrink))
     except UserError as error:
-        found.add("bad", "following", str(error))
+        found.add("bad", "tracking", str(error))
     for _ in pictures:
-        pass  # those that nobody followed count too
+        pass  # frames that were not tracked count too
     if not found.frames:
         return
-    found.add("ok", "pictures", f"{found.frames} of {found.size[1]} x {found.size[0]} px")
+    found.add("ok", "pictures", f"{found.frames} frames of {found.size[1]} x {found.size[0]} px")
     if found.last < first:
         found.add("bad", "rest frame", f"rest_frame is {first}, the last frame {found.last}")
     if recording.tissue is None:
-        found.add("lack", "tissue", "no tissue.png: the whole picture is taken for tissue")
+        found.add("lack", "tissue", "no tissue.png: the whole picture is assumed to be tissue")
     found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
     if video.summary.frames:
-        found.judge(not video.summary.is_odd, "following", video.summary.describe())
+        found.judge(not video.summary.is_odd, "tracking", video.summary.describe())
     stereo = None if second is None else second.quality
     if stereo is not None and not judge_stereo(stereo, found.mm_per_px or stereo.mm_per_px):
-        found.add("ok", "second eye", stereo.describe())
+        found.add("ok", "stereo", stereo.describe())
     found.findings += judge(recording, found.mm_per_px or 0.0, video, stereo)
 
 
 def _counted(recording: Recording, found: _Checked) -> Iterator[Picture]:
-    """The pictures, counted on the way; those up to where the film can't be read."""
+    """Yields and counts the pictures, up to the first unreadable one."""
     try:
         for picture in recording.frames():
             found.size, found.frames = (picture.rgb.shape[0], picture.rgb.shape[1]), found.frames + 1
@@ -230,17 +227,17 @@ def _check_times(recording: Recording, found: _Checked) -> None:
     if len(t) < 2:
         found.add("bad", "times", "fewer than two frames have a time")
         return
-    # From the first frame to the last: stamps that come in bursts have a median step of their own.
+    # From first to last frame: the median interval misleads where stamps come in bursts.
     rate = (len(t) - 1) / (t[-1] - t[0])
     jumps = np.diff(t) > _JUMP * np.median(np.diff(t))
-    found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames a second")
+    found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")
     if found.timeless or found.back:
-        said = f"{found.timeless} frames without a time, {found.back} whose time runs back"
-        found.add("odd", "times", said)
+        message = f"{found.timeless} frames without a time, {found.back} whose time runs backwards"
+        found.add("odd", "times", message)
     if jumps.any():
         found.add("odd", "times", f"{jumps.sum()} gaps, the longest {np.diff(t).max():.3g} s")
     if not 0.5 <= rate <= 1000:
-        found.add("odd", "times", f"{rate:.3g} frames a second: are the times in seconds?")
+        found.add("odd", "times", f"{rate:.3g} frames per second: are the times in seconds?")
 
 
 def _check_sensor(recording: Recording, found: _Checked) -> None:
@@ -251,9 +248,9 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
     t = force.time_s
     peak = float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
     rate = (len(t) - 1) / (t[-1] - t[0])
-    found.add("ok", "sensor", f"{len(t)} rows at {rate:.4g} a second, up to {peak:.3g} mN")
+    found.add("ok", "sensor", f"{len(t)} samples at {rate:.4g} Hz, up to {peak:.3g} mN")
     if not meta.sensor.free_s:
-        found.add("lack", "sensor", "no sensor.free_s: no tare, no drift, no noise floor")
+        found.add("lack", "sensor", "no sensor.free_s: no tare, no drift correction, no noise floor")
     for start, stop in meta.sensor.free_s:
         if not ((t >= start) & (t <= stop)).any():
             found.add("bad", "sensor", f"sensor.free_s: no samples between {start:g} and {stop:g} s")
@@ -262,15 +259,15 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
         common = min(times[-1], t[-1] + offset) - max(times[0], t[0] + offset)
         share = max(common, 0) / (times[-1] - times[0])
         other = clocks.find_other_unit(times, t)
-        said = other or f"the sensor covers {100 * share:.0f}% of the video"
-        found.judge(share > 0.9 and not other, "clocks", said)
+        message = other or f"the sensor covers {100 * share:.0f}% of the video"
+        found.judge(share > 0.9 and not other, "clocks", message)
 
 
 def _check_press(recording: Recording, found: _Checked) -> None:
-    """Whether the press is long enough. The searches for clock and axes say it of their own spans."""
+    """Length of the press; the searches for clock and axes check their own spans."""
     span, times = recording.meta.press_s, found.time_s
     if span is not None and len(times) > 1:
         needed_s = _LEAST_PRESS / min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
         inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
-        said = f"press_s holds {inside_s:.3g} s of video, {needed_s:.3g} s are needed"
-        found.judge(inside_s >= needed_s, "press", said)
+        message = f"press_s covers {inside_s:.3g} s of video; at least {needed_s:.3g} s are needed"
+        found.judge(inside_s >= needed_s, "press", message)

@@ -1,4 +1,4 @@
-"""Clocks that count in another unit than seconds, told by the other clock of the same recording."""
+"""Detection of a clock that is not in seconds, by comparison with the recording's other clock."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _SLOW_VIDEO_S = 1.0
 
 
 def find_other_unit(frame_s: NDArray[np.float64], force_s: NDArray[np.float64]) -> str:
-    """Which of two clocks seems not to count seconds, in words; empty if neither or if too little is known.
+    """Describes which of two clocks seems not to be in seconds; empty if neither does or it can't be decided.
 
-    A sensor may run for hours beside a short video. So the longer record must be far longer, and slower than
-    such a device is: a fast sensor that counts milliseconds looks like one that is read once a second.
+    A sensor may run for hours next to a short video. So the longer record must be far longer, and sampled
+    more slowly than such devices are: a fast sensor in milliseconds looks as if sampled about once a second.
 
     Args:
         frame_s: (T,) times of the frames [s].

@@ -1,4 +1,4 @@
-"""Small numeric CSV files with a header: read whole, errors by line."""
+"""Reader of numeric CSV files with a header; errors name the line."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def read_csv(
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
     Args:
-        path: the CSV; comma, or semicolon and then decimal commas too; UTF-8 with or without BOM.
-        required: columns that must be there, each once.
-        optional: columns returned when there.
+        path: the CSV; comma, or semicolon and then also decimal commas; UTF-8 with or without BOM.
+        required: columns that must be present exactly once.
+        optional: columns returned if present.
 
     Raises:
-        UserError: unreadable, too large, a column missing, no rows, a cell that is no number (with its line).
+        UserError: unreadable, too large, a missing column, no rows, a cell that is not a number.
     """
     header, rows = _split(path)
     missing = [name for name in required if header.count(name) != 1]
     if missing:
         there = ", ".join(header)[:200]
-        raise UserError(f"{path}:1: missing column {', '.join(missing)}; there are {there!r}")
+        raise UserError(f"{path}:1: missing column {', '.join(missing)}; the header is {there!r}")
     wanted = [name for name in (*required, *optional) if name in header]
     columns, values = [header.index(name) for name in wanted], array("d")
     try:
@@ -42,7 +42,7 @@ def read_csv(
             if "".join(row).strip():
                 over = "." not in "".join(row) and "".join(row[len(header) :]).strip()
                 if over or len(row) <= max(columns):
-                    why = "decimal commas? write points" if over else "cut off?"
+                    why = "decimal commas? use points" if over else "cut off?"
                     raise ValueError(f"{len(row)} cells, {len(header)} expected ({why})")
                 values.extend(float(row[k].strip().replace(",", ".") or "nan") for k in columns)
     except (ValueError, csv.Error) as error:
@@ -53,12 +53,12 @@ def read_csv(
 
 
 def read_header(path: Path) -> list[str]:
-    """Names of the columns, in lower case. UserError if it is unreadable or too large."""
+    """Column names, in lower case. UserError if the file is unreadable or too large."""
     return _split(path)[0]
 
 
 def _split(path: Path) -> tuple[list[str], Any]:
-    """Names of the columns, and the csv.reader of the rows below."""
+    """Column names, and the csv.reader of the rows."""
     lines = checked_file.read_text(path, _LARGEST_BYTES, "utf-8-sig").splitlines()
     first = lines[0] if lines else ""
     rows = csv.reader(lines, delimiter=";" if first.count(";") > first.count(",") else ",", strict=True)

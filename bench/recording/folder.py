@@ -1,16 +1,16 @@
-"""A recording: a folder with a video, perhaps the force sensor's file, and `meta.yaml`.
+"""Reader of recordings: a folder with a video, optionally a force sensor's file, and `meta.yaml`.
 
 meta.yaml              scale, stiffness, rest frame, ... (`bench.recording.meta`)
 video.mp4 or frames/*.png
 frames.csv             optional: frame,t_s      (else the video's own presentation times)
 force.csv              optional: t_s,fx_n,fy_n,fz_n
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
-mask.png               optional: the same for all frames that have none of their own
-tissue.png             optional: white on all of the tissue, in the rest frame (the rest shows the camera)
-right.mp4 or right/*.png   optional: the second eye, frame by frame, with `stereo` in meta.yaml
+mask.png               optional: the same for all frames that have no mask of their own
+tissue.png             optional: white on all tissue in the rest frame; the rest shows the camera's motion
+right.mp4 or right/*.png   optional: the right camera, frame by frame, with `stereo` in meta.yaml
 depth/*.png or *.npy   optional: depth (H, W) or points (H, W, 3), frame by frame, with `depth` in meta.yaml
 
-What is of one moment has the same number, in a picture's name and in frames.csv; a video counts from 0.
+Files of one moment have the same number, in a picture's name and in frames.csv; videos are numbered from 0.
 """
 
 from __future__ import annotations
@@ -33,52 +33,42 @@ from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture
 
-Film = Path | dict[int, Path]
-"""A video, or pictures by the numbers in their names, in order."""
+Video = Path | dict[int, Path]
+"""A video file, or pictures by the numbers in their names, in order."""
 
 _LARGEST_FORCE_N = 50.0
-_EPOCH_S = 1e8  # three years: no recording is as long, so such a time counts from 1970
+_EPOCH_S = 1e8  # three years, longer than any recording: larger times count from 1970
 
 
 @dataclass(frozen=True)
 class Force:
-    """What the sensor's file says, in its own time, unprocessed but for units and sign."""
+    """The sensor's samples on its own clock, converted in unit and sign only."""
 
-    time_s: NDArray[np.float64]
-    """(N,) strictly rising [s]."""
-    force_mn: NDArray[np.float64]
-    """(N, 3) force on the tissue [mN]; NaN where the file has none."""
-    gravity: NDArray[np.float64] | None = None
-    """(N, 3) unit vector of gravity in the sensor's axes, when the file has gx, gy, gz."""
+    time_s: NDArray[np.float64]  # (N,) strictly rising [s]
+    force_mn: NDArray[np.float64]  # (N, 3) force on the tissue [mN]; NaN where the file has none
+    gravity: NDArray[np.float64] | None = None  # (N, 3) unit vector in the sensor's axes: gx, gy, gz
 
 
 @dataclass(frozen=True)
 class Recording:
-    """An opened recording. Nothing is decoded yet."""
+    """An opened recording; its pictures are not yet decoded."""
 
     folder: Path
     meta: Meta
-    footage: Film
-    times_s: Mapping[int, float] | None
-    """From frames.csv [s], by the frame's number. None without the file."""
+    footage: Video
+    times_s: Mapping[int, float] | None  # frames.csv [s], by frame number; None without the file
     force: Force | None
-    masks: MaskFiles
-    """Of the tool; there may be none."""
+    masks: MaskFiles  # of the tool; may be empty
     tissue: Path | None
-    notes: tuple[str, ...]
-    """What was found odd and how it was taken; every one goes into the report."""
-    region: tuple[int, int, int, int] | None = None
-    """Left, top, width and height [px] of the part of the picture that is looked at."""
-    right: Film = field(default_factory=dict)
-    """Of the second eye; empty: none."""
-    right_frame: Mapping[int, int] = field(default_factory=dict)
-    """Which frame each of them belongs to, where that is known."""
-    depths: Mapping[int, Path] = field(default_factory=dict)
-    """Depth pictures by the frame; empty: none."""
+    notes: tuple[str, ...]  # oddities and how they were handled, for the report
+    region: tuple[int, int, int, int] | None = None  # left, top, width, height [px] of the tracked part
+    right: Video = field(default_factory=dict)  # right camera; empty: none
+    right_frame: Mapping[int, int] = field(default_factory=dict)  # frame of each picture, where known
+    depths: Mapping[int, Path] = field(default_factory=dict)  # depth pictures by frame; empty: none
 
     @property
     def has_stereo(self) -> bool:
-        """Whether a second eye or a depth camera saw it too."""
+        """Whether it has a right camera or a depth camera."""
         return bool(self.right or self.depths)
 
     @property
@@ -86,13 +76,11 @@ class Recording:
         return self.folder.resolve().name
 
     def numbers(self) -> Collection[int]:
-        """Of the frames, in order; empty for a video that doesn't say how many. UserError: unreadable."""
+        """Frame numbers in order; empty if the video's length is unknown. UserError: unreadable."""
         return _numbers(self.footage)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times.
-
-        Those of frames.csv alone if there is one, else the video's, else by `fps` of meta.yaml.
+        """Upright frames in order, with times: from frames.csv if it exists, else the video, else `fps`.
 
         Raises:
             UserError: unreadable video or picture.
@@ -101,29 +89,29 @@ class Recording:
         for picture in _pictures(self.footage):
             yield self._timed(picture, first)
 
-    def film(self, pictures: Iterable[Picture] | None = None) -> Footage:
-        """The recording for a `VideoFlow`. `pictures`: some of its frames; None: all."""
+    def as_footage(self, pictures: Iterable[Picture] | None = None) -> Footage:
+        """The recording as input of a `VideoFlow`. `pictures`: some of its frames; None: all."""
         tool = self.masks.read if self.masks else None
         frames = self.frames() if pictures is None else pictures
         return Footage(frames, str(self.folder), self.tissue_mask, tool, self.meta.rest_frame)
 
     def right_frames(self) -> Iterator[Picture]:
-        """The second eye's frames in order, with the numbers of the film's; UserError: unreadable."""
+        """The right camera's frames in order, with the left frames' numbers. UserError: unreadable."""
         for picture in _pictures(self.right):
             yield replace(picture, index=self.right_frame.get(picture.index, picture.index))
 
     def describe_tool(self, frames: int) -> str:
-        """What is taken for the tool in how many frames, for `bench check` and `bench score` alike."""
+        """The source of the tool masks, in words."""
         if not self.masks:
-            return "no masks/, no mask.png: the tool is looked for in each picture"
+            return "no masks/, no mask.png: the tool is detected in each picture"
         count = len(self.masks.by_frame.keys() & set(self.numbers() or self.masks.by_frame))
         if count >= frames:
             return f"masks/ has all {frames} frames"
-        others = "mask.png stands for" if self.masks.default else "no tool is taken to be in"
+        others = "mask.png is used for" if self.masks.default else "no tool is assumed in"
         return f"masks/ has {count} of {frames} frames; {others} the others"
 
     def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
-        """(H, W) where tissue may be tracked in the rest frame: `tissue.png`, else everywhere."""
+        """Mask (H, W) of trackable tissue in the rest frame: `tissue.png`, else the whole picture."""
         tissue = np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
         if self.region is not None:
             left, top, width, height = self.region
@@ -133,7 +121,7 @@ class Recording:
         return tissue
 
     def within(self, masks: MaskFiles | None, region: tuple[int, int, int, int] | None) -> Recording:
-        """The same with the tool as other files have it, and looked at in a region (see `region`) only."""
+        """The recording with other tool masks, if given, and restricted to a region (see `region`)."""
         if masks is None:
             return replace(self, region=region)
         notes = list(self.notes)
@@ -149,32 +137,32 @@ class Recording:
         return replace(picture, time_s=time_s)
 
 
-def _pictures(film: Film) -> Iterator[Picture]:
-    return video.read_video(film) if isinstance(film, Path) else video.read_pictures(film)
+def _pictures(files: Video) -> Iterator[Picture]:
+    return video.read_video(files) if isinstance(files, Path) else video.read_pictures(files)
 
 
-def _numbers(film: Film) -> Collection[int]:
-    return range(video.count_frames(film) or 0) if isinstance(film, Path) else film.keys()
+def _numbers(files: Video) -> Collection[int]:
+    return range(video.count_frames(files) or 0) if isinstance(files, Path) else files.keys()
 
 
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
-    """Reads everything but the pictures. Times since 1970 are brought to the recording's start.
+    """Reads everything but the pictures. Times since 1970 are counted from the recording's start.
 
     Args:
         folder: of the recording.
-        phantom: it shows one, whatever meta.yaml says of the tissue.
+        phantom: whether it shows a phantom, whatever meta.yaml states.
 
     Raises:
-        UserError: no folder, bad meta.yaml, neither or both of video and frames, a CSV that can't be used.
+        UserError: no folder, bad meta.yaml, neither or both of video and frames, an unusable CSV.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: no recording folder; `bench import` makes one of other systems' files")
+        raise UserError(f"{folder}: no recording folder; `bench import` converts other systems' files")
     about = meta.read_meta(folder / "meta.yaml")
     if phantom:
         about = about.model_copy(update={"tissue": "phantom"})
-    footage = _film(folder, "video", "frames")
+    footage = _find_video(folder, "video", "frames")
     if not footage:
-        raise UserError(f"{folder}: holds neither video.mp4 nor frames/*.png")
+        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found")
     notes: list[str] = []
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
@@ -184,12 +172,12 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         notes += file_numbers.describe_gaps(list(frames), "frames/")
     elif (aspect := video.pixel_aspect(footage)) != 1:
         how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
-        notes.append(f"the video: {how}; scale and calibration are taken to be of the square ones")
+        notes.append(f"the video: {how}; scale and calibration are assumed to be for square pixels")
     times = _frame_times(folder / "frames.csv", frames, notes)
     force = _force(folder / "force.csv", about, notes)
     about, times, force = _from_start(about, times, force, notes)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
-    right, depths = _second_eye(folder, about)
+    right, depths = _find_stereo(folder, about)
     right_frame = file_numbers.match_numbers(_numbers(right), frames, "right", notes)
     depth_frame = file_numbers.match_numbers(depths, frames, "depth/", notes)
     found = Recording(
@@ -208,45 +196,45 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     return found.within(MaskFiles.find(folder / "masks", folder), None)
 
 
-def _second_eye(folder: Path, about: Meta) -> tuple[Film, dict[int, Path]]:
-    """Video or pictures of the right eye, and depth pictures; UserError if meta.yaml says otherwise."""
-    right = _film(folder, "right", "right")
+def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
+    """The right camera's video or pictures, and depth pictures. UserError if meta.yaml does not match."""
+    right = _find_video(folder, "right", "right")
     depths = [path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")]
-    for found, told, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
-        if bool(found) != (told is not None):
+    for found, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
+        if bool(found) != (section is not None):
             raise UserError(
-                f"{folder}: right.mp4 or right/*.png goes with stereo: in meta.yaml, depth/ with depth:; "
+                f"{folder}: right.mp4 or right/*.png requires stereo: in meta.yaml, depth/ requires depth:; "
                 f"{key}: or its pictures are missing"
             )
     return right, file_numbers.number_files(depths)
 
 
-def _film(folder: Path, name: str, pictures: str) -> Film:
-    """The video NAME.*, or the pictures of a folder; empty: neither. UserError for several."""
-    found: list[Film] = [
+def _find_video(folder: Path, name: str, pictures: str) -> Video:
+    """The video NAME.*, or the pictures in a folder; empty: neither. UserError for several."""
+    found: list[Video] = [
         path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
     ]
     if stills := file_numbers.number_files(list(folder.glob(f"{pictures}/*.png"))):
         found.append(stills)
     if len(found) > 1:
-        raise UserError(f"{folder}: holds several of {name}.mp4 and {pictures}/; keep one of them")
+        raise UserError(f"{folder}: has several of {name}.mp4 and {pictures}/; keep one of them")
     return found[0] if found else {}
 
 
 def _from_start(
     about: Meta, times: dict[int, float] | None, force: Force | None, notes: list[str]
 ) -> tuple[Meta, dict[int, float] | None, Force | None]:
-    """Times since 1970 counted from the first frame instead, those of meta.yaml's spans among them."""
+    """Converts times since 1970, also those of meta.yaml's spans, to times since the first frame."""
     first = next(iter((times or {}).values()), 0.0)
     start = first if first > _EPOCH_S else 0.0
-    felt = force is not None and bool(force.time_s[0] > _EPOCH_S)
-    if force is not None and felt != bool(start):
-        one, other = ("force.csv", "the video") if felt else ("frames.csv", "force.csv")
-        notes.append(f"{one} counts from 1970, {other} doesn't: nobody can tell where one lies on the other")
+    force_since_1970 = force is not None and bool(force.time_s[0] > _EPOCH_S)
+    if force is not None and force_since_1970 != bool(start):
+        one, other = ("force.csv", "the video") if force_since_1970 else ("frames.csv", "force.csv")
+        notes.append(f"{one} counts from 1970, {other} doesn't: the offset between the two is unknown")
         return about, times, force
     if not start:
         return about, times, force
-    notes.append(f"times since 1970 are counted from {start:.3f} s on")
+    notes.append(f"times since 1970 are counted from {start:.3f} s")
     if times is not None:
         times = {number: time - start for number, time in times.items()}
     if force is not None:
@@ -255,7 +243,7 @@ def _from_start(
 
 
 def _spans_from(about: Meta, start: float) -> Meta:
-    """The same with the spans that count from 1970 counted from `start` [s] on."""
+    """meta.yaml with the spans that count from 1970 counted from `start` [s]."""
 
     def moved(span: Span | None) -> Span | None:
         return span if span is None or span[0] < _EPOCH_S else (span[0] - start, span[1] - start)
@@ -263,16 +251,18 @@ def _spans_from(about: Meta, start: float) -> Meta:
     def every(spans: tuple[Span, ...]) -> tuple[Span | None, ...]:
         return tuple(moved(span) for span in spans)
 
-    sync = about.sync.model_copy(update={"calibration_s": moved(about.sync.calibration_s)})
-    told = about.sensor
-    sensor = told.model_copy(update={"free_s": every(told.free_s), "turn_s": moved(told.turn_s)})
-    pulse = about.pulse.model_copy(update={"free_s": every(about.pulse.free_s)})
-    parts = {"sync": sync, "sensor": sensor, "pulse": pulse, "press_s": moved(about.press_s)}
+    sync, sensor, pulse = about.sync, about.sensor, about.pulse
+    parts = {
+        "sync": sync.model_copy(update={"calibration_s": moved(sync.calibration_s)}),
+        "sensor": sensor.model_copy(update={"free_s": every(sensor.free_s), "turn_s": moved(sensor.turn_s)}),
+        "pulse": pulse.model_copy(update={"free_s": every(pulse.free_s)}),
+        "press_s": moved(about.press_s),
+    }
     return about.model_copy(update=parts)
 
 
 def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[int, float] | None:
-    """Seconds by the frame's number, rising; `frames`: the film's. UserError: no numbers, or of another."""
+    """Rising times [s] by frame number; `frames`: numbers of the video. UserError for bad numbers."""
     if not os.path.lexists(path):
         return None
     columns = csv_table.read_csv(path, ("frame", "t_s"))
@@ -280,18 +270,18 @@ def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[
     number = np.where((frame >= 0) & (frame < 1e8), frame, -1).astype(np.int64)
     whole = (number == frame).all() and len(np.unique(number)) == len(number)
     if not whole or number.max() > 10 * len(number) + 1000:
-        raise UserError(f"{path}: column frame must hold the frames' numbers, each once")
+        raise UserError(f"{path}: column frame must contain frame numbers, each once")
     frame_of = file_numbers.match_numbers(number.tolist(), frames, path.name, notes)
     times = {frame_of[n]: t for n, t in sorted(zip(number.tolist(), time.tolist(), strict=True)) if t == t}
     if (np.diff(list(times.values())) <= 0).any():
-        notes.append(f"{path.name}: times stand still or run back; those frames are left out")
+        notes.append(f"{path.name}: times repeat or run backwards; those frames are left out")
     return times
 
 
 def _rising(time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) rows kept of a clock that runs back: those at which it reaches new ground.
+    """Rows (N,) to keep so that times rise: those later than all before, or earlier than all after.
 
-    Seen from the start or from the end, whichever keeps more: one wrong time must not take all that follow.
+    Whichever keeps more rows: a single wrong time must not exclude all that follow.
     """
     if len(time) == 0:
         return np.zeros(0, bool)
@@ -307,7 +297,7 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     forces = ("fx_n", "fy_n", "fz_n")
     columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
     columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
-    for fault, check in (("without a time", np.isfinite), ("whose time stands still or runs back", _rising)):
+    for fault, check in (("without a time", np.isfinite), ("whose time repeats or runs backwards", _rising)):
         good = check(columns["t_s"])
         if not good.all():
             notes.append(f"{path.name}: {np.sum(~good)} rows {fault} left out")
@@ -320,23 +310,18 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
         for name, empty in zip(forces, lacking.T, strict=True):
             if empty.any():
                 row = columns["row"][empty][0]
-                few += (
-                    f"; {name} is empty in {empty.sum()} of {len(empty)}, first in row {row:.0f} of the data"
-                )
+                few += f"; {name} is empty in {empty.sum()} of {len(empty)} rows, first in row {row:.0f}"
         raise UserError(few)
     if not usable.all():
-        notes.append(
-            f"{path.name}: {np.sum(~usable)} rows with a missing force; scores leave those times out"
-        )
+        notes.append(f"{path.name}: {np.sum(~usable)} rows with a missing force are not scored")
         newtons[~usable] = np.nan
     largest = float(np.nanmax(np.abs(newtons)))
     if largest > _LARGEST_FORCE_N and about.tissue == "brain":
         raise UserError(
-            f"{path}: force reaches {largest:.4g} N, more than any brain bears; are the columns in mN? "
-            "(of a phantom: --phantom, or tissue: phantom in meta.yaml)"
+            f"{path}: force reaches {largest:.4g} N, too much for a brain; are the columns in mN? "
+            "(for a phantom: --phantom, or tissue: phantom in meta.yaml)"
         )
-    gravity = None
-    if all(name in columns for name in ("gx", "gy", "gz")):
-        gravity = np.stack([columns[name] for name in ("gx", "gy", "gz")], axis=1)
+    directions = [columns[name] for name in ("gx", "gy", "gz") if name in columns]
+    gravity = np.stack(directions, axis=1) if len(directions) == 3 else None
     sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
     return Force(columns["t_s"], sign * 1000.0 * newtons, gravity)

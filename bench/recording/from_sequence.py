@@ -1,4 +1,4 @@
-"""A sealed sequence written as a recording folder, so that the code that scores real ones scores it too."""
+"""Export of a sealed sequence as a recording folder, to be scored like a real recording."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ _PAIR = "stereo.yaml"
 def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["png", "mp4"] = "png") -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
 
-    Of a stereo sequence the right eye and the pair's calibration too.
-
-    Nothing that the recorded scene wouldn't have given is written: no true flow, no traction, no glare mask.
+    A stereo sequence adds the right camera and the calibration. Ground truth that a real recording lacks is
+    not written: no true flow, no traction, no glare mask.
 
     Args:
         sequence: a sealed sequence.
-        folder: where to; must not exist.
+        folder: must not exist.
         frames: `png` is lossless, `mp4` is H.264.
 
     Raises:
@@ -34,16 +33,16 @@ def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["pn
     """
     folder = as_path("recording", folder)
     with writer.write_whole_folder(folder) as part:
-        _fill(sequence, part, frames)
+        _write_files(sequence, part, frames)
     return folder
 
 
-def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
+def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
     (part / "masks").mkdir()
     time = np.asarray(sequence["time"][:], np.float64)
-    _film(sequence, "rgb", part, "video", frames)
+    _write_pictures(sequence, "rgb", part, "video", frames)
     even = (slice(None), slice(None))
-    if frames == "mp4":  # the codec wants even sizes; masks must fit the video
+    if frames == "mp4":  # the codec requires even sizes; masks must have the video's size
         even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
     for t in range(sequence.frames):
         tool = np.asarray(sequence["tool"][t], bool)[even]
@@ -52,23 +51,26 @@ def _fill(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
     writer.write_force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
     writer.write_frames(part, time)
+    anatomy = (sequence.attrs.get("scenario") or {}).get("anatomy", sequence.index)
     about: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "rest_frame": 0,
-        "specimen": f"anatomy {_anatomy(sequence)}",
+        "specimen": f"anatomy {anatomy}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
     if "rgb_right" in sequence:
-        _film(sequence, "rgb_right", part, "right", frames)
+        _write_pictures(sequence, "rgb_right", part, "right", frames)
         writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
         about["stereo"] = {"calibration": _PAIR}
     writer.write_meta(part, about)
 
 
-def _film(sequence: Sequence, field: str, part: Path, name: str, kind: Literal["png", "mp4"]) -> None:
-    """An eye's pictures, (H, W, 3) uint8 a frame, as NAME.mp4 or in a folder."""
+def _write_pictures(
+    sequence: Sequence, field: str, part: Path, name: str, kind: Literal["png", "mp4"]
+) -> None:
+    """Writes a camera's pictures as NAME.mp4 or into a folder."""
     pictures = (np.asarray(sequence[field][t], np.uint8) for t in range(sequence.frames))
     if kind == "mp4":
         writer.write_video(part / f"{name}.mp4", pictures, np.asarray(sequence["time"][:], np.float64))
@@ -77,11 +79,6 @@ def _film(sequence: Sequence, field: str, part: Path, name: str, kind: Literal["
     folder.mkdir()
     for t, rgb in enumerate(pictures):
         _write(folder / f"{t:06d}.png", rgb[..., ::-1])
-
-
-def _anatomy(sequence: Sequence) -> str:
-    scenario = sequence.attrs.get("scenario") or {}
-    return str(scenario.get("anatomy", sequence.index))
 
 
 def _write(path: Path, picture: NDArray[np.uint8]) -> None:

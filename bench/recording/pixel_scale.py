@@ -1,7 +1,7 @@
-"""Millimetres a pixel, and how sure they are.
+"""Millimetres per pixel and their uncertainty.
 
-At equal flow in pixels both the depth u and the size a of the dent go with the scale. On an elastic body
-F = E a² g(u/a), so force goes with the scale's square: 5% of scale is 10% of force.
+At equal flow in pixels both the depth u and the width a of a dent are proportional to the scale. On an
+elastic body F = E a² g(u/a), so force is proportional to the scale's square: 5% of scale is 10% of force.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from synth.errors import UserError
 from synth.video import read as video
 from synth.video.pixel_scale import ASSUMED_WIDTH_MM, pixel_mm
 
-_UNKNOWN = 0.99  # relative: nothing is known
-_STATED = 0.02  # what a stated scale is trusted to without more
-_POINT_PX = 1.0  # standard error of a point set by hand
+_UNKNOWN = 0.99  # relative uncertainty of an unknown scale
+_STATED = 0.02  # relative uncertainty of a stated scale, unless given
+_POINT_PX = 1.0  # standard error of a point marked by hand
 _DISTANCE = 0.01  # relative standard error of a stated working distance
 
 
@@ -29,20 +29,19 @@ class PixelScale:
     """Scale at the tissue."""
 
     mm_per_px: float
-    uncertainty: float
-    """Relative, one standard deviation."""
+    uncertainty: float  # relative, one standard deviation
     source: str
 
 
 def find_scale(meta: Meta, folder: Path) -> PixelScale:
-    """The recording's scale, from what `meta.yaml` offers.
+    """The recording's scale, stated or calibrated by `meta.yaml`.
 
     Raises:
-        UserError: a checkerboard that isn't found, points that coincide; of an unknown scale, no picture.
+        UserError: no checkerboard found, points that coincide, or, for an unknown scale, no picture.
     """
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
-        source = f"unknown: the picture is taken to be {ASSUMED_WIDTH_MM:g} mm wide"
+        source = f"unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
         found = PixelScale(pixel_mm("unknown", wide), _UNKNOWN, source)
     elif meta.scale_mm_per_px is not None:
         found = PixelScale(meta.scale_mm_per_px, _STATED, "stated")
@@ -73,9 +72,9 @@ def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float
 
 
 def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> PixelScale:
-    """Mean length of the squares' sides over the whole board; their spread is the error.
+    """Scale by the mean length of the squares' sides, with their spread as its error.
 
-    On a board that lies flat and square to the view all sides are equal; tilt and distortion show as spread.
+    On a flat board perpendicular to the optical axis all sides are equal; tilt and distortion add spread.
     """
     columns, rows = corners
     grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
@@ -86,7 +85,7 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Pix
     sides = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)]
     lengths = np.concatenate(sides)
     middle = float(lengths.mean())
-    # Sides along rows and columns differ under tilt: half that difference can't be averaged away.
+    # Under tilt sides along rows and columns differ: half that difference is a systematic error.
     tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
     error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
     return PixelScale(square_mm / middle, max(error, 1e-4), "checkerboard")

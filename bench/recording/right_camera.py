@@ -1,4 +1,4 @@
-"""The second eye of a recording, or its depth camera: motion in space from the flow of each frame."""
+"""The right camera or depth camera of a recording: motion in three dimensions from the flow of each frame."""
 
 from __future__ import annotations
 
@@ -31,48 +31,42 @@ _LARGEST_BYTES = 1 << 30  # of an array of points
 
 @dataclass(frozen=True)
 class StereoQuality:
-    """What the second eye is good for, for `bench check` and the report."""
+    """Quality of the right or depth camera, for `bench check` and the report."""
 
-    baseline_mm: float
-    """NaN of a depth camera."""
-    epipolar_px: float
-    """Median distance of what matches from its row, on the pictures that flow is computed on; NaN: none."""
-    mm_per_px: float
-    """What a pixel of the recording spans at the tissue in the rest frame, by the second eye."""
-    noise_mm: float
-    """Median deviation of depth motion over the tissue, and over the frames looked at."""
-    fault: str = ""
-    """Why its pictures aren't the second eye's, of these moments; empty if nothing is wrong."""
+    baseline_mm: float  # NaN for a depth camera
+    epipolar_px: float  # median row error of stereo matches, at flow's resolution; NaN for a depth camera
+    mm_per_px: float  # of the recording's own pixels at the tissue in the rest frame, by stereo or depth
+    noise_mm: float  # median stated deviation of depth motion over tissue and frames
+    fault: str = ""  # why the right pictures don't belong to the left ones; empty if they do
 
     def describe(self) -> str:
-        """A line for a person."""
-        noise = f"depth motion is known to ± {self.noise_mm:.2g} mm"
+        """The quality in words."""
+        noise = f"depth motion has a standard deviation of {self.noise_mm:.2g} mm"
         if np.isnan(self.baseline_mm):
-            return f"a depth camera; {noise}"
-        rows = f"rows {self.epipolar_px:.2g} px off"
-        return f"a second eye {self.baseline_mm:.3g} mm to the right, {rows}; {noise}"
+            return f"depth camera; {noise}"
+        return f"baseline {self.baseline_mm:.3g} mm, rows {self.epipolar_px:.2g} px off; {noise}"
 
 
 class RightCamera:
-    """Follows the frames of a `VideoFlow`, each once and in order."""
+    """Tracks the right or depth camera along with the frames of a `VideoFlow`, each once and in order."""
 
     def __init__(self, recording: Recording, scale_mm_per_px: float) -> None:
-        """Nothing is read yet. `scale_mm_per_px`: of the recording's own pixels."""
+        """`scale_mm_per_px`: of the recording's own pixels. Nothing is read yet."""
         self.scale_mm_per_px, self._recording = scale_mm_per_px, recording
         self._stereo: StereoTracker | None = None
-        self._camera: CameraTracker | None = None  # of the second eye
+        self._camera: CameraTracker | None = None  # motion of the right camera
         self._depth: DepthTracker | None = None
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._shrink = 1
         self._noise: list[float] = []
         self._pairing = StereoPairing()
         self._timing: StereoTiming | None = None
-        self._pair: tuple[Rgb, Rgb] | None = None  # of the frame last followed, or
-        self._seen: Map | None = None  # its depth
+        self._pair: tuple[Rgb, Rgb] | None = None  # of the last tracked frame
+        self._depth_now: Map | None = None  # of the last tracked frame
 
     @property
     def quality(self) -> StereoQuality | None:
-        """What it came to, once all frames are through; None where the rest frame showed nothing."""
+        """The quality over all frames so far; None if the rest frame could not be used."""
         noise = float(np.median(self._noise)) if self._noise else float("nan")
         if self._stereo is None:
             if self._depth is None:
@@ -85,12 +79,12 @@ class RightCamera:
         return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, fault)
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
-        """Motion in space of a frame since rest, None where the second eye's picture is missing.
+        """Motion in three dimensions of a frame since rest; None if its right or depth picture is missing.
 
-        The first is the rest frame.
+        The first frame must be the rest frame.
 
         Raises:
-            UserError: the second eye lacks the rest frame, ends early or can't be read; not its calibration.
+            UserError: missing rest picture, too few or unreadable pictures, a calibration that doesn't fit.
         """
         self._shrink, tissue = video.shrink, video.tissue
         masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
@@ -100,13 +94,13 @@ class RightCamera:
             if self._stereo is None or self._camera is None:
                 self._pair = frame.rgb, right
                 hidden = _mask_right(right, video.settings.masks, masked)
-                self._stereo = self._begun(self._rig(video), frame.rgb, right, masked, hidden, tissue)
+                self._stereo = self._begin(self._rig(video), frame.rgb, right, masked, hidden, tissue)
                 self._pairing.add(frame.rgb, right, masked)
                 self._timing = StereoTiming(self._stereo, frame.rgb, right, tissue & ~masked)
                 inside = self._stereo.right_tissue()
                 self._camera = CameraTracker(right, inside, mask_detection.blocked(right))
                 return Moved.nothing(tissue.shape)
-            # Both eyes' surroundings are brought back to rest: with them the rig, as far as the tissue shows.
+            # Aligning both cameras' surroundings to rest removes motion of the rig relative to the tissue.
             view = self._camera.find(right, frame.time_s) or frame.camera
             right = right if view is None else view.undo(right)
             self._pair = frame.rgb, right
@@ -120,7 +114,7 @@ class RightCamera:
         else:
             if (depth := self._depths(frame, video)) is None:
                 return None
-            self._seen = np.where(depth > 0, depth, np.nan).astype(np.float32)
+            self._depth_now = np.where(depth > 0, depth, np.nan).astype(np.float32)
             if self._depth is None:
                 self._depth = DepthTracker(self._K(video), depth, masked, tissue)
                 return Moved.nothing(tissue.shape)
@@ -129,21 +123,21 @@ class RightCamera:
         return moved
 
     def depth_mm(self) -> Map | None:
-        """See `DepthSource`: of two eyes by matching the frame's own pictures."""
+        """See `DepthSource`; with a right camera by stereo matching of the frame's own pictures."""
         if self._stereo is None or self._pair is None:
-            return self._seen
+            return self._depth_now
         r, anywhere = self._stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
-        left, right = (r.picture(rgb @ image.GREY, eye) for eye, rgb in enumerate(self._pair))
+        left, right = (r.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(self._pair))
         try:
             found = match(left, right, anywhere, anywhere, refine=False)
         except UserError:
             return None
         return r.back(np.where(found.found, r.depth(found.disparity), np.nan).astype(np.float32))
 
-    def _begun(
+    def _begin(
         self, rig: StereoRig, left: Rgb, right: Rgb, masked: Flags, hidden: Flags, tissue: Flags
     ) -> StereoTracker:
-        """From the rest pictures; UserError if they don't match, which says how they would."""
+        """Starts tracking from the rest pictures; UserError if they don't match, naming a flip that would."""
         try:
             return StereoTracker(rig, left[None], right[None], masked, hidden, tissue)
         except UserError as error:
@@ -152,23 +146,23 @@ class RightCamera:
                     StereoTracker(rig, left[None], np.ascontiguousarray(turned)[None], masked, hidden, tissue)
                 except UserError:
                     continue
-                raise UserError(f"{self._recording.folder}: the right eye's pictures are {how}") from None
+                raise UserError(f"{self._recording.folder}: the right camera's pictures are {how}") from None
             raise error
 
     def _rig(self, video: VideoFlow) -> StereoRig:
-        """The pair, with pictures as small as the film's, cut as `shrink_picture` cuts them."""
+        """The stereo rig for pictures reduced and cropped as by `shrink_picture`."""
         about, (height, width) = self._recording.meta.stereo, video.size
         assert about is not None
         path = self._recording.folder / about.calibration
         rig = calibration.read_rig(path, (width, height), about.mm_per_unit)
         left, right = (
-            Intrinsics(_smaller(eye.K, video.shrink), eye.distortion) for eye in (rig.left, rig.right)
+            Intrinsics(_smaller(one.K, video.shrink), one.distortion) for one in (rig.left, rig.right)
         )
         size = (width // video.shrink, height // video.shrink)
         return StereoRig(left, right, rig.rotation, rig.translation, size)
 
     def _right(self, frame: FrameMotion, video: VideoFlow) -> Rgb | None:
-        """The second eye's picture of that number, shrunk as the film's; None: it is missing."""
+        """The right camera's picture of a frame, shrunk as the video is; None: missing."""
         index = frame.index
         for picture in self._rights:
             if picture.index > index and not frame.is_rest:
@@ -176,11 +170,10 @@ class RightCamera:
                 return None
             if picture.index == index:
                 if picture.rgb.shape[:2] != video.size:
-                    raise UserError(
-                        f"{self._recording.folder}: the right eye's frame {index} is of another size"
-                    )
+                    folder = self._recording.folder
+                    raise UserError(f"{folder}: frame {index} of the right camera has another size")
                 return shrink_picture(picture.rgb, video.shrink)
-        raise UserError(f"{self._recording.folder}: the right eye has no frame {index}")
+        raise UserError(f"{self._recording.folder}: the right camera has no frame {index}")
 
     def _K(self, video: VideoFlow) -> Floats:
         about, (height, width) = self._recording.meta.depth, video.size
@@ -189,7 +182,7 @@ class RightCamera:
         return _smaller(np.array([[about.focal_px, 0, x], [0, about.focal_px, y], [0, 0, 1.0]]), video.shrink)
 
     def _depths(self, frame: FrameMotion, video: VideoFlow) -> Map | None:
-        """Depth (h, w) mm of a frame, of points their third coordinate; None: it is missing."""
+        """Depth (h, w) mm of a frame, or the third coordinate of its points; None: missing."""
         recording, about = self._recording, self._recording.meta.depth
         assert about is not None
         if frame.index not in recording.depths:
@@ -217,7 +210,7 @@ class RightCamera:
 
 
 def _smaller(K: Floats, shrink: int) -> Floats:
-    """K of pictures whose pixels hold shrink x shrink of the old: a picture begins half a pixel early."""
+    """K after averaging shrink x shrink pixels; a picture starts half a pixel before its first centre."""
     out = K / shrink
     out[:2, 2] = (K[:2, 2] + 0.5) / shrink - 0.5
     out[2] = [0, 0, 1]
@@ -225,9 +218,9 @@ def _smaller(K: Floats, shrink: int) -> Floats:
 
 
 def _mask_right(rgb: Rgb, kind: str, left: Flags) -> Flags:
-    """(H, W) tool and glare as the right eye's picture alone shows them: nobody gave their outlines.
+    """Mask (H, W) of tool and specular highlights, detected in the right picture.
 
-    `kind`: one of `MASKS`; of `auto`, only where something proved worth masking in the left eye's.
+    `kind`: one of `MASKS`; with `auto` nothing is masked unless something is masked in the left picture.
     """
     nothing = np.zeros(rgb.shape[:2], bool)
     if kind == "none" or (kind == "auto" and not left.any()):

@@ -1,4 +1,4 @@
-"""Whether the right eye's pictures are those of the right eye."""
+"""Check that the right camera's pictures are not copies, frozen, or swapped with the left camera's."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
 
-_SAME = 0.2  # of the change of the left eye's picture: less is the same picture again
-_COPY = 0.03  # of the picture's own detail: two cameras' noise alone differs by more
+_SAME = 0.2  # share of the left picture's change below which the right picture is frozen
+_COPY = 0.03  # share of the picture's detail: the noise of two cameras differs by more
 _FROZEN = 3  # frames
 _LEAST_TOOL = 300  # px
-_BEHIND_PX = 1.0  # of disparity: what hides tissue is nearer than it
+_BEHIND_PX = 1.0  # of disparity: a tool that hides tissue is nearer than the tissue
 _NEAR = np.ones((25, 25), np.uint8)
 
 
 class StereoPairing:
-    """Gathers, frame by frame, what tells."""
+    """Gathers the evidence frame by frame."""
 
     def __init__(self) -> None:
         self._last: tuple[Rgb, Rgb] | None = None
@@ -27,8 +27,8 @@ class StereoPairing:
         self._tool: tuple[Flags, Rgb, Rgb] | None = None
 
     def add(self, left: Rgb, right: Rgb, masked: Flags) -> None:
-        """A frame's pictures (H, W, 3) and its mask; the rest frame's first."""
-        # A flat surface may look alike to both eyes, but not in every frame.
+        """Adds a frame's pictures (H, W, 3) and its mask; the rest frame first."""
+        # A flat surface may look the same in both cameras, but not in every frame.
         self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
         if self._last is not None:
             before_left, before_right = self._last
@@ -39,21 +39,21 @@ class StereoPairing:
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 
     def fault(self, rectified: Rectified) -> str:
-        """What is wrong with the right eye's pictures; empty if nothing is."""
+        """What is wrong with the right camera, as a predicate; empty if nothing is."""
         if self._copied:
-            return "shows the left eye's own pictures"
+            return "shows the left camera's own pictures"
         if self._frozen >= _FROZEN:
-            return f"stands still in {self._frozen} frames in which the left eye's picture changes"
+            return f"is frozen in {self._frozen} frames in which the left camera's picture changes"
         if self._behind_px(rectified) > _BEHIND_PX:
-            return "sees the tool behind the tissue that it hides: the eyes are swapped"
+            return "shows the tool behind the tissue: left and right are swapped"
         return ""
 
     def _behind_px(self, rectified: Rectified) -> float:
-        """How much less disparity the tool has than the tissue around it [px]; 0: unknown."""
+        """Disparity of the surrounding tissue minus that of the tool [px]; 0: unknown."""
         if self._tool is None:
             return 0.0
         tool, *pair = self._tool
-        left, right = (rectified.picture(rgb @ image.GREY, eye) for eye, rgb in enumerate(pair))
+        left, right = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
         everywhere = np.ones(tool.shape, bool)
         found = rest.match(left, right, everywhere, everywhere, refine=False)
         inner = found.found & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)

@@ -1,9 +1,9 @@
-"""Whether the right eye's pictures are of the left eye's moments: both see one motion, at the same time.
+"""Check that the pictures of left and right camera are simultaneous: both show the same motion.
 
-Of rectified eyes the vertical motion is the same and the horizontal nearly: tissue that comes nearer by a
-millimetre changes the disparity by less than a tenth of what as much across moves either picture. So corners
-(Shi & Tomasi, CVPR 1994) are followed in each eye (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and
-the right eye's motion is held against the left eye's of other moments.
+In rectified pictures the vertical motion is equal and the horizontal motion nearly so: a millimetre towards
+the camera changes the disparity by less than a tenth of the shift from a millimetre across the view. So
+corners (Shi & Tomasi, CVPR 1994) are tracked in each camera (Lucas & Kanade, IJCAI 1981, in Bouguet's
+pyramid), and the right camera's motion is compared with the left camera's at other times.
 """
 
 from __future__ import annotations
@@ -17,80 +17,80 @@ from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo.track import StereoTracker
 
 Motion = NDArray[np.float64]
-"""(T, P, 2) px of P points since the rest frame, the first; NaN: not followed."""
+"""(T, P, 2) px of P points since the rest frame, the first; NaN: not tracked."""
 Places = NDArray[np.float32]
 
 _CORNERS, _APART_PX, _LEAST_POINTS = 200, 5, 8
 _WINDOW = (13, 13)
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
-_BACK_PX = 0.5  # from where a corner was, once it is followed forth and back
-_MOST, _STEP, _LEAST = 3.0, 0.25, 0.5  # frames of lag
-_MOVING, _MOVED_PX = 0.4, 0.3  # share of the largest motion, of the corners that tell; less says nothing
-_BETTER = 0.75  # what another moment leaves of the difference; 0.98 and more of eyes of one moment
-_LEAST_FRAMES = 4  # before it ends
+_BACK_PX = 0.5  # largest forward-backward error of a tracked corner
+_MOST, _STEP, _LEAST = 3.0, 0.25, 0.5  # lags, in frames: largest, step, smallest that counts
+_MOVING, _MOVED_PX = 0.4, 0.3  # motion of the corners used, as a share of the largest motion and at least
+_BETTER = 0.75  # largest residual of another lag over that of none; 0.98 and more if simultaneous
+_LEAST_FRAMES = 4  # from the end of the video
 
 
 class StereoTiming:
-    """Follows the tissue's corners in both eyes."""
+    """Tracks the tissue's corners in both cameras."""
 
     def __init__(self, stereo: StereoTracker, left: Rgb, right: Rgb, usable: Flags) -> None:
-        """The rest pictures (H, W, 3); `usable`: (H, W) tissue, in the left eye."""
+        """The rest pictures (H, W, 3); `usable`: (H, W) tissue in the left picture."""
         self._rectified = r = stereo.rectified
-        self._rest = [self._picture(rgb, eye) for eye, rgb in enumerate((left, right))]
+        self._rest = [self._picture(rgb, camera) for camera, rgb in enumerate((left, right))]
         mask = (r.flags(usable, 0) & stereo.rest.found).astype(np.uint8)
         corners = cv2.goodFeaturesToTrack(
             self._rest[0], _CORNERS, 0.01, _APART_PX, mask=mask, blockSize=_WINDOW[0] // 2
         )
         at = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         x, y = np.rint(at).astype(int).T
-        beside = at - np.column_stack([stereo.rest.disparity[y, x], np.zeros(len(at))])
-        self._at: list[Places] = [at, beside.astype(np.float32)]
+        in_right = at - np.column_stack([stereo.rest.disparity[y, x], np.zeros(len(at))])
+        self._at: list[Places] = [at, in_right.astype(np.float32)]
         self._last = list(self._at)
         self._moved: list[list[Places]] = [[np.zeros_like(at)] for _ in range(2)]
         self._time_s = [0.0]
 
     def add(self, left: Rgb, right: Rgb, time_s: float) -> None:
-        """The next frame's pictures (H, W, 3)."""
+        """Adds the next frame's pictures (H, W, 3)."""
         if len(self._at[0]) < _LEAST_POINTS:
             return
         how = None, None, _WINDOW, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
-        for eye, rgb in enumerate((left, right)):
-            rest, now, at = self._rest[eye], self._picture(rgb, eye), self._at[eye]
-            there, good, _ = cv2.calcOpticalFlowPyrLK(rest, now, at, self._last[eye].copy(), *how)
+        for camera, rgb in enumerate((left, right)):
+            rest, now, at = self._rest[camera], self._picture(rgb, camera), self._at[camera]
+            there, good, _ = cv2.calcOpticalFlowPyrLK(rest, now, at, self._last[camera].copy(), *how)
             back, _, _ = cv2.calcOpticalFlowPyrLK(now, rest, there, at.copy(), *how)
             known = (np.linalg.norm(back - at, axis=1) < _BACK_PX) & (good[:, 0] > 0)
-            self._last[eye] = np.where(known[:, None], there, self._last[eye]).astype(np.float32)
-            self._moved[eye].append(np.where(known[:, None], there - at, np.nan))
+            self._last[camera] = np.where(known[:, None], there, self._last[camera]).astype(np.float32)
+            self._moved[camera].append(np.where(known[:, None], there - at, np.nan))
         self._time_s.append(time_s)
 
     def fault(self) -> str:
-        """What is wrong; empty if nothing is."""
+        """What is wrong with the right camera, as a predicate; empty if nothing is."""
         lag, since = find_lag(*(np.array(moved, np.float64) for moved in self._moved))
         if not lag:
             return ""
         step_s = float(np.median(np.diff(self._time_s)))
-        after = f", from {self._time_s[since]:.3g} s on" if since > _LEAST_FRAMES else ""
+        after = f", from {self._time_s[since]:.3g} s" if since > _LEAST_FRAMES else ""
         return f"is about {abs(lag) * step_s:.2g} s {'late' if lag > 0 else 'early'}{after}"
 
-    def _picture(self, rgb: Rgb, eye: int) -> NDArray[np.uint8]:
-        """(H, W) local contrast, rectified."""
-        grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, eye), (0, 0), 1)
+    def _picture(self, rgb: Rgb, camera: int) -> NDArray[np.uint8]:
+        """Local contrast of the rectified picture, (H, W)."""
+        grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, camera), (0, 0), 1)
         return image.local_contrast(grey, _WINDOW)
 
 
 def find_lag(left: Motion, right: Motion) -> tuple[float, int]:
-    """By how many frames the right eye is late (below 0: early), and from which on; 0.0: not, or unknown."""
+    """Lag of the right camera in frames (negative: early) and its first frame; 0.0: none, or unknown."""
     frames = np.arange(len(left))
     known = np.isfinite(left + right).all(axis=2)
     length = np.linalg.norm(np.where(np.isfinite(left + right), left, 0), axis=2)
     length = np.where(known.mean(axis=0) > 0.5, np.percentile(length, 90, axis=0), 0)
     if len(frames) < 2 * _LEAST_FRAMES or not len(length):
         return 0.0, 0
-    tell = length > max(_MOVING * float(np.percentile(length, 90)), _MOVED_PX)
-    left, right = left[:, tell], right[:, tell]
+    moving = length > max(_MOVING * float(np.percentile(length, 90)), _MOVED_PX)
+    left, right = left[:, moving], right[:, moving]
 
     def apart(lag: float) -> NDArray[np.float64]:
-        """(T,) median squared distance of the eyes' motions; NaN beyond the film."""
+        """Median squared difference of the cameras' motions, (T,); NaN beyond the video."""
         at = np.maximum(frames - lag, 0)
         below = np.minimum(at.astype(int), len(frames) - 2)
         share = (at - below)[:, None, None]
@@ -109,10 +109,10 @@ def find_lag(left: Motion, right: Motion) -> tuple[float, int]:
         both = np.isfinite(now) & np.isfinite(other)
         if abs(lag) < _LEAST or both.sum() < 2 * _LEAST_FRAMES or not now[both].any():
             continue
-        kept, late = np.where(both, now, 0.0), np.where(both, other, 0.0)
-        mixed = np.cumsum(kept) - kept + np.cumsum(late[::-1])[::-1]  # late from each frame on
+        prompt, late = np.where(both, now, 0.0), np.where(both, other, 0.0)
+        mixed = np.cumsum(prompt) - prompt + np.cumsum(late[::-1])[::-1]  # if late from each frame on
         since = 1 + int(np.argmin(mixed[1:-_LEAST_FRAMES]))
-        share = float(np.sqrt(mixed[since] / kept.sum()))
+        share = float(np.sqrt(mixed[since] / prompt.sum()))
         if share < best:
             best, answer = share, (float(lag), since)
     return answer

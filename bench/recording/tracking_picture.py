@@ -1,4 +1,4 @@
-"""What is tracked in a film, drawn before anything is scored."""
+"""A picture of a recording's tracking, for `bench check`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _LEGEND = "green: tissue; magenta: masked; arrows: trusted motion"
 
 
 def draw_tracking(frames: Sequence[FrameMotion], tissue: Flags, shrink: int) -> Rgb:
-    """The rest frame, the one that moves most and three more over the film, in order: (H, W, 3).
+    """The rest frame, the frame with the largest motion and three others, in order: (H, W, 3).
 
     Args:
         frames: the rest frame first.
         tissue: (h, w) of the rest frame.
-        shrink: how many times smaller than the film's these pictures are; lengths are said in the film's.
+        shrink: factor by which the frames are smaller than the video; lengths are in the video's pixels.
     """
     trusted = [tissue & (one.confidence > LOW_CONFIDENCE) for one in frames]
     lengths = [np.linalg.norm(one.flow, axis=-1) * where for one, where in zip(frames, trusted, strict=True)]
@@ -47,8 +47,8 @@ def draw_tracking(frames: Sequence[FrameMotion], tissue: Flags, shrink: int) -> 
         flow = times * frame.flow.repeat(times, axis=0).repeat(times, axis=1)
         picture = arrows(picture, flow, moving, gain)
         time = "" if frame.time_s is None else f", {frame.time_s:.2f} s"
-        said = f"{most[k] * shrink:.1f} px at most, arrows x{gain}" if k else "rest frame"
-        said = said if frame.trusted else "could not be followed"
-        panels.append(framed(picture, f"frame {frame.index}{time}: {said}"))
+        caption = f"{most[k] * shrink:.1f} px at most, arrows x{gain}" if k else "rest frame"
+        caption = caption if frame.trusted else "tracking lost"
+        panels.append(framed(picture, f"frame {frame.index}{time}: {caption}"))
     legend = framed(np.full_like(picture, 255), _LEGEND)
     return tile([*panels, legend])

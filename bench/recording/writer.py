@@ -1,4 +1,4 @@
-"""Writing a recording's folder: the files that `bench.recording.folder` reads."""
+"""Writers of the files of a recording folder, which `bench.recording.folder` reads."""
 
 from __future__ import annotations
 
@@ -12,25 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from synth.system.checked_file import folder_of as write_whole_folder
+from synth.system import checked_file
 from synth.video.write import encode
 
 if TYPE_CHECKING:
     from synth.render.camera.camera import Camera
 
-__all__ = [
-    "write_force",
-    "write_frames",
-    "write_meta",
-    "write_pair",
-    "write_second",
-    "write_storage",
-    "write_tip",
-    "write_video",
-    "write_whole_folder",
-]
-
 Floats = NDArray[np.float64]
+write_whole_folder = checked_file.folder_of
 
 
 def write_frames(folder: Path, time_s: Floats) -> None:
@@ -45,18 +34,18 @@ def write_force(folder: Path, time_s: Floats, newtons: Floats) -> None:
 
 
 def write_tip(folder: Path, places: Floats) -> None:
-    """Writes tip.csv: times and places of the instrument's tip, (N, 4) s, mm, mm, mm."""
+    """Writes tip.csv: times and positions of the instrument's tip, (N, 4) s, mm, mm, mm."""
     _csv(folder / "tip.csv", "t_s,x_mm,y_mm,z_mm", "%.6f,%.6f,%.6f,%.6f", places)
 
 
-def write_meta(folder: Path, said: Mapping[str, object]) -> None:
+def write_meta(folder: Path, keys: Mapping[str, object]) -> None:
     """Writes meta.yaml."""
     with (folder / "meta.yaml").open("w", encoding="utf-8") as file:
-        YAML().dump(dict(said), file)
+        YAML().dump(dict(keys), file)
 
 
 def write_pair(path: Path, left: Camera, right: Camera) -> None:
-    """Writes the pair's calibration, K1, D1, K2, D2, R, T, as OpenCV's `stereoCalibrate` gives it."""
+    """Writes a stereo calibration, K1, D1, K2, D2, R, T, as OpenCV's `stereoCalibrate` returns it."""
     turn = right.rotation @ left.rotation.T
     lenses = {"K1": left.K, "D1": left.distortion, "K2": right.K, "D2": right.distortion}
     write_storage(path, {**lenses, "R": turn, "T": (right.translation - turn @ left.translation)[:, None]})
@@ -71,13 +60,13 @@ def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
 
 
 def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[NDArray[Any]]) -> None:
-    """Writes FOLDER/NNNNNN.png a picture by the number of its frame; those of no frame (-1) are left out.
+    """Writes right or depth pictures as FOLDER/NNNNNN.png by frame number, without those of no frame (-1).
 
     Args:
-        folder: `right` or `depth` of the recording; made.
+        folder: `right` or `depth` of the recording; created.
         frames: (M,).
         pictures: M of (H, W, 3) uint8, or of depth (H, W): uint16, or float32 as .npy. An odd last row or
-            column is left out, as that of the film is.
+            column is left out, as in the video.
     """
     folder.mkdir()
     for frame, picture in zip(frames, pictures, strict=True):
@@ -98,13 +87,14 @@ def write_video(
     crf: int = 12,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """H.264 MP4 with each frame at its own time, in milliseconds; odd sizes lose their last row or column.
+    """Writes H.264 MP4 with each frame at its own time, to 1 ms; an odd last row or column is left out.
 
     Args:
+        path: the file.
         pictures: (H, W, 3) uint8 each, as many as `times_s`.
         times_s: (T,) rising [s].
         crf: x264's quality, 0 is lossless (4:4:4 colour).
-        progress: told how many frames are written.
+        progress: called with the number of frames written.
     """
     options = {"crf": str(crf), "threads": "1"}
     rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))
@@ -114,7 +104,7 @@ def write_video(
             yield rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
             progress(k + 1)
 
-    # By "file:" a colon in the path is no protocol.
+    # After "file:" a colon in the path does not start a protocol.
     with av.open(f"file:{path}", "w", format="mp4") as container:
         encode(container, even(), rate, "yuv444p" if crf == 0 else "yuv420p", options, times_s=times_s)
 

@@ -1,1 +1,1 @@
-"""From a recording and methods to scores and a report."""
+"""Scoring: from a recording and methods to scores and a report."""

@@ -1,4 +1,4 @@
-"""The report's charts, each the text of an SVG element."""
+"""The report's charts, each returned as the text of an SVG element."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _WIDE, _HALF, _HIGH = 1150, 560, 300  # points
 
 
 def draw_force(result: Result, others: bool = False) -> str:
-    """Force over time: the sensor, the main method with its bands of uncertainty, thinner the `others`.
+    """Force over time: the sensor, the main method with its uncertainty, and thinner the `others`.
 
-    Lost frames are gaps, shaded. Without a known E all curves are brought to one height. The axis holds the
-    sensor, networks and lengths of flow, which are dotted; other curves may leave it. Without the others it
-    holds the main method's interval, up to twice its largest force.
+    Lost frames are shaded gaps. Without a known E all curves are scaled to comparable heights. The axis
+    covers the sensor, networks and the dotted lengths of flow; other curves may exceed it. Without the others
+    it covers the main method's interval, up to twice its largest force.
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
-    # What physics has a part in knows how unsure E is; scale is in no interval.
+    # The intervals of physics and of the fusion include the uncertainty of E; none includes that of scale.
     holds_young = method.low_mn is not None and result.main in (PHYSICS, FUSION)
     spread = 1.96 * (2 * result.scale.uncertainty if holds_young else result.relative_uncertainty)
 
@@ -51,7 +51,7 @@ def draw_force(result: Result, others: bool = False) -> str:
         networks = result.settings.get("networks", {})
         sizes = {name for name in thin if result.methods[name].gain}
         for k, (name, curve) in enumerate(thin.items()):
-            # A length of flow has its gain from what is drawn here already.
+            # The gain of a length of flow is fitted to a curve that is drawn too: dotted.
             line, colour = ":" if name in sizes else "-", _OTHERS[k % len(_OTHERS)]
             axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
         held = [curve for name, curve in thin.items() if name in sizes or name in networks]
@@ -69,11 +69,11 @@ def draw_force(result: Result, others: bool = False) -> str:
 
 
 def scale_curves(result: Result) -> tuple[Curve | None, dict[str, Curve], str]:
-    """Sizes of the sensor's and each method's force, (T,) each, and what the axis is called.
+    """Magnitudes of the sensor's and each method's force, (T,) each, and the axis label.
 
-    Forces as they stand; without a known E brought to what can be compared. With a separate press to newtons,
-    by its gain. Without, the sensor to its largest value and each method to the sensor by the one gain that
-    fits best; without a sensor each method to its own largest value.
+    Without a known E forces are scaled: by the gain of a separate press, if there is one; else the sensor by
+    its largest value and each method by its best-fitting gain to the sensor; without a sensor each method by
+    its own largest value.
     """
     sizes = {name: method.size_mn for name, method in result.methods.items()}
     if result.absolute:
@@ -106,7 +106,7 @@ def draw_components(result: Result) -> str:
 
 
 def draw_correlogram(found: Offset) -> str:
-    """Correlation of force and motion at every offset that was tried, and the one that was found best."""
+    """Correlation of force and motion at every offset that was tried, and the best offset."""
     offsets, r = np.array(found.correlogram).T
 
     def draw(figure: Figure) -> None:
@@ -119,7 +119,7 @@ def draw_correlogram(found: Offset) -> str:
 
 
 def draw_scatter(result: Result) -> str:
-    """Predicted against sensor, with the line of agreement."""
+    """Predicted against measured force, with the line of agreement."""
     x, y = _scored_pairs(result)
     top = 1.05 * max(_largest(x), _largest(y))
 
@@ -153,7 +153,7 @@ def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
 
 
 def _scored_pairs(result: Result) -> tuple[Curve, Curve]:
-    """Sensor and main method over the scored frames that both have."""
+    """Sensor and main method in the scored frames for which both have a force."""
     assert result.sensor_mn is not None
     predicted = result.methods[result.main].size_mn
     good = result.scored & np.isfinite(result.sensor_mn) & np.isfinite(predicted)
@@ -161,7 +161,7 @@ def _scored_pairs(result: Result) -> tuple[Curve, Curve]:
 
 
 def _largest(values: NDArray[np.float64]) -> float:
-    """1 where there is none above zero."""
+    """The largest value; 1 if none is above zero."""
     return float(np.nanmax(values, initial=0.0)) or 1.0
 
 

@@ -1,7 +1,7 @@
-"""A recording and methods in, a scored result out.
+"""Scoring of methods on a recording.
 
-The video is tracked and each method gives a force of every frame; the sensor is aligned with the video and
-read at the frames; each method's curve is scored against it. `report` and `result` write what comes of it.
+The video is tracked and each method estimates the force of every frame; the sensor is aligned with the video
+and interpolated at the frames; each method's curve is scored against it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from synth.recording_flow.local_flow import LocalFlow
 from synth.recording_flow.video_flow import RecordingFlowSettings
 
 Flags = NDArray[np.bool_]
-_MOVED = 0.1  # of the sensor's peak while pictures stand still: they are frozen
-_SEED = 0  # of the bootstrap: the same recording gives the same intervals
+_MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones
+_SEED = 0  # of the bootstrap, for reproducible intervals
 _NO_YOUNG = (
-    "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that no factor changes are "
-    "given, and those after the gain of a separate press if there is one"
+    "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that are independent of a "
+    "factor are reported, and those after the gain of a separate press if there is one"
 )
 
 
@@ -53,17 +53,17 @@ def evaluate_recording(
     Args:
         recording: the opened recording.
         methods: by name, in the table's order.
-        main: the one the report is about.
+        main: the method that the report is about.
         scale: the recording's scale.
         settings: of this run.
-        described: what the methods are, for the report.
-        progress: told after every frame.
-        flow: where it is computed; None: here.
+        described: properties of the methods, for the report.
+        progress: called after every frame.
+        flow: computes the flow, e.g. in another process; None: computed here.
 
     Raises:
         UserError: as `track_recording` and `force_sensor.process_force`.
     """
-    # Whoever is scored has these two to beat.
+    # The lengths of flow are the least that a method should exceed.
     methods = {main: methods[main], **flow_sizes(), **methods}
     tracked = track_recording(
         recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
@@ -85,7 +85,7 @@ def evaluate_recording(
         meta.young_kpa is not None,
     )
     if lost.any() and not first_fault(findings):
-        notes.append(f"{lost.sum()} of {len(lost)} frames could not be followed: gaps, not scored")
+        notes.append(f"tracking was lost in {lost.sum()} of {len(lost)} frames: they are not scored")
     scored: dict[str, Scored] = {}
     for name, method in methods.items():
         force = np.array(tracked.force_mn[name], np.float64)
@@ -113,7 +113,7 @@ def evaluate_recording(
         notes=tuple(notes),
         steps=sensor.steps,
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
-        followed=tracked,
+        tracked=tracked,
         turn=sensor.rotation,
         findings=worth_saying(findings),
         absolute=against.absolute,
@@ -122,16 +122,13 @@ def evaluate_recording(
 
 @dataclass(frozen=True)
 class _Reference:
-    """What every method is scored against."""
+    """The data that every method is scored against."""
 
     time_s: Curve
     sensor: AlignedSensor
-    scored: Flags
-    """(T,) whether the frame counts."""
-    press: Flags | None
-    """(T,) the frames of the calibrating press; None if there is none."""
-    absolute: bool
-    """Whether E is known."""
+    scored: Flags  # (T,) frames that are scored
+    press: Flags | None  # (T,) frames of the calibrating press; None without one
+    absolute: bool  # whether E is known
 
 
 def _against_sensor(
@@ -141,24 +138,24 @@ def _against_sensor(
     sensor: AlignedSensor,
     followed: Flags,
 ) -> list[Finding]:
-    """What the film says of the sensor, on the frames that were followed."""
+    """Findings on the sensor from the frames that were tracked (`followed`)."""
     moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
     if sensor.axes_mn is None or moved is None:
         return []
     forces = []
     if recording.meta.young_kpa is not None:
-        # What combines others is no further witness.
+        # A fusion is not an independent estimate.
         alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, FusedEstimate))]
         every = [np.array(tracked.force_mn[name]) for name in alone]
         forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]
     time_s = np.array(tracked.time_s)[followed]
-    axes = 3 if recording.has_stereo else 2  # one eye doesn't see along the view
+    axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
     return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, axes if sensor.in_camera_axes else 0)
 
 
 def _speed(tracked: TrackedRecording, lost: Flags) -> Curve:
-    """(T,) mm/s; of two frames each, so that it is unknown where either is lost."""
+    """Speed of the tissue, (T,) mm/s; NaN where this frame or the one before is lost."""
     return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
 
 
@@ -167,10 +164,10 @@ def _within(time_s: Curve, span: Span) -> Flags:
 
 
 def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
-    """(T,) whether a frame is scored: those that something was calibrated on are not."""
+    """Frames (T,) outside the spans that something is calibrated on."""
     scored = np.ones(len(time_s), bool)
     for what, span in (
-        ("calibration of the clocks", meta.sync.calibration_s),
+        ("clock calibration", meta.sync.calibration_s),
         ("sensor's rotation", meta.sensor.turn_s),
         ("press", meta.press_s),
     ):
@@ -182,9 +179,9 @@ def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
 
 
 def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[str]) -> Flags:
-    """(T,) frames that show what the one followed before them did: surely, or while the sensor moved."""
+    """Frames (T,) with the picture of the tracked frame before: identical, or frozen while force changed."""
     pairs = list(zip(tracked.frame, [-1, *tracked.frame[:-1]], strict=True))
-    # Of a doubled film whose every sixth frame is followed none is.
+    # Repeats of frames that were not tracked do not count.
     surely, maybe = (np.array([k in of and of[k] <= before for k, before in pairs]) for of in tracked.repeats)
     if sensor_mn is not None and maybe.any():
         peak = float(np.nanmax(np.abs(sensor_mn), initial=0.0))
@@ -192,15 +189,15 @@ def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[st
             if maybe[run[0]] and np.ptp(sensor_mn[max(run[0] - 1, 0) : run[-1] + 1]) > _MOVED * peak:
                 surely[run] = True
     if surely.any():
-        notes.append(f"{surely.sum()} frames show an earlier one again, frozen or doubled: not scored")
+        notes.append(f"{surely.sum()} frames show an earlier one again, frozen or repeated: not scored")
     return np.asarray(surely, bool)
 
 
 def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference) -> Gain:
-    """What makes a force of a length of flow, (T,) mm.
+    """The gain from a length of flow, (T,) mm, to force.
 
-    On the press if there is one. Else in hindsight, which flatters: a method that loses against that may
-    only lack a gain, one that follows the sensor less well lacks more. Without a sensor: the main method's.
+    Fitted on the press if there is one. Else in hindsight on the scored frames, which favours the baseline:
+    a method with a larger error may lack only a gain. Without a sensor it is fitted to the main method.
     """
     sensor = against.sensor.size_mn
     if sensor is None:
@@ -214,19 +211,19 @@ def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference)
 
 
 def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
-    """One method's force (T, 3) against the sensor; `first`: the main method, if this is another."""
-    size, sensor, kept = _magnitude(force), against.sensor.size_mn, against.scored
+    """Scores one method's force (T, 3) against the sensor; `first`: the main method, if this is another."""
+    size, sensor, used = _magnitude(force), against.sensor.size_mn, against.scored
     axes = against.sensor.axes_mn
     if sensor is None or axes is None:
         return Scored(force, size)
-    x, y = sensor[kept], size[kept]
-    scores, events = metrics.compute_all(against.time_s, sensor, size, against.sensor.noise_floor_mn, kept)
+    x, y = sensor[used], size[used]
+    scores, events = metrics.compute_all(against.time_s, sensor, size, against.sensor.noise_floor_mn, used)
     components: dict[str, dict[str, float]] = {}
     if against.sensor.in_camera_axes and np.isfinite(force).any(axis=0).all():
-        components = {axis: metrics.agreement(axes[kept, k], force[kept, k]) for k, axis in enumerate("xyz")}
+        components = {axis: metrics.agreement(axes[used, k], force[used, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = metrics.agreement_intervals(x, y, rng)
-    worse = None if first is None else metrics.difference_interval(x, first.size_mn[kept], y, rng)
+    worse = None if first is None else metrics.difference_interval(x, first.size_mn[used], y, rng)
     if not against.absolute:
         scores, events = metrics.without_newtons(scores), metrics.without_prediction(events)
         components = {axis: metrics.without_newtons(values) for axis, values in components.items()}
@@ -240,12 +237,9 @@ def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
 
 
 def _with_interval(
-    scored: Scored,
-    bounds: Sequence[tuple[float, float]],
-    lost: Flags,
-    against: _Reference,
+    scored: Scored, bounds: Sequence[tuple[float, float]], lost: Flags, against: _Reference
 ) -> Scored:
-    """The same with the intervals that the method gave of its force, and what of the sensor they hold."""
+    """Adds the method's prediction intervals, their mean width and their coverage of the sensor."""
     low, high = np.where(lost, np.nan, np.array(bounds, np.float64).T)
     known = np.isfinite(low)
     if not known.any():
@@ -264,7 +258,7 @@ def _mean(values: NDArray[Any]) -> float:
 
 
 def _magnitude(force: Curve) -> Curve:
-    """Size of each force, from the components that there are, (T,) mN."""
+    """Magnitude of each force from its finite components, (T,) mN."""
     size = np.sqrt(np.nansum(force**2, axis=1))
     size[~np.isfinite(force).any(axis=1)] = np.nan
     return np.asarray(size, np.float64)

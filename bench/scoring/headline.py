@@ -1,4 +1,4 @@
-"""What is said first of a scored recording, wherever it is said: a few numbers, or why there are none."""
+"""The headline of a scored recording, in report and terminal: a few numbers, or why there are none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
 from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 
-_NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "ghost_rate")
+_NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "false_positive_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
 _PRESSED = ("mae_mn", "mae_of_peak", "r2")
 
@@ -22,45 +22,40 @@ class Tile:
 
     name: str
     value: float
-    unit: str
-    """As `Metric.unit`."""
+    unit: str  # as `Metric.unit`
     interval: Interval | None = None
 
 
 @dataclass(frozen=True)
 class Headline:
-    """What is said first."""
+    """The most important numbers of a result."""
 
-    refused: str
-    """Why no number is said; empty where numbers are."""
+    refused: str  # why there are no numbers; empty if there are
     tiles: tuple[Tile, ...]
-    warnings: tuple[str, ...] = ()
-    """What the numbers must not be read without."""
-    of_peak: float | None = None
-    """The first tile's error over the contacts' mean peak; None where it is no error."""
-    trust: str = ""
-    """What was lost, what was unlike the training, what was assumed: one sentence."""
+    warnings: tuple[str, ...] = ()  # caveats that must be shown with the numbers
+    of_peak: float | None = None  # the first tile's error over the contacts' mean peak; None: no error
+    trust: str = ""  # one sentence on lost frames, unfamiliar motion and assumptions
 
 
 def headline(result: Result) -> Headline:
-    """The main method's scores in the order that this recording asks for.
+    """The main method's most important scores for this recording.
 
-    With a separate press those after its gain come first. Without a known E, or with the press alone, the
-    curve's shape follows: what no gain changes. Nothing of it where too many frames were lost.
+    Scores after the gain of a separate press come first. Then, without a known E, scores that no gain
+    changes. There are none if too many frames were lost.
     """
     odd = tuple(one.message for one in result.findings if one.state == "odd")
     if result.refused:
         return Headline(result.refused, (), odd)
     main = result.methods[result.main]
     if not main.scores:
-        why = "No usable force sensor: these are predictions only, nothing is scored"
+        why = "No usable force sensor: predictions only, nothing is scored"
         return Headline(why, (), odd, trust=_trust(result))
     warnings = list(odd)
     if result.left == 2:
-        warnings.append("Only two frames are scored: every curve correlates with two (see the notes)")
+        warnings.append("Only two frames are scored: correlations are meaningless (see the notes)")
     if result.sync is not None and not result.aligned:
         warnings.append(
-            f"The clocks could not be aligned ({result.sync.refused}): scored at the offset stated, "
+            f"The clocks could not be aligned ({result.sync.refused}): scored with the stated offset of "
             f"{result.settings['meta']['sync']['offset_s']:g} s"
         )
     tiles, of_peak = list[Tile](), main.scores["mae_of_peak"] if result.absolute else None
@@ -78,21 +73,21 @@ def headline(result: Result) -> Headline:
 
 
 def _trust(result: Result) -> str:
-    """Lost frames, motion unlike the network's training, and what of tissue and scale was taken as given."""
+    """One sentence on lost frames, motion unlike the network's training, and assumed tissue and scale."""
     meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
     parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
     network = MAIN if result.main == FUSION else result.main
-    asked = result.methods.get(network)  # without intervals nothing is known of what it was trained on
-    if network in result.settings.get("networks", {}) and asked is not None and asked.low_mn is not None:
+    scored = result.methods.get(network)  # without intervals its training distribution is unknown
+    if network in result.settings.get("networks", {}) and scored is not None and scored.low_mn is not None:
         unlike = any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes)
-        parts.append(f"it moves {'unlike anything' if unlike else 'as what'} the network was trained on")
-    young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E of 1 kPa, for none is known"
-    given = [young + _within(meta.get("young_uncertainty", 0.0))]
+        parts.append(f"the motion is {'unlike' if unlike else 'like'} that of the network's training data")
+    young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E = 1 kPa (unknown)"
+    assumed = [young + _within(meta.get("young_uncertainty", 0.0))]
     guessed = meta.get("scale_mm_per_px") == "unknown"
-    scale = " (a guess)" if guessed else _within(result.scale.uncertainty)
-    given.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
-    given.append(f"membrane {meta.get('membrane', 'unknown')}")
-    return "; ".join([*parts, f"taken as given: {', '.join(given)}"]) + "."
+    scale = " (unknown)" if guessed else _within(result.scale.uncertainty)
+    assumed.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
+    assumed.append(f"membrane {meta.get('membrane', 'unknown')}")
+    return "; ".join([*parts, f"assumed: {', '.join(assumed)}"]) + "."
 
 
 def _within(uncertainty: float) -> str:

@@ -1,4 +1,4 @@
-"""How well one force curve follows another. Pure functions on arrays; undefined is NaN, never 0."""
+"""Agreement of a predicted force curve with the sensor's. Undefined scores are NaN, never 0."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Curve = NDArray[np.float64]
 
 _LARGEST_LAG_S = 0.5
 _LEAST_CONTACT_MN = 1e-3
-_SHAPE_ERROR = "MAE after the one gain that fits best, over the contacts' mean peak."
+_SHAPE_ERROR = "MAE after the best-fitting gain, over the contacts' mean peak."
 
 METRICS = {
     "n": Metric("samples", "", "Samples where both are finite.", relative=True),
@@ -32,33 +32,38 @@ METRICS = {
     "r2": Metric("R²", "", "1 − SSE/SST about the sensor's mean: bias and gain count.", "high", column="R²"),
     "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", "one", column="gain"),
     "shape_error": Metric("shape error", "%", _SHAPE_ERROR, "low", 3, True, "shape err."),
-    "lag_s": Metric("lag", "ms", "How late predicted is, at the best correlation.", "zero", 3, True, "lag"),
-    "r_at_lag": Metric("r at that lag", "", "Correlation with the lag taken out.", "high", relative=True),
+    "lag_s": Metric("lag", "ms", "Delay of predicted, at the best correlation.", "zero", 3, True, "lag"),
+    "r_at_lag": Metric("r at that lag", "", "Correlation with the lag removed.", "high", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
-    "ghost_rate": Metric("false positives", "%", "Free samples with contact.", "low", column="FPR"),
-    "ghost_mn": Metric("background force", "mN", "Mean predicted force without contact.", "low", 2),
-    "threshold_mn": Metric("contact threshold", "mN", "From which the sensor says contact.", "", 2, True),
-    "events": Metric("contacts", "", "Contacts that the sensor shows.", relative=True),
+    "false_positive_rate": Metric(
+        "false positives", "%", "Contact-free samples with predicted contact.", "low", column="FPR"
+    ),
+    "background_mn": Metric("background force", "mN", "Mean predicted force without contact.", "low", 2),
+    "threshold_mn": Metric("contact threshold", "mN", "Sensor's force at contact.", "", 2, True),
+    "events": Metric("contacts", "", "Contacts in the sensor's curve.", relative=True),
     "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", "", 2, True),
     "peak_mae": Metric("peak error", "%", "Mean relative error of peaks.", "low", column="peak err."),
-    "impulse_mae": Metric("impulse error", "%", "The same of their impulses.", "low", column="impulse err."),
+    "impulse_mae": Metric(
+        "impulse error", "%", "Mean relative error of impulses.", "low", column="impulse err."
+    ),
     "dropout": Metric("dropout", "%", "Samples without a prediction.", "low", 3, True, "dropout"),
 }
-"""By key of `score.json`: the only place that says what a score is."""
+"""Definitions of the scores by their key in `score.json`."""
 
 RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
-"""Scores that a prediction of unknown stiffness has."""
+"""Scores that are defined without a known stiffness."""
 
 
 _AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "ccc": "ccc", "r2": "r2"}
-"""Fields of `learn.evaluation.metrics.Agreement`, and their keys here."""
+"""Fields of `learn.evaluation.metrics.Agreement` and their keys here."""
 
 
 def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
-    """Scores of predicted against sensor, each (T,) mN, over all samples where both are finite.
+    """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2 and gain over samples where both are finite.
 
-    Returns:
-        n, mae_mn, rmse_mn, bias_mn, r, ccc, r2, gain (least-squares slope of predicted on sensor).
+    Args:
+        sensor: (T,) mN.
+        predicted: (T,) mN.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
@@ -68,10 +73,10 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
 
 
 def agreement_intervals(sensor: Curve, predicted: Curve, rng: np.random.Generator) -> dict[str, Interval]:
-    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2, samples being resampled in blocks.
+    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2 by a block bootstrap of the samples.
 
-    The block is the longest that the sensor, the prediction or their difference ask for. Arguments as of
-    `agreement`; none of fewer than eight samples.
+    The block length is the largest of those of the sensor, the prediction and their difference. Arguments as
+    in `agreement`; empty for fewer than eight samples.
     """
     good = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[good], predicted[good]
@@ -84,7 +89,7 @@ def agreement_intervals(sensor: Curve, predicted: Curve, rng: np.random.Generato
 
 
 def difference_interval(sensor: Curve, first: Curve, second: Curve, rng: np.random.Generator) -> Interval:
-    """Interval of MAE(first) − MAE(second), paired: both are resampled alike."""
+    """Interval of MAE(first) − MAE(second), paired: the same samples are drawn for both."""
     gap = np.abs(first - sensor) - np.abs(second - sensor)
     gap = gap[np.isfinite(gap)]
     if len(gap) < bootstrap.LEAST_SAMPLES:
@@ -94,24 +99,21 @@ def difference_interval(sensor: Curve, first: Curve, second: Curve, rng: np.rand
 
 
 def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:
-    """The factor that best brings `predicted` to `sensor` over the samples of a calibrating press."""
+    """The least-squares factor from `predicted` to `sensor` over the samples `where`."""
     good = where & np.isfinite(sensor) & np.isfinite(predicted)
     return ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
 
 
 def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
-    """By how much `predicted` runs behind `sensor`, and the correlation with that taken out.
+    """The lag of `predicted` behind `sensor`, lag_s [s], and the correlation with it removed, r_at_lag.
 
-    Only reported: scores are at lag 0. Found on a uniform grid of a quarter of the median frame time, within
-    half a second either way.
+    It is only reported: scores are at lag 0. It is found on a uniform grid with a step of a quarter of the
+    median frame time, within half a second in both directions.
 
     Args:
         time_s: (T,) rising [s].
         sensor: (T,) mN.
         predicted: (T,) mN.
-
-    Returns:
-        lag_s (positive: predicted is late), r_at_lag.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
@@ -125,7 +127,7 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     if inner.sum() < 8:
         return nothing
     shifted = [np.interp(t[inner] + shift, t, y) for shift in lags]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a curve that stands still correlates with nothing
+    with np.errstate(divide="ignore", invalid="ignore"):  # constant curves
         r = np.corrcoef([x[inner], *shifted])[0, 1:]
     if not np.isfinite(r).any():
         return nothing
@@ -134,16 +136,13 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
 
 
 def contact_threshold(sensor: Curve, noise_floor_mn: float) -> float:
-    """Force above which the sensor says contact [mN]: 3 times its noise floor, at least 5% of its peak.
-
-    Never zero: a sensor that reads nothing says that there is no contact.
-    """
+    """The sensor's force at contact [mN]: 3 times its noise floor, at least 5% of its peak, never 0."""
     peak = float(np.nanmax(sensor, initial=0.0))
     return max(3 * noise_floor_mn, 0.05 * peak, _LEAST_CONTACT_MN)
 
 
 def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
-    """(T,) whether the curve is in contact: entered at the threshold, left at half of it (hysteresis)."""
+    """Contact (T,) with hysteresis: it starts at the threshold and ends at half of it."""
     state, out = False, np.zeros(len(curve), bool)
     for k, value in enumerate(curve):
         if np.isfinite(value):
@@ -153,7 +152,7 @@ def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
 
 
 def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[slice]:
-    """Contacts of at least `shortest_s` (a sample lasts a median step); shorter gaps are closed first."""
+    """Contacts of at least `shortest_s`, after closing shorter gaps; a sample lasts a median step."""
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
     first, last = edges[::2], edges[1::2] - 1
@@ -164,17 +163,17 @@ def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) 
 
 
 def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[slice]) -> list[dict[str, float]]:
-    """One row a contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
+    """A row per contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
 
-    Times, peak and impulse are the sensor's alone. Errors are over the samples that have a prediction, and
-    NaN where fewer than two have.
+    Times, peak and impulse are those of the sensor. Errors are over the samples with a prediction, and NaN
+    for fewer than two.
     """
     rows = []
     for part in spans:
-        felt = np.isfinite(sensor[part])
-        if felt.sum() < 2:
+        known = np.isfinite(sensor[part])
+        if known.sum() < 2:
             continue
-        t, x, y = time_s[part][felt], sensor[part][felt], predicted[part][felt]
+        t, x, y = time_s[part][known], sensor[part][known], predicted[part][known]
         rows.append(
             {
                 "from_s": float(t[0]),
@@ -188,11 +187,11 @@ def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[slice]
 
 
 def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
-    """What a contact's prediction `y` makes of the sensor's `x` where there is one."""
-    said = np.isfinite(y)
-    if said.sum() < 2:
+    """Errors of a contact's predicted force `y` against the sensor's `x`, both in mN."""
+    known = np.isfinite(y)
+    if known.sum() < 2:
         return dict.fromkeys(("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"), math.nan)
-    t, x, y = t[said], x[said], y[said]
+    t, x, y = t[known], x[known], y[known]
     peak, impulse = float(x.max()), float(np.trapezoid(x, t))
     return {
         "predicted_peak_mn": float(y.max()),
@@ -203,19 +202,19 @@ def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
 
 
 def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict[str, float]:
-    """How well contact is told from none.
+    """Scores of contact detection.
 
     Returns:
-        contact_f1; ghost_rate, the false-positive rate: share of contact-free samples where contact is
-        predicted; ghost_mn, the background force: mean predicted force there.
+        contact_f1; false_positive_rate: share of contact-free samples where contact is predicted;
+        background_mn: mean predicted force in contact-free samples.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
     free, background = ~truth, np.abs(predicted[both][~truth])
     return {
         "contact_f1": float(f1_score(truth, found)) if (truth | found).any() else math.nan,
-        "ghost_rate": float(found[free].mean()) if free.any() else math.nan,
-        "ghost_mn": float(background.mean()) if free.any() else math.nan,
+        "false_positive_rate": float(found[free].mean()) if free.any() else math.nan,
+        "background_mn": float(background.mean()) if free.any() else math.nan,
     }
 
 
@@ -224,24 +223,24 @@ def compute_all(
     sensor: Curve,
     predicted: Curve,
     noise_floor_mn: float = 0.0,
-    kept: NDArray[np.bool_] | None = None,
+    used: NDArray[np.bool_] | None = None,
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
-    """All scores of one predicted curve against one sensor's, and the table of its contacts.
+    """All scores of a predicted curve against a sensor's, and the table of its contacts.
 
     Args:
         time_s: (T,) rising [s].
-        sensor: (T,) mN, NaN where there is none.
-        predicted: (T,) mN, NaN where there is none.
+        sensor: (T,) mN, NaN where unknown.
+        predicted: (T,) mN, NaN where unknown.
         noise_floor_mn: standard deviation of the sensor without contact [mN].
-        kept: (T,) which samples count; None: all. A contact ends where samples are left out.
+        used: (T,) samples that are scored; None: all. A contact ends at samples that are not.
     """
-    kept = np.ones(len(time_s), bool) if kept is None else kept
-    sensor, predicted = np.where(kept, sensor, np.nan), np.where(kept, predicted, np.nan)
+    used = np.ones(len(time_s), bool) if used is None else used
+    sensor, predicted = np.where(used, sensor, np.nan), np.where(used, predicted, np.nan)
     threshold = contact_threshold(sensor, noise_floor_mn)
-    rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold) & kept))
+    rows = per_event(time_s, sensor, predicted, events(time_s, in_contact(sensor, threshold) & used))
     scores = agreement(sensor, predicted)
     peak = _mean_size(rows, "peak_mn")
-    # After the one best gain, known in hindsight, what is left is the error of the curve's shape.
+    # The error after the best gain, known only in hindsight, is that of the curve's shape.
     best = gain(sensor, predicted, np.isfinite(sensor)) * predicted
     scores["shape_error"] = ratio(agreement(sensor, best)["mae_mn"], peak)
     scores |= lag(time_s, sensor, predicted)
@@ -253,34 +252,31 @@ def compute_all(
         "mae_of_peak": ratio(scores["mae_mn"], peak),
         "peak_mae": _mean_size(rows, "peak_error"),
         "impulse_mae": _mean_size(rows, "impulse_error"),
-        "dropout": float(np.mean(~np.isfinite(predicted[kept]))) if kept.any() else math.nan,
+        "dropout": float(np.mean(~np.isfinite(predicted[used]))) if used.any() else math.nan,
     }
     return scores, rows
 
 
 def without_newtons(scores: dict[str, float]) -> dict[str, float]:
-    """The scores with those that need forces in newtons made NaN: for predictions of unknown stiffness."""
+    """The scores with those that require newtons set to NaN, for predictions of unknown stiffness."""
     return {key: value if key in RELATIVE else math.nan for key, value in scores.items()}
 
 
 def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
-    """Contacts as the sensor alone has them: what needs predicted newtons made NaN."""
+    """The contacts with all values that require predicted newtons set to NaN."""
     own = ("from_s", "to_s", "peak_mn", "impulse_mns")
     return [{key: value if key in own else math.nan for key, value in row.items()} for row in rows]
 
 
 def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
-    """Bias and 95% limits of agreement when samples come in groups that share their error.
+    """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, for samples in groups of correlated error.
 
     Bland and Altman, "Agreement between methods of measurement with multiple observations per individual"
     (J. Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
 
     Args:
         difference: (T,) predicted minus sensor [mN]; NaN are left out.
-        group: (T,) which contact, or span between contacts, a sample belongs to.
-
-    Returns:
-        bias_mn, low_mn, high_mn.
+        group: (T,) index of the contact, or span between contacts, of each sample.
     """
     good = np.isfinite(difference)
     d, names = difference[good], np.unique(group[good], return_inverse=True)[1]

@@ -1,7 +1,7 @@
-"""Several scored recordings as one answer: means over recordings, intervals over specimens.
+"""Pooled scores of several recordings: means over recordings, intervals over specimens.
 
-A method is what its hash says: networks of one name and different weights are different methods, and networks
-of the same weights one, whatever they were called.
+Networks are identified by their weights' hash: networks with one name and different weights are different
+methods, and networks with the same weights are one method, whatever their names.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from synth.system.checked_file import write_whole
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SHOWN = ("mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "contact_f1", "ghost_rate", "peak_mae")
-"""Of the scores, what the page has."""
+_SHOWN = (
+    "mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "contact_f1", "false_positive_rate", "peak_mae",
+)  # fmt: skip
 SCORES = (*_SHOWN, "bias_mn", "impulse_mae", "dropout")
 _CALIBRATED = {
     "mae_of_peak": f"{METRICS['mae_of_peak'].heading}, gain set",
@@ -36,17 +37,17 @@ _CALIBRATED = {
 
 
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """The score.json of each path (a file, or a folder of `bench score`), in the order given.
+    """The score.json of each path (a file, or a folder of `bench score`), in their order.
 
     Raises:
-        UserError: none given, one that is no score, recordings twice, or main methods that differ.
+        UserError: no path, a file of another kind, a recording twice, or main methods that differ.
     """
     found = []
     for path in paths:
         try:
             tree = checked_file.read_json(path / "score.json" if path.is_dir() else path)
         except UserError as error:
-            raise UserError(f"{path}: holds no readable score.json ({error})") from None
+            raise UserError(f"{path}: no readable score.json ({error})") from None
         if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
         found.append(tree)
@@ -57,19 +58,18 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
         raise UserError(f"recording {min(twice)} is given twice")
     if all(_fault(tree) for tree in found):
         why = "; ".join(f"{tree['recording']}: {_fault(tree)}" for tree in found)
-        raise UserError(f"no recording that can be pooled ({why})")
+        raise UserError(f"no recording can be pooled ({why})")
     mains = {_identity(tree, tree["main"]): f"{tree['main']} of {tree['recording']}" for tree in found}
     if len(mains) > 1:
-        raise UserError(
-            f"the scores are of different main methods ({', '.join(mains.values())}): pool those of one"
-        )
+        differ = ", ".join(mains.values())
+        raise UserError(f"the main methods differ ({differ}): pool scores of one main method")
     return found
 
 
 def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Means over recordings with 95% intervals, specimens resampled; methods that all have.
+    """Means over recordings with 95% intervals over specimens, for methods that all recordings have.
 
-    Recordings that were not scored (no sensor, clocks not aligned, too much lost) are left out and named.
+    Recordings that were not scored (no sensor, clocks not aligned, too many lost frames) are left out.
     """
     every, found = found, [tree for tree in found if not _fault(tree)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
@@ -109,7 +109,7 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _identity(tree: dict[str, Any], name: str) -> str:
-    """What tells a method from others: of a network its hash, of a plug-in its version too, else the name."""
+    """A method's identity: a network's hash, a plug-in's name and version, else the name."""
     about = tree["settings"]
     if network := about.get("networks", {}).get(name):
         return str(network["hash"])
@@ -117,7 +117,7 @@ def _identity(tree: dict[str, Any], name: str) -> str:
 
 
 def _fault(tree: dict[str, Any]) -> str:
-    """Why a recording is left out, as its own report gives no number; empty if it isn't."""
+    """Why a recording is left out, as its own report has no numbers; empty if it is not."""
     if tree.get("fault"):
         return f"nothing can be measured: {tree['fault']}"
     lost = tree.get("lost") or {}
@@ -130,7 +130,7 @@ def _fault(tree: dict[str, Any]) -> str:
 
 
 def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
-    """One recording's main scores and how its clocks were aligned."""
+    """One recording's main scores and the alignment of its clocks."""
     found = tree.get("sync") or {}
     return {
         "recording": tree["recording"],
@@ -143,7 +143,7 @@ def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
-    """Mean of the finite values and its interval; None for what is undefined, or of too few specimens."""
+    """Mean of the finite values and its interval; None if undefined or from too few specimens."""
     found = over_groups(values, specimens, np.random.default_rng(0))
     ends = {name: getattr(found, name) for name in ("mean", "low", "high")}
     plain = {name: value if math.isfinite(value) else None for name, value in ends.items()}
@@ -155,7 +155,7 @@ def _number(value: float | None) -> float:
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
-    """pool.json, README.md and chart.svg in the folder `out`."""
+    """Writes pool.json, README.md and chart.svg into the folder `out`."""
     tree = tree | {"command": command}
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n", durable=False)
@@ -164,7 +164,7 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
 
 
 def page(tree: Mapping[str, Any]) -> str:
-    """Markdown; methods that beat the main one are marked."""
+    """The page in Markdown; methods with a smaller error than the main one are marked."""
     methods, count = tree["methods"], f"{len(tree['recordings'])} recordings"
     own = methods[tree["main"]]["scores"]
     rows = []
@@ -182,10 +182,10 @@ def page(tree: Mapping[str, Any]) -> str:
     parts = [
         f"# {count}, {tree['specimens']} specimens, {tree['frames']} frames",
         f"    {tree['command']}",
-        "Means over recordings; in brackets 95% intervals, specimens resampled."
+        "Means over recordings; in brackets 95% intervals over specimens."
         if tree["specimens"] >= LEAST_GROUPS
-        else f"Means over recordings, without intervals: those need {LEAST_GROUPS} specimens at least.",
-        *(f"{name}  is left out: not every recording was scored by the same." for name in tree["of_some"]),
+        else f"Means over recordings, without intervals: those need at least {LEAST_GROUPS} specimens.",
+        *(f"{name} is left out: not all recordings were scored with it." for name in tree["of_some"]),
         *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
         f"![{count}](chart.svg)",
         _table(rows),
@@ -196,13 +196,13 @@ def page(tree: Mapping[str, Any]) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Rows of the same columns in Markdown."""
+    """A Markdown table of rows with the same columns."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *([*row.values()] for row in rows)]
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 
 
 def _row(one: Mapping[str, Any]) -> dict[str, str]:
-    """One recording for the table."""
+    """One recording's row of the table."""
     offset = "–"
     if one["offset_s"] is not None:
         offset = f"{1e3 * one['offset_s']:.0f} ± {1e3 * _number(one['offset_deviation_s']):.0f}"
@@ -210,7 +210,7 @@ def _row(one: Mapping[str, Any]) -> dict[str, str]:
         "recording": one["recording"],
         "frames": str(one["frames"]),
         "event peak [mN]": f"{_number(one['event_peak_mn']):.2f}",
-        "MAE of it": f"{_number(one['mae_of_peak']):.1%}",
+        "MAE of peak": f"{_number(one['mae_of_peak']):.1%}",
         "r": f"{_number(one['r']):.3f}",
         "clocks' offset [ms]": offset,
     } | ({"lost": f"{one['lost']:.0%}"} if one.get("lost") is not None else {})
@@ -226,7 +226,7 @@ def _text(value: Mapping[str, float | None], digits: int) -> str:
 
 
 def chart(tree: Mapping[str, Any]) -> str:
-    """SVG of every method's mean error and its interval."""
+    """The SVG chart of every method's mean error and its interval."""
     errors = {name: found["scores"]["mae_of_peak"] for name, found in tree["methods"].items()}
     at = np.arange(len(errors))
     colours = ["#1f6feb" if name == tree["main"] else "#c2352b" for name in errors]

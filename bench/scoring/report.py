@@ -1,4 +1,4 @@
-"""`report.html`: one page that stands alone, from a result."""
+"""`report.html`: a self-contained page of a result; and the table for the terminal."""
 
 from __future__ import annotations
 
@@ -28,24 +28,23 @@ from synth.publish import picture
 _PEAKS, _WORST = 4, 2
 
 _COLUMNS = {key: metric for key, metric in METRICS.items() if metric.column}
-_NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "ghost_rate")
-"""What a terminal's eighty columns hold, and the report's first table."""
+_NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "false_positive_rate")
+"""Columns that fit into the 80 of a terminal, and those of the report's first table."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One moment: frame, flow, force map, as data URIs."""
+    """A selected frame: picture, flow, force map and motion in depth, as data URIs."""
 
     caption: str
     frame: str
     flow: str
     force: str | None
     depth: str | None = None
-    """Motion along the view."""
 
 
 def render_report(result: Result, title: str = "") -> str:
-    """The page as text; `title`: its heading, the recording's name if empty."""
+    """The page as text; `title`: its heading, by default with the recording's name."""
     environment = Environment(
         loader=PackageLoader("bench.scoring", "."),
         autoescape=select_autoescape(default_for_string=True, default=True),
@@ -64,9 +63,9 @@ def render_report(result: Result, title: str = "") -> str:
     if result.sync is not None and result.sync.correlogram:
         figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
-    columns, lower = _columns(result), beaten_by(result)
-    flattered = [n for n in lower if (gain := result.methods[n].gain) and gain.source == "hindsight"]
-    better = [n for n in lower if n not in flattered]
+    columns, lower = _columns(result), methods_with_lower_error(result)
+    in_hindsight = [n for n in lower if (gain := result.methods[n].gain) and gain.source == "hindsight"]
+    better = [n for n in lower if n not in in_hindsight]
     return environment.get_template("report.html.jinja").render(
         title=title or f"Force from video: {result.recording}",
         result=result,
@@ -75,16 +74,16 @@ def render_report(result: Result, title: str = "") -> str:
         more={key: metric for key, metric in columns.items() if key not in _NARROW},
         headline=headline(result),
         best=_best(result),
-        beaten_by=better,
-        flattered=flattered,
+        better=better,
+        in_hindsight=in_hindsight,
         origin=result.settings.get("networks", {}).get(result.main, {}).get("origin", ""),
         surely=[n for n in better if (w := result.methods[n].worse_by_mn) and w[0] > 0],
         figures=figures,
-        depth_mm=_largest_depth(result.followed),
+        depth_mm=_largest_depth(result.tracked),
         panels=panels,
         flow_px=flow_px,
-        masks=None if (masked := picture_masks(result.followed)) is None else _jpeg(masked),
-        masked=result.followed.summary.describe(),
+        masks=None if (masked := picture_masks(result.tracked)) is None else _jpeg(masked),
+        masked=result.tracked.summary.describe(),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
         cost=_cost(result),
@@ -93,7 +92,7 @@ def render_report(result: Result, title: str = "") -> str:
 
 def terminal_table(result: Result) -> Table:
     """The methods' scores for a terminal."""
-    # Eighty columns: a name may take two lines, a number never.
+    # In 80 columns a name may take two lines, a number only one.
     title = escape(result.recording)
     tight = (0, 1, 0, 0)
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=tight, pad_edge=False)
@@ -113,7 +112,7 @@ def terminal_table(result: Result) -> Table:
 
 
 def _columns(result: Result) -> dict[str, Metric]:
-    """The table's columns: those in which some method has a number."""
+    """The columns in which at least one method has a number."""
     every = [method.scores for method in result.methods.values()]
     return {
         key: metric
@@ -123,18 +122,18 @@ def _columns(result: Result) -> dict[str, Metric]:
 
 
 def limits_of_agreement(result: Result) -> dict[str, float]:
-    """Bias and limits of agreement over the scored frames, contacts being the repeats."""
+    """Bias and limits of agreement over the scored frames, grouped by contact."""
     assert result.sensor_mn is not None
-    kept, predicted = result.scored, result.methods[result.main].size_mn
-    threshold = metrics.contact_threshold(result.sensor_mn[kept], result.noise_floor_mn)
+    scored, predicted = result.scored, result.methods[result.main].size_mn
+    threshold = metrics.contact_threshold(result.sensor_mn[scored], result.noise_floor_mn)
     contact = metrics.in_contact(result.sensor_mn, threshold)
-    # What is left out also ends a repeat: contact before a calibrating press is not contact after it.
-    state = np.where(kept, contact, -1)
+    # A span that is not scored also ends a group: contact before and after it are different contacts.
+    state = np.where(scored, contact, -1)
     run = np.cumsum(np.diff(state, prepend=state[:1]) != 0)
-    return metrics.limits_of_agreement((predicted - result.sensor_mn)[kept], run[kept])
+    return metrics.limits_of_agreement((predicted - result.sensor_mn)[scored], run[scored])
 
 
-def beaten_by(result: Result) -> list[str]:
+def methods_with_lower_error(result: Result) -> list[str]:
     """Names of the other methods whose MAE is lower than the main one's."""
     own = result.methods[result.main].scores.get("mae_mn", math.nan)
     return [
@@ -145,7 +144,7 @@ def beaten_by(result: Result) -> list[str]:
 
 
 def shown(value: float | None, unit: str = "") -> str:
-    """A number for a person: three figures, percent and milliseconds converted, a dash for none."""
+    """Formats a number: three significant figures, percent and milliseconds converted, a dash for none."""
     if value is None or not math.isfinite(value):
         return "–"
     if unit == "%":
@@ -158,9 +157,9 @@ def shown(value: float | None, unit: str = "") -> str:
 
 
 def pictures(result: Result) -> tuple[list[Panel], float, float]:
-    """The moments shown, and the flow [px of the picture shown] and density [kPa] at full colour."""
-    chosen = moments(result)
-    done = result.followed
+    """The selected frames, and the flow [px of the panel] and density [kPa] at full colour."""
+    chosen = select_frames(result)
+    done = result.tracked
     if not chosen or done.rest is None or done.tissue is None:
         return [], 0.0, 0.0
     lengths = [np.linalg.norm(snap.flow, axis=-1)[done.tissue] for _, snap in chosen]
@@ -173,36 +172,35 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
     for caption, snap in chosen:
         moved = picture.overlay(grey, picture.flow_colours(snap.flow, flow_px), 0.65 * tissue)
         moved = picture.arrows(moved, snap.flow, done.tissue, 1.0)
-        pushed = None
+        force_map = depth = None
         if snap.density is not None:
             weight = tissue * np.clip(0.15 + snap.density / max(force_kpa, 1e-12), 0, 0.9)
             dark = (0.6 * grey).astype(np.uint8)
-            pushed = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
-        sunk = None
+            force_map = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
         if snap.depth is not None:
-            sunk = _jpeg(_depth_colours(grey, snap.depth, _largest_depth(done), tissue))
-        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), pushed, sunk))
+            depth = _jpeg(_depth_colours(grey, snap.depth, _largest_depth(done), tissue))
+        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), force_map, depth))
     return panels, flow_px, force_kpa
 
 
 def _largest_depth(done: TrackedRecording) -> float:
-    """Motion along the view [mm] at full colour; 0 without a second eye."""
-    seen = [np.abs(snap.depth) for snap in done.snapshots if snap.depth is not None]
-    return max(float(np.percentile(np.stack(seen), 99.8)), 1e-3) if seen else 0.0
+    """Motion in depth [mm] at full colour; 0 without a right or depth camera."""
+    depths = [np.abs(snap.depth) for snap in done.snapshots if snap.depth is not None]
+    return max(float(np.percentile(np.stack(depths), 99.8)), 1e-3) if depths else 0.0
 
 
 def _depth_colours(
     grey: NDArray[np.uint8], depth: NDArray[np.float32], largest: float, tissue: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """Blue where the tissue went away from the camera, red where it came nearer, (h, w, 3)."""
+    """Motion in depth, (h, w, 3): blue away from the camera, red towards it."""
     share = np.clip(depth / largest, -1, 1)[..., None]
     colours = np.where(share > 0, np.array([31, 111, 235]), np.array([194, 53, 43])).astype(np.uint8)
     return picture.overlay(grey, colours, 0.85 * np.abs(share[..., 0]) * tissue)
 
 
-def moments(result: Result) -> list[tuple[str, Snapshot]]:
-    """The snapshots nearest the largest forces of separate contacts, and the ones with the largest errors."""
-    snaps = [snap for snap in result.followed.snapshots if not result.lost[snap.position]]
+def select_frames(result: Result) -> list[tuple[str, Snapshot]]:
+    """The snapshots nearest the largest forces of separate contacts, and those with the largest errors."""
+    snaps = [snap for snap in result.tracked.snapshots if not result.lost[snap.position]]
     if not snaps:
         return []
     at = np.array([snap.position for snap in snaps])
@@ -227,11 +225,11 @@ def moments(result: Result) -> list[tuple[str, Snapshot]]:
 
 def _caption(result: Result, snap: Snapshot) -> str:
     k = snap.position
-    said = shown(float(result.methods[result.main].size_mn[k]))
-    words = f"{result.time_s[k]:.2f} s, predicted {said} {'mN' if result.absolute else 'mN a kPa'}"
+    predicted = shown(float(result.methods[result.main].size_mn[k]))
+    caption = f"{result.time_s[k]:.2f} s, predicted {predicted} {'mN' if result.absolute else 'mN per kPa'}"
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
-        words += f", sensor {shown(float(result.sensor_mn[k]))} mN"
-    return words
+        caption += f", sensor {shown(float(result.sensor_mn[k]))} mN"
+    return caption
 
 
 _DISTANCE: dict[str, Callable[[float], float]] = {
@@ -240,11 +238,11 @@ _DISTANCE: dict[str, Callable[[float], float]] = {
     "zero": abs,
     "one": lambda value: abs(value - 1),
 }
-"""What the best value has least of."""
+"""Functions that are smallest at the best value, by `Metric.best`."""
 
 
 def _best(result: Result) -> dict[str, float]:
-    """The best value in each column of the table, to be set in bold."""
+    """The best value of each column, for bold type."""
     best = {}
     for key, metric in _COLUMNS.items():
         found = [method.scores.get(key, math.nan) for method in result.methods.values()]
@@ -255,11 +253,11 @@ def _best(result: Result) -> dict[str, float]:
 
 
 def _cost(result: Result) -> list[tuple[str, str, str]]:
-    """Stage, CPU milliseconds a frame, share of real time."""
+    """Stage, CPU milliseconds per frame, share of real time."""
     frames = max(len(result.time_s), 1)
     duration = float(result.time_s[-1] - result.time_s[0]) if len(result.time_s) > 1 else math.nan
     rows = []
-    for stage, spent in result.followed.timings.items():
+    for stage, spent in result.tracked.timings.items():
         if isinstance(spent, dict):
             rows.append((stage, f"{1000 * spent['cpu_s'] / frames:.1f}", f"{spent['wall_s'] / duration:.2f}"))
     return rows

@@ -24,52 +24,44 @@ _METHOD_KEYS = (
     "interval", "scores", "intervals", "calibrated", "worse_by_mn", "gain", "components", "events",
 )  # fmt: skip
 MOST_LOST = 0.2
-"""Share of lost frames above which no number stands for a recording: the rest are the easy ones."""
+"""Share of lost frames from which a recording has no scores: the remaining frames are the easy ones."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """The one factor that makes a force of a length of flow."""
+    """The factor between a length of flow and force."""
 
-    mn_per_mm: float
-    """NaN where nothing determines it."""
+    mn_per_mm: float  # NaN if it can't be determined
     source: str
-    """`press`: the separate one. `hindsight`: the scored frames themselves, the best there is. Without a
-    sensor the name of the method whose curve it was brought to."""
+    """`press`: fitted on the separate press; `hindsight`: on the scored frames, the best gain possible.
+    Without a sensor the name of the method whose curve it is fitted to."""
 
 
 @dataclass(frozen=True)
 class Scored:
     """One method on one recording."""
 
-    force_mn: Curve
-    """(T, 3) camera axes [mN]."""
-    size_mn: Curve
-    """(T,) magnitude [mN]."""
-    scores: dict[str, float] = field(default_factory=dict)
-    """Empty without a sensor."""
+    force_mn: Curve  # (T, 3) camera axes [mN]
+    size_mn: Curve  # (T,) magnitude [mN]
+    scores: dict[str, float] = field(default_factory=dict)  # empty without a sensor
     components: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Agreement by camera axis, when the sensor's axes are the camera's."""
+    """Agreement by camera axis, if the sensor's axes are the camera's."""
     events: list[dict[str, float]] = field(default_factory=list)
-    intervals: dict[str, Interval] = field(default_factory=dict)
-    """95% intervals of some scores, frames being resampled in blocks."""
+    intervals: dict[str, Interval] = field(default_factory=dict)  # 95%, by a block bootstrap over frames
     calibrated: dict[str, float] = field(default_factory=dict)
-    """Scores after one gain found on the separate press, and that gain; empty without a press."""
+    """Scores after the gain found on the separate press, and that gain; empty without a press."""
     worse_by_mn: Interval | None = None
     """Interval of the main method's MAE minus this one's, paired; None for the main method."""
-    gain: Gain | None = None
-    """Of a baseline that has no newtons of its own; None for all others."""
-    low_mn: Curve | None = None
-    """(T,) lower end of the 90% interval of the size [mN]; None of a method that knows none."""
-    high_mn: Curve | None = None
-    """(T,) upper end."""
+    gain: Gain | None = None  # of a length of flow; None for force estimators
+    low_mn: Curve | None = None  # (T,) lower end of the 90% prediction interval [mN]; None: no intervals
+    high_mn: Curve | None = None  # (T,) upper end
     interval: dict[str, float] = field(default_factory=dict)
-    """What that interval came to: `level`, mean `width_mn` and, where the sensor says, `coverage`."""
+    """`level`, mean `width_mn` and, with a sensor and a known E, `coverage` of those intervals."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One run."""
+    """The result of scoring a recording."""
 
     recording: str
     main: str
@@ -82,20 +74,21 @@ class Result:
     methods: dict[str, Scored]
     scale: PixelScale
     relative_uncertainty: float
-    """One standard deviation of every force, from scale (whose square force goes with) and stiffness."""
+    """Relative standard deviation of every force from scale (force is proportional to its square) and E."""
     noise_floor_mn: float
     scored: NDArray[np.bool_]
-    """(T,) whether the frame counts: calibration spans don't."""
+    """(T,) whether the frame is scored: not in calibration spans."""
     lost: NDArray[np.bool_]
-    """(T,) whether the frame could not be followed: no method has an answer there."""
+    """(T,) whether tracking was lost: no method has an estimate there."""
     sync: Offset | None
-    """What the search for the clocks' offset found; None if they weren't searched."""
+    """The search for the clocks' offset; None if there was none."""
     notes: tuple[str, ...]
     steps: tuple[str, ...]
+    """Processing steps of the sensor."""
     settings: dict[str, Any]
-    followed: TrackedRecording
+    tracked: TrackedRecording
     turn: SensorRotation | None = None
-    """The sensor's rotation as found on `sensor.turn_s`; None if it was stated, or nobody asked."""
+    """The sensor's rotation found on `sensor.turn_s`; None without that span."""
     findings: tuple[Finding, ...] = ()
     """What is wrong or odd, the worst first."""
     absolute: bool = True
@@ -104,30 +97,31 @@ class Result:
 
     @property
     def fault(self) -> str:
-        """Why no number stands; empty if one may."""
+        """Why the recording can't be measured; empty if it can."""
         return first_fault(self.findings)
 
     @property
     def refused(self) -> str:
-        """Why no number of it may be said; empty where numbers may. Without a sensor there is none either."""
+        """Why the result has no numbers; empty if it has, or if it only lacks a sensor."""
         if self.fault:
             return f"Nothing can be measured: {self.fault}"
         if self.lost.any() and self.lost_share > MOST_LOST:
-            share = f"{100 * self.lost_share:.0f}%"
-            return f"{share} of the frames to be scored were lost: no number stands for this recording"
+            return (
+                f"{100 * self.lost_share:.0f}% of the frames to be scored were lost: no scores are reported"
+            )
         left = self.left
         return "" if left is None or left > 1 else f"{left} frames are left to be scored (see the notes)"
 
     @property
     def left(self) -> int | None:
-        """Frames that are scored; None without a sensor."""
-        return (
-            None if self.sensor_mn is None else int((self.scored & ~self.lost & (self.sensor_mn >= 0)).sum())
-        )
+        """Number of frames that are scored; None without a sensor."""
+        if self.sensor_mn is None:
+            return None
+        return int((self.scored & ~self.lost & (self.sensor_mn >= 0)).sum())
 
     @property
     def aligned(self) -> bool:
-        """Whether the clocks are as stated, or were found; not where the search had to be refused."""
+        """Whether the clocks' offset is as stated, or was found."""
         return self.sync is None or not self.sync.refused
 
     @property
@@ -138,7 +132,7 @@ class Result:
 
 def as_json(result: Result) -> dict[str, Any]:
     """The result as JSON-ready values; undefined numbers are null."""
-    done, methods = result.followed, result.methods
+    done, methods = result.tracked, result.methods
     ends = {
         end: {name: getattr(method, end) for name, method in methods.items() if method.interval}
         for end in ("low_mn", "high_mn")
@@ -189,7 +183,7 @@ def as_json(result: Result) -> dict[str, Any]:
 
 
 def _environment() -> dict[str, str]:
-    """What the numbers were made with."""
+    """System and versions of packages."""
     return {"system": f"{platform.system()} {platform.machine()}", **packages.versions()}
 
 

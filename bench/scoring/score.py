@@ -1,4 +1,4 @@
-"""`bench.score` and `bench score`: a folder or opened recording in, score.json and report.html out."""
+"""`bench.score` and `bench score`: from a recording to score.json and report.html."""
 
 from __future__ import annotations
 
@@ -30,11 +30,9 @@ from synth.recording_flow.video_flow import RecordingFlowSettings
 from synth.system import checked_file
 from synth.system.terminal import counting
 
-Settings = RecordingFlowSettings
-"""What scripts call them."""
-_ROOM_BYTES = 32 << 20  # score.json and report.html, with the charts' program in it
-_LONG = 100
-"""Frames from which a second process is worth the seconds that it takes to start."""
+Settings = RecordingFlowSettings  # public name
+_OUTPUT_BYTES = 32 << 20  # for score.json and report.html
+_LONG = 100  # frames from which a second process is worth the seconds that it takes to start
 
 
 def score(
@@ -50,39 +48,39 @@ def score(
     progress: bool = False,
     own_process: bool = False,
 ) -> Result:
-    """Scores a model, methods of one's own, or both, on a recording; writes only where `out` says.
+    """Scores a model, your own methods, or both, on a recording; writes files only with `out`.
 
     Args:
-        recording: its folder, or what `open_recording` made of it.
-        model: of `learn.load_model`, its folder, mono or stereo; it is called D2FNet in the tables. Where
-            neither it nor methods are given, what comes with this version.
-        methods: further ones by name; the first is what the result is about where there is no model.
-        baselines: whether the simpler methods are scored beside.
-        train: the dataset the model was trained on; those that need data are fitted on the same sequences.
-        settings: flow back end, rate, masks; as the command's if None.
-        out: folder for score.json and report.html, both whole or not at all.
+        recording: its folder, or the result of `open_recording`.
+        model: from `learn.load_model`, its folder, mono or stereo; its name in the tables is D2FNet. Without
+            model and methods, the pretrained model for the recording's cameras.
+        methods: further methods by name; without a model the result is about the first.
+        baselines: whether physics and the baselines are scored too.
+        train: the dataset the model was trained on, to fit baselines on the same sequences.
+        settings: flow back end, rate, masks; None: the command's defaults.
+        out: folder for score.json and report.html, which are written together.
         title: heading of the report.
-        progress: whether a bar is drawn, in a terminal or a notebook.
-        own_process: whether the flow of a long recording is computed in a process of its own, which imports
-            the main module again.
+        progress: whether a progress bar is shown, in a terminal or a notebook.
+        own_process: whether the flow of a long recording is computed in another process, which imports the
+            main module again.
 
     Returns:
-        `Result.methods[name].scores` has the numbers, `Result.time_s` and `.size_mn` of each the curves.
+        The result: scores in `Result.methods[name].scores`, curves in `Result.time_s` and `.size_mn` of each.
 
     Raises:
-        UserError: recording, model or settings that can't be used, or nothing to score; nothing is written.
+        UserError: unusable recording, model or settings, or nothing to score; nothing is written.
     """
     if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
-        raise UserError("score: train needs the model's folder, which says what it was fitted on")
+        raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
     opened = (
         recording if isinstance(recording, Recording) else open_recording(as_path("recording", recording))
     )
     if not isinstance(model, (str, Path, Predictor, NoneType)):
-        raise UserError(f"model: expected a folder or what `load_model` gives, got {type(model).__name__}")
+        raise UserError(f"model: expected a folder or a result of `load_model`, got {type(model).__name__}")
     if not isinstance(methods or {}, Mapping):
-        raise UserError(f"methods: expected them by name, got {type(methods).__name__}")
+        raise UserError(f"methods: expected a mapping by name, got {type(methods).__name__}")
     if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
-        raise UserError(f"methods: {min(taken)} is a name of ours; give yours another")
+        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
     if model is None and not methods:
         model = require_model(opened.has_stereo)
     elif isinstance(model, (str, Path)):
@@ -93,25 +91,17 @@ def score(
         flow = flow_process.open_flow_process()
     written: AbstractContextManager[None] = nullcontext()
     if out is not None:
-        written = checked_file.made_folder(Path(out), _ROOM_BYTES)
+        written = checked_file.made_folder(Path(out), _OUTPUT_BYTES)
     bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
     if progress:
         bar = counting(f"scoring {opened.name}", frames)
-    # The process is started first, for it takes seconds to begin; the methods are fitted meanwhile.
-    with written, flow as elsewhere:
+    # The process takes seconds to start, during which the baselines are fitted.
+    with written, flow as process:
         chosen = _choose_methods(model, methods or {}, opened.has_stereo, baselines, train)
-        scale = pixel_scale.find_scale(opened.meta, opened.folder)
-        with bar as told:
-            result = evaluate_recording(
-                opened,
-                chosen,
-                next(iter(chosen)),
-                scale,
-                settings or Settings(),
-                _describe(chosen),
-                told,
-                elsewhere,
-            )
+        scale, main = pixel_scale.find_scale(opened.meta, opened.folder), next(iter(chosen))
+        used, about = settings or Settings(), _describe(chosen)
+        with bar as done:
+            result = evaluate_recording(opened, chosen, main, scale, used, about, done, process)
         if out is not None:
             write_result(result, Path(out), title)
     return result
@@ -124,7 +114,7 @@ def _choose_methods(
     baselines: bool,
     train: str | Path | None,
 ) -> dict[str, Method]:
-    """All methods by name, in the table's order; the first is what the result is about."""
+    """All methods by name, in the table's order; the result is about the first."""
     chosen: dict[str, Method] = {} if model is None else {MAIN: Model(model)}
     for name, one in own.items():
         chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
@@ -138,7 +128,7 @@ def _choose_methods(
 
 
 def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
-    """What networks and plug-ins among the methods are, for the report."""
+    """Hashes, origins and versions of the networks and plug-ins among the methods, for the report."""
     networks = {name: one for name, one in chosen.items() if isinstance(one, Model)}
     about = {name: {"hash": one.identity, "origin": one.origin} for name, one in networks.items()}
     main = networks.get(MAIN)
@@ -152,7 +142,7 @@ def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
 
 
 def write_result(result: Result, folder: Path, title: str) -> None:
-    """Writes score.json and report.html: both are whole before either has its name."""
+    """Writes score.json and report.html; neither has its name before both are complete."""
     with (
         checked_file.part_of(folder / "score.json") as scores,
         checked_file.part_of(folder / "report.html") as page,

@@ -1,1 +1,1 @@
-"""The force sensor: its samples, its clock and its axes."""
+"""Processing of the force sensor: samples, clock and axes."""

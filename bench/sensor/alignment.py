@@ -1,4 +1,4 @@
-"""The force sensor at the frames' times: clock offset found and frozen, axes found, samples processed."""
+"""Alignment of the force sensor with the video: clock offset, axes, processed samples at frame times."""
 
 from __future__ import annotations
 
@@ -22,15 +22,11 @@ Curve = NDArray[np.float64]
 class AlignedSensor:
     """The sensor at the frames' times, on the video's clock."""
 
-    axes_mn: Curve | None = None
-    """(T, 3) mN, NaN where there are no samples; None if nothing can be scored."""
+    axes_mn: Curve | None = None  # (T, 3) mN, NaN without samples; None if nothing can be scored
     noise_floor_mn: float = 0.0
-    steps: tuple[str, ...] = ()
-    """What was done to the samples, in order, in words."""
-    offset: Offset | None = None
-    """What the search for the clocks' offset found; None if they weren't searched."""
-    rotation: SensorRotation | None = None
-    """As found on `sensor.turn_s`; None if it was stated, or nobody asked."""
+    steps: tuple[str, ...] = ()  # of the processing, in order, in words
+    offset: Offset | None = None  # found by correlation; None without a search
+    rotation: SensorRotation | None = None  # found on `sensor.turn_s`; None without that span
     in_camera_axes: bool = False
 
     @property
@@ -42,14 +38,14 @@ class AlignedSensor:
 def align_sensor(
     recording: Recording, time_s: Curve, speed: Curve, surface: SurfaceMotion | None, notes: list[str]
 ) -> AlignedSensor:
-    """Finds the clocks' offset and the sensor's rotation, freezes both, and reads the sensor at the frames.
+    """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames.
 
     Args:
-        recording: its force and what meta.yaml says of it.
+        recording: with its force and meta.yaml.
         time_s: (T,) times of the frames [s].
-        speed: (T,) mean speed of the tissue since the frame before [mm/s]; NaN where it is not known.
-        surface: how the tissue moved over `sensor.turn_s`; None without that span.
-        notes: gets what a user should know.
+        speed: (T,) mean speed of the tissue since the frame before [mm/s]; NaN where unknown.
+        surface: the tissue's motion over `sensor.turn_s`; None without that span.
+        notes: notes for the user are appended.
 
     Raises:
         UserError: as `force_sensor.process_force`.
@@ -63,16 +59,18 @@ def align_sensor(
     if sensor.turn_s is not None:
         rotation = _find_rotation(force, sensor, offset_s, surface)
         if rotation.refused:
-            notes.append(f"no rotation of the sensor found ({rotation.refused}): components are not scored")
+            notes.append(
+                f"the sensor's rotation was not found ({rotation.refused}): components are not scored"
+            )
         else:
-            on = describe_span(sensor.turn_s)
-            notes.append(f"the sensor's rotation was found on {on}: {rotation.describe()}")
+            span = describe_span(sensor.turn_s)
+            notes.append(f"the sensor's rotation was found on {span}: {rotation.describe()}")
             sensor = sensor.model_copy(update={"to_camera": rotation.rows})
     processed = force_sensor.process_force(force, sensor, offset_s)
     axes = force_sensor.force_at(processed, time_s)
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if covered == 0:
-        notes.append("force.csv and the video share no time: predictions only; are both clocks in seconds?")
+        notes.append("force.csv and the video don't overlap: predictions only; are both clocks in seconds?")
         return AlignedSensor(steps=processed.steps, offset=found, rotation=rotation)
     if other := clocks.find_other_unit(time_s, force.time_s):
         notes.append(f"{other}: predictions only, nothing is scored")
@@ -92,7 +90,7 @@ def describe_span(span: Span) -> str:
 def _find_offset(
     force: Force, sensor: SensorMeta, sync: Sync, time_s: Curve, speed: Curve
 ) -> tuple[float, Offset | None]:
-    """What to add to the sensor's times [s], and the search for it if there was one."""
+    """The offset to add to the sensor's times [s], and the search for it if there was one."""
     if sync.method == "clock":
         return 0.0, None
     if sync.method == "offset" or sync.calibration_s is None:
@@ -108,11 +106,11 @@ def _find_offset(
 def _find_rotation(
     force: Force, sensor: SensorMeta, offset_s: float, surface: SurfaceMotion | None
 ) -> SensorRotation:
-    """The rotation to the camera's axes at which the tissue moves along the force."""
+    """The rotation to the camera's axes for which the tissue moves along the force."""
     if surface is None:
         return find_rotation(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 3)))
     count = len(surface.time_s)
-    moved, seen = (np.stack(parts).astype(np.float64) for parts in (surface.motion, surface.visible))
+    moved, visible = (np.stack(parts).astype(np.float64) for parts in (surface.motion, surface.visible))
     processed = force_sensor.process_force(force, sensor, offset_s)
     at = force_sensor.force_at(processed, np.array(surface.time_s))
-    return find_rotation(moved.reshape(count, -1, 2), seen.reshape(count, -1), at)
+    return find_rotation(moved.reshape(count, -1, 2), visible.reshape(count, -1), at)

@@ -1,8 +1,8 @@
-"""The sensor's clock on the video's: where force changes, tissue moves.
+"""Synchronisation of the sensor's clock with the video's: tissue moves when force changes.
 
-Within a frame interval the sensor's force changes by some amount; the tissue moves by some amount. Over the
-calibration span the two series are correlated for every candidate offset. The offset is frozen before
-anything is scored, and refused when the recording doesn't determine it.
+The change of the sensor's force in each frame interval is correlated with the tissue's motion in it, over the
+calibration span and for every candidate offset. The offset is fixed before anything is scored, and refused if
+the recording does not determine it.
 """
 
 from __future__ import annotations
@@ -25,26 +25,20 @@ _SAME_PEAK = 0.95
 
 @dataclass(frozen=True)
 class Offset:
-    """What was found."""
+    """The offset between two clocks."""
 
-    offset_s: float
-    """To be added to the sensor's times [s]."""
-    r: float
-    """Correlation there."""
-    r_at_zero: float
-    """Correlation without any offset."""
-    deviation_s: float
-    """Standard deviation of the offset over all bootstrap resamples, other peaks included [s]."""
-    refused: str
-    """Why the offset must not be used; empty when it may be."""
-    correlogram: tuple[tuple[float, float], ...] = ()
-    """Offset [s] and correlation of every candidate; empty where none could be tried."""
+    offset_s: float  # to be added to the sensor's times [s]
+    r: float  # correlation at that offset
+    r_at_zero: float  # correlation without an offset
+    deviation_s: float  # standard deviation over all bootstrap resamples, including other peaks [s]
+    refused: str  # why the offset must not be used; empty if it may be
+    correlogram: tuple[tuple[float, float], ...] = ()  # offset [s] and correlation of every candidate
 
 
 def find_offset(
     frame_s: Curve, speed: Curve, sensor_s: Curve, force_mn: NDArray[np.float64], search_s: float
 ) -> Offset:
-    """The offset at which the sensor's changes best follow the tissue's motion.
+    """The offset with the highest correlation between changes of force and motion.
 
     Args:
         frame_s: (T,) times of the frames in the calibration span [s].
@@ -52,11 +46,11 @@ def find_offset(
             out.
         sensor_s: (N,) the sensor's own times [s].
         force_mn: (N, 3) [mN]; NaN rows are left out.
-        search_s: largest offset looked for, either way [s].
+        search_s: largest offset that is tried, in both directions [s].
 
     Returns:
-        The offset, refused if there are too few intervals, the correlation is weak, its peak lies at the
-        search's end, or fewer than 95% of block-bootstrap resamples put it within a frame of the same place.
+        The offset; refused if there are too few intervals, the correlation is weak, its peak is at the end of
+        the search, or fewer than 95% of block-bootstrap resamples have their peak within a frame of it.
     """
     good = np.isfinite(force_mn).all(axis=1)
     t, force = sensor_s[good], force_mn[good]
@@ -72,7 +66,7 @@ def find_offset(
     followed = int(np.isfinite(moved).sum())
     if followed < _LEAST_INTERVALS:
         return _none(
-            f"only {followed} of {len(widths)} frame intervals in the calibration span could be followed, "
+            f"only {followed} of {len(widths)} frame intervals in the calibration span could be tracked, "
             f"{_LEAST_INTERVALS} needed"
         )
     if usable.sum() < _LEAST_INTERVALS:
@@ -80,9 +74,9 @@ def find_offset(
     change, moved = change[:, usable], moved[usable]
     r = _correlations(np.ones((1, len(moved))), change, moved)[0]
     if not np.isfinite(r).any():
-        return _none("nothing moves, or the force doesn't change, in the calibration span")
+        return _none("no motion or no change of force in the calibration span")
     best = int(np.nanargmax(r))
-    rng = np.random.default_rng(0)  # the same recording gives the same offset
+    rng = np.random.default_rng(0)  # reproducible
     weights = bootstrap.counts(len(moved), bootstrap.block_length(moved), _RESAMPLES, rng)
     again = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, moved), nan=-1.0), axis=1)]
     there = np.abs(again - offsets[best]) <= frame
@@ -90,17 +84,17 @@ def find_offset(
     deviation = float(again.std())
     refused = ""
     if best in (0, len(offsets) - 1):
-        refused = f"correlation still rises at the end of the search, {search_s:g} s"
+        refused = f"the correlation still rises at the end of the search, {search_s:g} s"
     elif r[best] < _LEAST_R:
-        refused = f"force and motion correlate by only {r[best]:.2f}"
+        refused = f"the correlation of force and motion is only {r[best]:.2f}"
     elif there.mean() < _SAME_PEAK:
-        refused = f"ambiguous: {100 * (1 - there.mean()):.0f}% of resamples put the peak elsewhere"
+        refused = f"ambiguous: the peak is elsewhere in {100 * (1 - there.mean()):.0f}% of resamples"
     tried = tuple(zip(offsets.tolist(), r.tolist(), strict=True))
     return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused, tried)
 
 
 def _change(frame_s: Curve, sensor_s: Curve, force_mn: NDArray[np.float64]) -> Curve:
-    """Length of the change of force over each frame interval [mN]; NaN outside the sensor's record."""
+    """Magnitude of the change of force over each frame interval [mN]; NaN outside the sensor's record."""
     at = np.stack([np.interp(frame_s, sensor_s, f, left=np.nan, right=np.nan) for f in force_mn.T], axis=1)
     return np.asarray(np.linalg.norm(np.diff(at, axis=0), axis=1), np.float64)
 
@@ -121,7 +115,7 @@ def _correlations(
 
 
 def _refined(offsets: NDArray[np.floating], r: Curve, best: int) -> float:
-    """Top of the parabola through the best three."""
+    """Maximum of the parabola through the best offset and its neighbours."""
     if best in (0, len(r) - 1):
         return float(offsets[best])
     left, middle, right = r[best - 1 : best + 2]
@@ -131,5 +125,4 @@ def _refined(offsets: NDArray[np.floating], r: Curve, best: int) -> float:
 
 
 def _none(reason: str) -> Offset:
-    nan = float("nan")
-    return Offset(0.0, nan, nan, nan, reason)
+    return Offset(0.0, np.nan, np.nan, np.nan, reason)

@@ -1,4 +1,4 @@
-"""From the sensor's raw samples to the force on the tissue at the times of the frames."""
+"""Processing of the sensor's raw samples into the force on the tissue at the frames' times."""
 
 from __future__ import annotations
 
@@ -13,53 +13,46 @@ from bench.recording.meta import SensorMeta
 from synth.errors import UserError
 
 Curve = NDArray[np.float64]
-STANDARD_GRAVITY = 9.80665
-"""m/s² = mN/g."""
+STANDARD_GRAVITY = 9.80665  # m/s² = mN/g
 
-_GAP = 5.0  # sample times after which samples are apart
-_ACROSS = 32  # samples over which the sample time is taken
+_GAP = 5.0  # sample intervals from which there is a gap
+_ACROSS = 32  # samples over which the sample interval is averaged
 _ORDER = 4
-_NO_UNIT = 0.1  # how far from 1 the length of gravity's direction may be
+_NO_UNIT = 0.1  # largest deviation from 1 of the length of gravity's direction
 
 
 @dataclass(frozen=True)
 class Processed:
     """Force on the tissue, on the video's clock."""
 
-    time_s: Curve
-    """(N,) rising [s]."""
-    force_mn: Curve
-    """(N, 3) [mN]; NaN in gaps."""
-    noise_floor_mn: float
-    """Standard deviation without contact, all components together, after filtering [mN]; 0 if unknown."""
-    drift_mn: float
-    """Largest drift taken out [mN]."""
-    steps: tuple[str, ...]
-    """What was done, in order, in words."""
+    time_s: Curve  # (N,) rising [s]
+    force_mn: Curve  # (N, 3) mN; NaN in gaps
+    noise_floor_mn: float  # filtered standard deviation without contact, all components; 0: unknown
+    drift_mn: float  # largest drift that was removed
+    steps: tuple[str, ...]  # of the processing, in order, in words
 
 
 def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processed:
-    """Gravity, tare and drift, low-pass, clock; in this order.
+    """Removes gravity, tare and drift, filters, and shifts the clock, in this order.
 
     Args:
         force: raw samples.
-        sensor: how to read them.
+        sensor: settings of the processing.
         offset_s: added to the sensor's times [s].
 
     Raises:
-        UserError: a contact-free span without samples, a mass without gravity columns, or with columns
-            that hold no unit vector.
+        UserError: a contact-free span without samples, or a mass without a unit vector of gravity.
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
     if sensor.to_camera is not None:
         values = values @ np.array(sensor.to_camera).T
-        steps.append("turned to the camera's axes")
+        steps.append("rotated to the camera's axes")
     values, drift = _tared(force.time_s, values, sensor, steps)
     values = _smooth(force.time_s, values, sensor.low_pass_hz, steps)
     floor = _floor(force.time_s, values, sensor)
     if offset_s:
-        steps.append(f"clock moved by {offset_s * 1000:+.1f} ms")
+        steps.append(f"clock shifted by {offset_s * 1000:+.1f} ms")
     return Processed(force.time_s + offset_s, values, floor, drift, tuple(steps))
 
 
@@ -69,9 +62,8 @@ def force_at(processed: Processed, time_s: Curve) -> Curve:
     out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
     step = _step(t)
     after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
-    # Frame times that fall in a hole of the sensor's record have no truth.
-    hole = (t[after] - t[after - 1] > _GAP * step) & (time_s != t[after]) & (time_s != t[after - 1])
-    out[hole] = np.nan
+    gap = (t[after] - t[after - 1] > _GAP * step) & (time_s != t[after]) & (time_s != t[after - 1])
+    out[gap] = np.nan
     return out
 
 
@@ -79,23 +71,21 @@ def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Curve:
     if sensor.mass_g == 0:
         return force.force_mn.copy()
     if force.gravity is None:
-        raise UserError(
-            "sensor.mass_g is given, but force.csv has no columns gx, gy, gz for the direction of gravity"
-        )
+        raise UserError("sensor.mass_g requires columns gx, gy, gz, the direction of gravity, in force.csv")
     length = np.linalg.norm(force.gravity, axis=1)
     off = np.abs(length - 1)
     if np.nanmax(off, initial=0.0) > _NO_UNIT:
         raise UserError(
             f"force.csv: gx, gy, gz have the length {length[np.nanargmax(off)]:.4g} at "
-            f"{force.time_s[np.nanargmax(off)]:.6g} s; a unit vector along gravity is needed, not m/s²"
+            f"{force.time_s[np.nanargmax(off)]:.6g} s; give a unit vector along gravity, not m/s²"
         )
-    sign = -1.0 if sensor.acts_on == "tool" else 1.0  # the file's sign was turned on reading
-    steps.append(f"weight of {sensor.mass_g:g} g beyond the sensor taken off")
+    sign = -1.0 if sensor.acts_on == "tool" else 1.0  # the file's sign was reversed on reading
+    steps.append(f"weight of {sensor.mass_g:g} g removed")
     return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
 
 
 def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -> tuple[Curve, float]:
-    """Subtracts the zero: a line through the medians of the contact-free spans, constant beyond them."""
+    """Subtracts tare and drift: interpolated medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
         return values, 0.0
     found = []
@@ -104,7 +94,7 @@ def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -
         if not inside.any():
             raise UserError(f"sensor.free_s: no samples between {start:g} and {stop:g} s")
         found.append((float(time_s[inside].mean()), *np.median(values[inside], axis=0)))
-    # By the middles, for a span may lie in another.
+    # Sorted by their middles, because spans may overlap.
     middles, *zeros = np.array(sorted(found)).T
     zero = np.stack([np.interp(time_s, middles, column) for column in zeros], axis=1)
     drift = float(np.linalg.norm(zero - zero[0], axis=1).max())
@@ -114,12 +104,12 @@ def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -
 
 
 def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]) -> Curve:
-    """Butterworth on each unbroken run of samples, brought to a uniform clock and back."""
+    """Butterworth filter of each run of samples without gaps, resampled to uniform times and back."""
     if cut_hz is None:
         return values
     step = _step(time_s)
     if cut_hz >= 0.4 / step:
-        steps.append(f"no low-pass: {cut_hz:g} Hz is too near half the sensor's {1 / step:.4g} Hz")
+        steps.append(f"no low-pass: {cut_hz:g} Hz is too close to half the sensor's rate, {1 / step:.4g} Hz")
         return values
     sos = signal.butter(_ORDER, cut_hz, fs=1 / step, output="sos")
     out = np.full_like(values, np.nan)
@@ -137,19 +127,21 @@ def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]
             out[run, k] = np.interp(t, even, signal.sosfiltfilt(sos, x))
     steps.append(f"zero-phase Butterworth low-pass, order {_ORDER}, {cut_hz:g} Hz")
     if short:
-        steps.append(f"not filtered: {sum(short)} samples in {len(short)} runs too short for it")
+        steps.append(f"not filtered: {sum(short)} samples in {len(short)} runs that are too short")
     return out
 
 
 def _step(time_s: Curve) -> float:
-    """Time from sample to sample [s]: the mean over a few dozen, so that it is true of stamps that come in
-    bursts, and the median of those means, so that holes in the record don't count."""
+    """Sample interval [s]: the median of means over a few dozen samples.
+
+    The means make it correct for stamps in bursts, the median makes it independent of gaps.
+    """
     across = min(_ACROSS, max(len(time_s) // 4, 1))
     return float(np.median(time_s[across:] - time_s[:-across])) / across
 
 
 def runs(time_s: Curve, good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:
-    """Indices of good samples, split where more than `gap_s` lies between neighbours."""
+    """Indices of good samples, split at gaps longer than `gap_s`."""
     where = np.flatnonzero(good)
     if len(where) == 0:
         return []

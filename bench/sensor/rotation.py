@@ -1,10 +1,9 @@
-"""The sensor's axes in the camera's: tissue that is pulled moves the way it is pulled.
+"""The rotation from the sensor's axes to the camera's: tissue moves in the direction of the force.
 
-On tissue that is alike in all directions of the picture, the mean motion around a contact is along the part
-of the force that lies in the picture, whatever the part along the view does. So over a span in which a tool
-pulls and pushes in many directions, motion = gain × (the picture's two rows of the rotation) × force. The
-rotation is the least-squares one (Wahba's problem, SIAM Review 7, 1965, with the third component of one side
-unseen).
+On tissue that is isotropic in the image plane, the mean motion around a contact is along the in-plane part of
+the force, whatever its part along the optical axis. So over a span in which a tool pulls and pushes in many
+directions, motion = gain × (first two rows of the rotation) × force. The rotation is found by least squares
+(Wahba's problem, SIAM Review 7, 1965, with the third component of one side unobserved).
 """
 
 from __future__ import annotations
@@ -21,55 +20,51 @@ from bench import bootstrap
 Floats = NDArray[np.float64]
 
 _LEAST_TURNING = 20  # frames
-_FLAT = 0.1  # of the largest standard deviation of force: a direction with less is not known
-_EXPLAINED = 0.5  # share of the motion's variance
+_FLAT = 0.1  # least standard deviation of force in any direction, as a share of the largest
+_EXPLAINED = 0.5  # least share of the motion's variance
 _SURE_DEG = 15.0
 _RESAMPLES = 100
-# The angle's deviation over the misfit: of six numbers of equal error a gain and a rotation leave two.
+# The angle's deviation over the misfit: gain and rotation leave two degrees of freedom of six.
 _FREEDOM = float(np.sqrt(2.5))
 _STARTS = Rotation.create_group("O")
 
 
 @dataclass(frozen=True)
 class SensorRotation:
-    """What was found."""
+    """A sensor's rotation and its uncertainty."""
 
-    rows: tuple[tuple[float, ...], ...]
-    """Rows of the rotation from the sensor's axes to the camera's; empty if none could be tried."""
-    deviation_deg: float
-    """Standard deviation of its angle [deg]: of bootstrap resamples, and of what no rotation can explain."""
-    explained: float
-    """Share of the motion's variance that it explains."""
-    refused: str
-    """Why it must not be used; empty when it may be."""
+    rows: tuple[tuple[float, ...], ...]  # of the rotation to the camera's axes; empty if not determined
+    deviation_deg: float  # standard deviation of its angle, from bootstrap resamples and misfit
+    explained: float  # share of the motion's variance
+    refused: str  # why it must not be used; empty if it may be
 
     def describe(self) -> str:
-        """In words."""
+        """Uncertainty and explained motion, in words."""
         return f"± {self.deviation_deg:.1f}°, {100 * self.explained:.0f}% of the motion explained"
 
 
-def find_rotation(moved: Floats, seen: Floats, force_mn: Floats) -> SensorRotation:
-    """The rotation at which the tissue's motion best follows the force.
+def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRotation:
+    """The rotation for which the tissue's motion best follows the force.
 
     Args:
         moved: (T, P, 2) motion of P parts of the tissue in the picture (right, down) from rest, any unit.
-        seen: (T, P) in 0..1, how much of each was seen.
+        visible: (T, P) visible share of each part, in 0..1.
         force_mn: (T, 3) in the sensor's axes, tared; frames with NaN are left out.
 
     Returns:
-        The rotation, refused where there are fewer than `_LEAST_TURNING`, the force keeps to a plane, less
-        than half of the motion is explained, or its angle is known to 15° only.
+        The rotation; refused for fewer than `_LEAST_TURNING` frames, forces in a plane, less than half of the
+        motion explained, or an angle with a standard deviation above 15°.
     """
     good = np.isfinite(force_mn).all(axis=1)
     if good.sum() < _LEAST_TURNING:
-        return _none(f"only {good.sum()} frames with force that could be followed, {_LEAST_TURNING} needed")
-    force, shift = force_mn[good], _shift(moved[good], seen[good])
+        return _none(f"only {good.sum()} tracked frames with force, {_LEAST_TURNING} needed")
+    force, shift = force_mn[good], _shift(moved[good], visible[good])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
     if spread[2] < _FLAT * spread[0] or not shift.any():
-        return _none("the force keeps to a plane or a line" if shift.any() else "nothing moves")
+        return _none("the force stays in a plane or on a line" if shift.any() else "nothing moves")
     every = np.ones(len(force))
     turn, explained, misfit = _fitted(force, shift, every, _STARTS)
-    rng = np.random.default_rng(0)  # the same recording gives the same rotation
+    rng = np.random.default_rng(0)  # reproducible
     block = max(bootstrap.block_length(axis) for axis in (*force.T, *shift.T))
     again = [
         _fitted(force, shift, weights, Rotation.concatenate([turn]))[0]
@@ -81,43 +76,45 @@ def find_rotation(moved: Floats, seen: Floats, force_mn: Floats) -> SensorRotati
     if explained < _EXPLAINED:
         refused = f"only {100 * explained:.0f}% of the motion follows the force"
     elif deviation > _SURE_DEG:
-        refused = f"known to {deviation:.0f}° only"
+        refused = f"its angle has a standard deviation of {deviation:.0f}°"
     return SensorRotation(tuple(map(tuple, turn.as_matrix().tolist())), deviation, explained, refused)
 
 
-def _shift(moved: Floats, seen: Floats) -> Floats:
-    """(T, 2) mean motion, each part weighted alike in all frames by how much it moves."""
-    weight = seen * np.square(moved).sum(axis=2).mean(axis=0)
+def _shift(moved: Floats, visible: Floats) -> Floats:
+    """Mean motion (T, 2), each part weighted by its mean squared motion over all frames."""
+    weight = visible * np.square(moved).sum(axis=2).mean(axis=0)
     whole = weight.sum(axis=1)
     return np.asarray((weight[..., None] * moved).sum(axis=1) / np.maximum(whole, 1e-12)[:, None], np.float64)
 
 
 def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> tuple[Rotation, float, float]:
-    """The best rotation from any start, the share of variance it explains, and what of the linear part no
-    rotation explains, as a share of its length. Both sides may have a zero of their own."""
+    """The best rotation over all starts, its share of explained variance, and its relative misfit.
+
+    The misfit is that of the unconstrained linear map. Both motion and force may have an offset.
+    """
     part = weights / weights.sum()
     force, shift = force - part @ force, shift - part @ shift
     moment = (force * part[:, None]).T @ force
     scale = np.linalg.cholesky(moment + 1e-9 * np.trace(moment) * np.eye(3))
-    # Motion over force as it would be without any constraint, both sides in the force's own metric.
-    asked = np.linalg.solve(scale, (force * part[:, None]).T @ shift).T
+    # The unconstrained linear map from whitened force to motion.
+    linear = np.linalg.solve(scale, (force * part[:, None]).T @ shift).T
 
     def along(turn: Rotation) -> Floats:
         return np.asarray(turn.as_matrix()[:2] @ scale, np.float64)
 
     def left(vector: Floats, start: Rotation) -> Floats:
-        said = along(Rotation.from_rotvec(vector) * start)
-        gain = max(float((asked * said).sum() / np.square(said).sum()), 0.0)
-        return np.asarray((asked - gain * said).ravel(), np.float64)
+        rows = along(Rotation.from_rotvec(vector) * start)
+        gain = max(float((linear * rows).sum() / np.square(rows).sum()), 0.0)
+        return np.asarray((linear - gain * rows).ravel(), np.float64)
 
     tried = [(least_squares(left, np.zeros(3), args=(start,)), start) for start in starts]
     best, start = min(tried, key=lambda one: float(one[0].cost))
     total = float((part[:, None] * np.square(shift)).sum())
-    unexplained = total - float(np.square(asked).sum()) + 2 * float(best.cost)
-    misfit = np.sqrt(2 * best.cost / max(float(np.square(asked).sum()), 1e-12))
+    unexplained = total - float(np.square(linear).sum()) + 2 * float(best.cost)
+    misfit = np.sqrt(2 * best.cost / max(float(np.square(linear).sum()), 1e-12))
     explained = 1 - unexplained / total if total > 0 else 0.0
     return Rotation.from_rotvec(best.x) * start, explained, float(misfit)
 
 
 def _none(reason: str) -> SensorRotation:
-    return SensorRotation((), float("nan"), float("nan"), reason)
+    return SensorRotation((), np.nan, np.nan, reason)

@@ -104,7 +104,7 @@ def track_recording(
 
     def one_pass(pulse: PulseSearch | None) -> tuple[TrackedRecording, PulseSearch | None]:
         depth = RightCamera(recording, scale_mm_per_px) if recording.has_stereo else None
-        video = VideoFlow(recording.film(), settings, flow, pulse, depth, watch=watch)
+        video = VideoFlow(recording.as_footage(), settings, flow, pulse, depth, watch=watch)
         forces = _Forces(methods, pictured, watch)
         for frame in video.frames(progress):
             if frame.is_rest:

@@ -58,8 +58,8 @@ def main(
             row: dict[str, Any] = {"recording": k, "method": method}
             row |= {f"{name}_mn": run.methods[method].scores["mae_mn"] for name, run in runs.items()}
             rows.append(row)
-        rows[-1]["found"] = runs["taken off"].followed.pulse
-        rows[-1]["found_on_still"] = runs["still"].followed.pulse
+        rows[-1]["found"] = runs["taken off"].tracked.pulse
+        rows[-1]["found_on_still"] = runs["still"].tracked.pulse
     found = {"seconds": seconds, "count": count, "size": size, "seed": seed, "rows": rows}
     report.save(out, "results.json", found, page(found))
     report.show({"rows": page(found).sections[0].rows})

@@ -424,7 +424,7 @@ def _both_bumped(film: Film) -> Film:
 
 _UNSEEN, _AGAIN = "out of distribution", "again"
 _MISSING = r"^pictures: .*missing|^clocks|^times"
-_LATE = "^second eye: .*(late|early)"
+_LATE = "^stereo: .*(late|early)"
 _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", np.s_[::-1]
 # How it is made, and what names its cause (a pattern; none: the answer is to hold).
 ONE_EYE: dict[str, tuple[Change, str]] = {
@@ -488,11 +488,11 @@ ONE_EYE: dict[str, tuple[Change, str]] = {
 TWO_EYES: dict[str, tuple[Change, str]] = {
     "right eye a frame late": (_order(lambda k: np.maximum(k - 1, 0), True), _LATE),
     "right eye lost a frame": (_order(lambda k: np.minimum(k + (k > 6), len(k) - 1), True), _LATE),
-    "right eye frozen": (_order(lambda k: np.minimum(k, 6), True), "^second eye"),
+    "right eye frozen": (_order(lambda k: np.minimum(k, 6), True), "^stereo"),
     "right eye mirrored": (_right(lambda film: film.right[:, :, ::-1]), "mirrored"),
     "right eye 4 rows down": (_right(lambda film: np.roll(film.right, 4, axis=1)), "rows"),
     "eyes swapped": (lambda film: replace(film, rgb=film.right, right=film.rgb), "swapped"),
-    "right eye a copy of the left": (_right(lambda film: film.rgb), "left eye's own"),
+    "right eye a copy of the left": (_right(lambda film: film.rgb), "left camera's own"),
     "baseline 2 times too long": (
         _stated(stereo={"calibration": "stereo.yaml", "mm_per_unit": 2}),
         "^scale",

@@ -1,4 +1,4 @@
-"""Intervals hold what they promise: coverage on series whose dependence is known."""
+"""Coverage of bootstrap intervals on series of known dependence."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ def test_counts_are_whole_resamples_in_blocks() -> None:
 
 def test_coverage_of_the_bias_of_dependent_errors() -> None:
     rng = np.random.default_rng(3)
-    hits = blind = 0
+    hits = naive = 0
     trials = 60
     for _ in range(trials):
         truth = 50 + 30 * np.sin(np.arange(400) / 15)
-        said = truth + 2 + autoregressive(400, 0.8, rng)
-        low, high = metrics.agreement_intervals(truth, said, rng)["bias_mn"]
+        predicted = truth + 2 + autoregressive(400, 0.8, rng)
+        low, high = metrics.agreement_intervals(truth, predicted, rng)["bias_mn"]
         hits += low <= 2 <= high
-        error = said - truth
+        error = predicted - truth
         half = 1.96 * error.std() / np.sqrt(len(error))
-        blind += abs(error.mean() - 2) <= half
+        naive += abs(error.mean() - 2) <= half
     assert hits / trials > 0.85
-    assert blind / trials < 0.65  # what pretending independence would have promised as 95%
+    assert naive / trials < 0.65  # the 95% interval that assumes independence
 
 
-def test_paired_difference_sees_what_unpaired_cannot() -> None:
+def test_paired_difference_removes_a_common_error() -> None:
     rng = np.random.default_rng(1)
     truth = np.zeros(300)
     common = 20 * np.abs(autoregressive(300, 0.5, rng))

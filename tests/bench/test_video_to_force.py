@@ -1,4 +1,4 @@
-"""One video, one number: what `learn predict` says of it is what `bench score` scores."""
+"""`learn predict` and `bench score` give the same forces for a video."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def test_predict_and_score_agree_at_every_frame(
     marked = np.zeros(SIZE, np.uint8)
     marked[8:-8, 40:-90] = 255
     cv2.imwrite(str(folder / "tissue.png"), marked)
-    # The other methods are slow, and no part of the question.
+    # The other methods are slow and not tested here.
     monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})
 
     words = [str(model), str(folder / "video.mp4"), "--scale", "0.2", "--tissue", str(folder / "tissue.png")]
     words += [] if young is None else ["--young", str(young)]
     words += ["-o", str(tmp_path / "forces"), "--flow", "dis", "--json"]
-    said = CliRunner().invoke(learn.cli.app, ["predict", *words])
-    assert said.exit_code == 0, said.output
+    predicted = CliRunner().invoke(learn.cli.app, ["predict", *words])
+    assert predicted.exit_code == 0, predicted.output
     words = [str(folder), "--model", str(model), "-o", str(tmp_path / "score"), "--flow", "dis", "--json"]
     scored = CliRunner().invoke(bench.cli.app, ["score", *words])
     assert scored.exit_code == 0, scored.output
@@ -52,7 +52,7 @@ def test_predict_and_score_agree_at_every_frame(
         size = np.array(curve["predicted_mn"]["D2FNet"])
         largest = size.max()
         assert size[0] < 1e-6 * largest, "nothing has moved in the rest frame"
-        assert np.ptp(size[1:]) > 0.1 * largest, "a network that says nothing proves nothing"
+        assert np.ptp(size[1:]) > 0.1 * largest, "the network's force must vary"
         assert found["total_force_mn"] == pytest.approx(size, rel=1e-6, abs=1e-8)
         if output == "vector":
             axes = np.array(curve["predicted_axes_mn"]["D2FNet"])

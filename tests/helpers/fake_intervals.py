@@ -1,4 +1,4 @@
-"""Intervals written by hand: half widths that are the same for every frame."""
+"""Intervals with constant half widths."""
 
 from __future__ import annotations
 
@@ -41,6 +41,6 @@ def make(
 
 
 def give(folder: Path, intervals: Intervals) -> Path:
-    """The model's folder, its card with these intervals."""
+    """Writes the intervals into the model's card; returns its folder."""
     write_card(folder, dataclasses.replace(read_card(folder), intervals=intervals))
     return folder

@@ -1,4 +1,4 @@
-"""Recordings with a known answer: a texture moved by a smooth field in proportion to a known force."""
+"""Recordings with known force: a texture moved by a smooth field proportional to the force."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Maker:
 
 
 class Bump:
-    """The inverse of `phantom.pushed`: force from the largest displacement, as a perfect method would."""
+    """The inverse of `phantom.pushed`: the exact force from the displacement at the centre."""
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         length = np.linalg.norm(flow, axis=-1)
@@ -83,10 +83,10 @@ class Bump:
 
 
 def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings: Any) -> Result:
-    """What scoring a recording gives; by default `Bump` on every frame, without a second process."""
+    """The result of scoring a recording; by default `Bump` on every frame, in this process."""
     recording = open_recording(folder)
     chosen = dict(methods or {"bump": Bump()})
     flow = settings.pop("flow_here", None)
-    asked = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
+    chosen_settings = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
     scale = pixel_scale.find_scale(recording.meta, folder)
-    return evaluate_recording(recording, chosen, next(iter(chosen)), scale, asked, {}, flow=flow)
+    return evaluate_recording(recording, chosen, next(iter(chosen)), scale, chosen_settings, {}, flow=flow)

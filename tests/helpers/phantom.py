@@ -1,7 +1,7 @@
-"""Small sequences from a closed form, written as real stores: what the learn tests train and score on.
+"""Small sequences from a closed form, written as stores, for training and scoring in tests.
 
 Surface displacement of an elastic half-space under a force spread like a hat of radius a (regularised
-Cerruti and Boussinesq solutions; Johnson, Contact Mechanics, 1985, §3.2), seen straight from above.
+Cerruti and Boussinesq solutions; Johnson, Contact Mechanics, 1985, §3.2), viewed from straight above.
 """
 
 from __future__ import annotations

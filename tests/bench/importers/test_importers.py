@@ -1,4 +1,4 @@
-"""Foreign recordings made by their own libraries come back as the frames, times and forces put in."""
+"""Importers return the frames, times and forces that each format's own library wrote."""
 
 from __future__ import annotations
 
@@ -56,8 +56,7 @@ def hdf5(path: Path) -> Path:
     return path
 
 
-LATE_S = 1e6
-"""How late the bag's own clock is."""
+LATE_S = 1e6  # offset of the bag's own clock
 
 
 def mcap(path: Path, unstamped: str = "") -> Path:
@@ -107,7 +106,7 @@ def mcap(path: Path, unstamped: str = "") -> Path:
     ("make", "name", "use"),
     [(igs, "run.igs.mha", []), (hdf5, "run.h5", ["--use", "frames=camera/rgb"]), (mcap, "run", [])],
 )
-def test_what_went_in_comes_out(
+def test_imported_data_equal_the_source(
     make: Callable[[Path], Path], name: str, use: list[str], tmp_path: Path
 ) -> None:
     source, out = make(tmp_path / name), tmp_path / "rec"
@@ -125,15 +124,15 @@ def test_what_went_in_comes_out(
     assert len(tip) == (3 if "mha" in name else 4)  # an INVALID pose is none
 
 
-def test_the_bags_clock_stands_in_for_topics_without_stamps_alone(tmp_path: Path) -> None:
-    """A stamp that is zero, as the first of a simulated clock, is one where the topic's others are not."""
+def test_the_bags_clock_is_used_only_for_topics_without_stamps(tmp_path: Path) -> None:
+    """A single zero stamp, as the first of a simulated clock, is valid."""
     found = registry.read_source(mcap(tmp_path / "bag", unstamped="/tip"))
     assert found.times_s == pytest.approx(TIMES)
     assert found.force_s == pytest.approx(TIMES)
     assert found.tip[:, 0] == pytest.approx(LATE_S + TIMES)
 
 
-def spoil_text(path: Path) -> Path:
+def write_nonsense(path: Path) -> Path:
     path.write_text("nothing of the kind")
     return path
 
@@ -141,13 +140,13 @@ def spoil_text(path: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "name", "use"),
     [
-        (spoil_text, "a.h5", {}),
-        (spoil_text, "a.xyz", {}),
+        (write_nonsense, "a.h5", {}),
+        (write_nonsense, "a.xyz", {}),
         (hdf5, "a.h5", {"force": "camera/timestamps"}),
         (igs, "a.mha", {"nonsense": "x"}),
     ],
 )
-def test_what_cannot_be_read_is_refused(
+def test_unreadable_sources_are_refused(
     make: Callable[[Path], Path], name: str, use: dict[str, str], tmp_path: Path
 ) -> None:
     with pytest.raises(UserError):

@@ -15,14 +15,14 @@ from bench.importers import registry
 from bench.recording.folder import open_recording
 from synth.errors import UserError
 
-FILM = np.stack([texture(48, 64, seed) for seed in range(12)])
+VIDEO = np.stack([texture(48, 64, seed) for seed in range(12)])
 
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Path:
     folder = tmp_path / "cam"
     folder.mkdir()
-    for k, rgb in enumerate(FILM):
+    for k, rgb in enumerate(VIDEO):
         cv2.imwrite(str(folder / f"img{k}.png"), rgb[..., ::-1])  # img10 comes after img9
     return folder
 
@@ -46,22 +46,22 @@ def test_a_folder_of_pictures_with_a_ros_table_becomes_a_recording(pictures: Pat
     assert recording.force.force_mn[3] == pytest.approx([300.0, 0.0, -500.0])
     frames = list(recording.frames())
     assert [frame.time_s for frame in frames] == pytest.approx(np.arange(12) / 4, abs=1e-5)
-    for frame, rgb in zip(frames, FILM, strict=True):
+    for frame, rgb in zip(frames, VIDEO, strict=True):
         assert np.abs(frame.rgb.astype(int) - rgb).max() <= 4
 
 
-def test_a_fast_sensors_other_unit_is_told_by_the_video(tmp_path: Path) -> None:
-    np.save(tmp_path / "film.npy", FILM)
+def test_a_fast_sensor_that_is_not_in_seconds_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "video.npy", VIDEO)
     table = tmp_path / "ft.csv"
 
     def read(seconds: float, of: float) -> registry.Intake:
         rows = [f"{of * k / 1000:.6f},0,0,1" for k in range(int(seconds * 1000))]
         table.write_text("\n".join(["t_s,fx,fy,fz", *rows]) + "\n")
-        return registry.read_source(tmp_path / "film.npy", {"fps": "25", "force": str(table)})
+        return registry.read_source(tmp_path / "video.npy", {"fps": "25", "force": str(table)})
 
     for unit in (1e3, 1e6):
         with pytest.raises(UserError, match="seconds"):
             read(1, unit)
     assert len(read(1, 1).force) == 1000
-    # Seconds of a sensor that ran for two minutes beside half a second of video.
+    # A sensor may run for two minutes next to half a second of video.
     assert len(read(120, 1).force) == 120_000

@@ -1,4 +1,4 @@
-"""A made-up bag as surgical robots record them: two compressed eyes of 960 x 540, two wrenches, lenses."""
+"""A bag as surgical robots record them: two compressed cameras of 960 x 540, two wrenches, calibrations."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 
 SIZE, FPS, FOCAL, BASE_MM, AWAY_MM = (960, 540), 10.0, 1000.0, 5.0, 100.0
-EYES = {
+CAMERAS = {
     "left": "/davinci/left/camera/image_raw/compressed",
     "right": "/davinci/right/camera/image_raw/compressed",
 }
 DEPTH = "/davinci/depth/image"
 ARMS = ("/PSM1/body/measured_cf", "/PSM2/body/measured_cf")
-LATE_S = 0.012  # the right eye's stamps
+LATE_S = 0.012  # delay of the right camera's stamps
 K = np.array([[FOCAL, 0, 470.0], [0, FOCAL, 280], [0, 0, 1]])
 TOED_IN = Rotation.from_rotvec([0.002, -0.03, 0.004]).as_matrix(), np.array([-BASE_MM, 0.1, -0.2])
 PARALLEL = np.eye(3), np.array([-BASE_MM, 0, 0])
@@ -38,22 +38,22 @@ Rgb = np.ndarray
 
 
 def lenses(pair: tuple[np.ndarray, np.ndarray], bent: list[np.ndarray]) -> dict[str, dict[str, Any]]:
-    """What `camera_calibration` writes of a pair: OpenCV's rectification, with lengths in metres."""
+    """What ROS's `camera_calibration` writes for a pair: OpenCV's rectification, with lengths in metres."""
     R1, R2, P1, P2, *_ = cv2.stereoRectify(K, bent[0], K, bent[1], SIZE, pair[0], pair[1][:, None] / 1000)
     return {
-        eye: {"k": K.ravel(), "d": d, "r": R.ravel(), "p": P.ravel()}
-        for eye, d, R, P in zip(EYES, bent, (R1, R2), (P1, P2), strict=True)
+        camera: {"k": K.ravel(), "d": d, "r": R.ravel(), "p": P.ravel()}
+        for camera, d, R, P in zip(CAMERAS, bent, (R1, R2), (P1, P2), strict=True)
     }
 
 
 def write_bag(
     path: Path,
-    film: list[dict[str, Rgb]],
+    video: list[dict[str, Rgb]],
     force_n: np.ndarray,
-    told: dict[str, dict[str, Any]],
+    infos: dict[str, dict[str, Any]],
     depths: tuple[np.ndarray, ...] = (),
 ) -> Path:
-    """Pictures (H, W, 3) of the eyes, PSM1's force (N, 3) at 10 samples a frame; PSM2 feels nothing."""
+    """Pictures (H, W, 3) of the cameras, PSM1's force (N, 3) at 10 samples per frame; PSM2's is 0."""
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -75,15 +75,15 @@ def write_bag(
                 made[topic] = bag.add_connection(topic, name, typestore=store)
             bag.write(made[topic], round(1e9 * time_s), store.serialize_cdr(message, name))
 
-        for eye, topic in EYES.items():
+        for camera, topic in CAMERAS.items():
             roi = kind["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-            info = (SIZE[1], SIZE[0], "plumb_bob", *(told[eye][name] for name in "dkrp"), 0, 0, roi)
-            put(f"/davinci/{eye}/camera/camera_info", "sensor_msgs/msg/CameraInfo", 0.0, *info)
-            for t, pictures in enumerate(film):
-                if eye not in pictures:
+            info = (SIZE[1], SIZE[0], "plumb_bob", *(infos[camera][name] for name in "dkrp"), 0, 0, roi)
+            put(f"/davinci/{camera}/camera/camera_info", "sensor_msgs/msg/CameraInfo", 0.0, *info)
+            for t, pictures in enumerate(video):
+                if camera not in pictures:
                     continue
-                jpeg = cv2.imencode(".jpg", pictures[eye][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-                late = LATE_S * (eye == "right")
+                jpeg = cv2.imencode(".jpg", pictures[camera][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+                late = LATE_S * (camera == "right")
                 put(topic, "sensor_msgs/msg/CompressedImage", 1 + t / FPS + late, "jpeg", jpeg)
         for t, depth in enumerate(depths):
             rows = (*depth.shape, {"u": "16UC1", "f": "32FC1"}[depth.dtype.kind], 0, depth.strides[0])
@@ -100,19 +100,21 @@ def write_bag(
 
 def bring_in(source: Path, out: Path) -> Any:
     words = ["import", str(source), "-o", str(out), "--scale", str(AWAY_MM / FOCAL), "--json"]
-    return CliRunner().invoke(app, [*words, "--use", f"right={EYES['right']}", "--use", f"force={ARMS[0]}"])
+    return CliRunner().invoke(
+        app, [*words, "--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}"]
+    )
 
 
-def test_eyes_and_calibration_are_those_of_the_bag(tmp_path: Path) -> None:
-    """The pair is what OpenCV rectified; of six frames the right eye lacks the first, fourth and last."""
+def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:
+    """Of six frames the right camera lacks the first, fourth and last."""
     bent = [k * np.array([-0.3, 0.1, 0.001, -0.002, 0.05]) for k in (1.0, 0.9)]
-    film = [
-        {eye: np.full((*SIZE[::-1], 3), 30 * t + 9 * (eye == "right"), np.uint8) for eye in EYES}
+    video = [
+        {camera: np.full((*SIZE[::-1], 3), 30 * t + 9 * (camera == "right"), np.uint8) for camera in CAMERAS}
         for t in range(6)
     ]
     for t in (0, 3, 5):
-        film[t].pop("right")
-    source = write_bag(tmp_path / "bag", film, np.zeros((60, 3)), lenses(TOED_IN, bent))
+        video[t].pop("right")
+    source = write_bag(tmp_path / "bag", video, np.zeros((60, 3)), lenses(TOED_IN, bent))
     done = bring_in(source, tmp_path / "rec")
     assert done.exit_code == 0, done.output
     rig = read_rig(tmp_path / "rec/stereo.yaml", SIZE)
@@ -123,19 +125,21 @@ def test_eyes_and_calibration_are_those_of_the_bag(tmp_path: Path) -> None:
         assert np.array_equal(found.distortion, expected)
     recording = open_recording(tmp_path / "rec")
     shades = {one.index: int(np.median(one.rgb)) for one in recording.right_frames()}
-    assert shades == {0: 39, 1: 69, 3: 129}, "each with the frame of its moment"
+    assert shades == {0: 39, 1: 69, 3: 129}, "each assigned to the frame of its time"
     frames = list(recording.frames())
     assert [int(np.median(one.rgb)) for one in frames] == pytest.approx([30, 60, 90, 120], abs=2)
     assert [one.time_s for one in frames] == pytest.approx(1 + np.arange(1, 5) / FPS, abs=1e-5)
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.float32])
-def test_depth_is_that_of_the_bag(tmp_path: Path, kind: type) -> None:
+def test_depth_equals_the_bags(tmp_path: Path, kind: type) -> None:
     """Millimetres in 16 bits, metres in floats."""
     depth_mm = np.add.outer(np.arange(SIZE[1]), np.arange(500, 500 + SIZE[0]))
-    film = [{"left": np.zeros((*SIZE[::-1], 3), np.uint8)}]
-    told = (depth_mm / (1000 if kind is np.float32 else 1)).astype(kind)
-    source = write_bag(tmp_path / "bag", film, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]), (told,))
+    video = [{"left": np.zeros((*SIZE[::-1], 3), np.uint8)}]
+    depth = (depth_mm / (1000 if kind is np.float32 else 1)).astype(kind)
+    source = write_bag(
+        tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]), (depth,)
+    )
     found = registry.read_source(source, {"depth": DEPTH, "force": ARMS[0]})
     about = {"scale_mm_per_px": AWAY_MM / FOCAL}
     recording = open_recording(
@@ -163,43 +167,45 @@ def test_partners_are_each_others_nearest() -> None:
     "use",
     [
         {"right": "/nothing"},
-        {"right": EYES["right"], "depth": EYES["left"]},
-        {"frames": EYES["left"], "calibration": "/a"},
+        {"right": CAMERAS["right"], "depth": CAMERAS["left"]},
+        {"frames": CAMERAS["left"], "calibration": "/a"},
         {},
     ],
 )
-def test_what_is_not_clear_is_refused(tmp_path: Path, use: dict[str, str]) -> None:
-    film = [{eye: np.zeros((270, 480, 3), np.uint8) for eye in EYES}]  # not of the calibration's size
-    source = write_bag(tmp_path / "bag", film, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]))
-    for further in ({}, {"right": EYES["right"]}):
+def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, str]) -> None:
+    video = [
+        {camera: np.zeros((270, 480, 3), np.uint8) for camera in CAMERAS}
+    ]  # another size than the calibration's
+    source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]))
+    for further in ({}, {"right": CAMERAS["right"]}):
         with pytest.raises(UserError):
             registry.read_source(source, {"force": ARMS[0], **further, **use})
 
 
 @pytest.mark.slow
 def test_a_bag_becomes_a_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One command each: import, score. The tissue slides with the force, in both eyes alike."""
+    """The tissue moves with the force, equally in both cameras."""
     monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})  # slow
     apart = round(FOCAL * BASE_MM / AWAY_MM)
     rest = texture(SIZE[1], SIZE[0] + apart)
     newtons = np.zeros((200, 3))
     newtons[:, 0] = 0.05 * np.clip(np.sin(np.arange(-40, 160) / 100 * np.pi), 0, None)
     wide = [pushed(rest, 160 * force) for force in newtons[::10, 0]]
-    film = [{"left": one[:, : SIZE[0]], "right": one[:, apart:]} for one in wide]
-    source = write_bag(tmp_path / "bag", film, newtons, lenses(PARALLEL, 2 * [np.zeros(5)]))
+    video = [{"left": one[:, : SIZE[0]], "right": one[:, apart:]} for one in wide]
+    source = write_bag(tmp_path / "bag", video, newtons, lenses(PARALLEL, 2 * [np.zeros(5)]))
     done = bring_in(source, tmp_path / "rec")
     assert done.exit_code == 0, done.output
     score = ["score", str(tmp_path / "rec"), "--flow", "dis", "--no-pulse", "-o", str(tmp_path / "score")]
     done = CliRunner().invoke(app, score)
     assert done.exit_code == 0, done.output
     curve = json.loads((tmp_path / "score/score.json").read_text())["curve"]
-    sensor, said = np.array(curve["sensor_mn"]), np.array(curve["predicted_mn"]["D2FNet"])
+    sensor, predicted = np.array(curve["sensor_mn"]), np.array(curve["predicted_mn"]["D2FNet"])
     assert sensor.max() == pytest.approx(50, rel=0.05)
-    assert np.corrcoef(sensor, said)[0, 1] > 0.9
+    assert np.corrcoef(sensor, predicted)[0, 1] > 0.9
 
 
 def test_inverse_depth_is_refused() -> None:
-    """`32FC1; compressedDepth` holds A / depth + B: read as millimetres it would be silently wrong."""
+    """`32FC1; compressedDepth` holds A / depth + B: as millimetres it would be wrong."""
     message = SimpleNamespace(format="32FC1; compressedDepth png", data=b"")
     with pytest.raises(UserError):
         _depth(Path("bag"), message)

@@ -1,4 +1,4 @@
-"""Simple methods on data they must get right."""
+"""Baselines on data of a linear solid."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def methods() -> dict[str, Method]:
     return baselines.as_methods(baselines.fitted_rules(clips(), "recovered"), "recovered")
 
 
-def ask(method: Method, force: NDArray[np.float64], young: float) -> float:
+def estimate(method: Method, force: NDArray[np.float64], young: float) -> float:
     scene = MethodContext(np.ones((96, 96), bool), 36 / 96, young)
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)
@@ -54,13 +54,13 @@ def ask(method: Method, force: NDArray[np.float64], young: float) -> float:
 
 def test_linear_solids_force_is_found_and_scales_with_stiffness(methods: dict[str, Method]) -> None:
     force = np.array([6.0, 0, 0])
-    assert ask(methods[baselines.RIDGE], force, 1.0) == pytest.approx(6, rel=0.12)
-    assert ask(methods[baselines.RIDGE], force, 2.5) == pytest.approx(
-        2.5 * ask(methods[baselines.RIDGE], force, 1.0)
+    assert estimate(methods[baselines.RIDGE], force, 1.0) == pytest.approx(6, rel=0.12)
+    assert estimate(methods[baselines.RIDGE], force, 2.5) == pytest.approx(
+        2.5 * estimate(methods[baselines.RIDGE], force, 1.0)
     )
 
 
-def test_ridge_is_its_formula_with_the_strength_that_errs_least_on_folds_left_out() -> None:
+def test_ridge_equals_its_formula_with_the_strength_of_least_error_on_folds_left_out() -> None:
     rng = np.random.default_rng(0)
     x, fold = rng.normal(size=(60, 8)) * np.geomspace(1, 0.01, 8), np.arange(60) % 4
     y = x @ rng.normal(size=(8, 3)) + [0.02, 0.02, 0.5] * rng.normal(size=(60, 3))
@@ -81,26 +81,25 @@ def test_ridge_is_its_formula_with_the_strength_that_errs_least_on_folds_left_ou
     chosen = [int(np.argmin([e[part].sum() for e in errors])) for part in parts]
     assert chosen[0] != chosen[1]
     by_hand = [x @ solve(x, y[:, part], alphas[k]) for part, k in zip(parts, chosen, strict=True)]
-    said = baselines.ridge(x, y, fold, strengths, parts).predict(x)
-    np.testing.assert_allclose(said, np.concatenate(by_hand, axis=1), rtol=1e-9, atol=1e-12)
+    found = baselines.ridge(x, y, fold, strengths, parts).predict(x)
+    np.testing.assert_allclose(found, np.concatenate(by_hand, axis=1), rtol=1e-9, atol=1e-12)
 
 
-def test_fitted_on_two_eyes_asks_for_two() -> None:
-    told = []
+def test_a_baseline_fitted_on_stereo_requires_stereo() -> None:
+    stereo = []
     for clip in clips():
         moved = clip.displacement["recovered"]
-        told.append(
-            replace(clip, displacement={"motion": np.concatenate([moved, 0.5 * moved[:, :1]], axis=1)})
-        )
-    method = baselines.as_methods(baselines.fitted_rules(told, "motion"), "motion")[baselines.RIDGE]
+        motion = np.concatenate([moved, 0.5 * moved[:, :1]], axis=1)
+        stereo.append(replace(clip, displacement={"motion": motion}))
+    method = baselines.as_methods(baselines.fitted_rules(stereo, "motion"), "motion")[baselines.RIDGE]
     force = np.array([6.0, 0, 0])
     scene = MethodContext(np.ones((96, 96), bool), 36 / 96, 1.0)
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)[..., None]
-    seen = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
-    flow, sure = seen[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
+    motion = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
+    flow, sure = motion[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
     assert isinstance(method, Uses3D)
-    said = method.in_space(flow, sure, Moved(seen, np.full_like(seen, 0.01)), scene, False)
-    assert said.size_mn == pytest.approx(6, rel=0.12)
-    with pytest.raises(UserError, match="second eye"):
+    found = method.in_space(flow, sure, Moved(motion, np.full_like(motion, 0.01)), scene, False)
+    assert found.size_mn == pytest.approx(6, rel=0.12)
+    with pytest.raises(UserError, match="right camera"):
         method(flow, sure, scene, False)

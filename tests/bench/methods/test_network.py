@@ -1,4 +1,4 @@
-"""A network's answer to no motion is taken off its answers, as a sensor's zero is."""
+"""A network's estimate at rest is subtracted from its estimates, like a sensor's tare."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Methods of other packages stand in scores, table and report beside ours; what goes wrong is one line."""
+"""Methods of other packages in scores and score.json; their errors become one line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ import bench
 
 
 class Push:
-    """The inverse of what the recording was made with, off by a tenth."""
+    """The inverse of the recording's force law, with an error of 10%."""
 
     def __call__(self, flow, confidence, scene, picture):
         height, width = flow.shape[:2]
@@ -30,10 +30,10 @@ class Push:
         return bench.ForceEstimate(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
 
 
-raises = lambda: lambda *asked: {}["nothing"]
-exits = lambda: lambda *asked: exit(0)
-silent = lambda: lambda *asked: None
-short = lambda: lambda *asked: bench.ForceEstimate(np.zeros(2))
+raises = lambda: lambda *inputs: {}["nothing"]
+exits = lambda: lambda *inputs: exit(0)
+silent = lambda: lambda *inputs: None
+short = lambda: lambda *inputs: bench.ForceEstimate(np.zeros(2))
 nothing = lambda: None
 '''
 
@@ -49,7 +49,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> 
 
 
 @pytest.mark.slow
-def test_it_is_scored_and_shown_beside_the_network(
+def test_a_plug_in_is_scored_with_the_network(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed(tmp_path, monkeypatch, pushes="Push")
@@ -60,16 +60,16 @@ def test_it_is_scored_and_shown_beside_the_network(
     own = result.methods["pushes"]
     assert own.scores["mae_mn"] < np.nanmean(np.abs(result.sensor_mn)) / 3
     assert own.worse_by_mn is not None, "paired with the network on the same frames"
-    told = json.loads((tmp_path / "score/score.json").read_text("utf-8"))
-    assert told["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(own.scores["mae_mn"])
-    assert told["settings"]["plug_ins"] == {"pushes": "lab_methods 1.2"}
+    tree = json.loads((tmp_path / "score/score.json").read_text("utf-8"))
+    assert tree["methods"]["pushes"]["scores"]["mae_mn"] == pytest.approx(own.scores["mae_mn"])
+    assert tree["settings"]["plug_ins"] == {"pushes": "lab_methods 1.2"}
     again = bench.score(recording, model, settings=settings)
     assert again.methods["pushes"].scores == pytest.approx(own.scores, nan_ok=True)
     assert "pushes" not in bench.score(recording, model, settings=settings, baselines=False).methods
 
 
 @pytest.mark.parametrize("at", ["raises", "exits", "silent", "short", "nothing", "Missing"])
-def test_what_is_wrong_in_it_names_it(
+def test_errors_name_the_plug_in(
     at: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     installed(tmp_path, monkeypatch, own=at)
@@ -78,7 +78,7 @@ def test_what_is_wrong_in_it_names_it(
         bench.score(recording, model, settings=bench.Settings(rate_hz=None, pulse=False))
 
 
-def test_a_method_cannot_change_what_the_others_see(recording: Path) -> None:
+def test_a_method_cannot_change_the_others_input(recording: Path) -> None:
     def wipe(flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
         force = bench.ForceEstimate(np.array([np.abs(flow).max(), 0.0, 0.0]))
         flow[:] = confidence[:] = 0
@@ -91,7 +91,7 @@ def test_a_method_cannot_change_what_the_others_see(recording: Path) -> None:
     assert np.nanmax(both["b"].size_mn) > 0
 
 
-def test_a_method_may_answer_a_whole_film_anew(recording: Path) -> None:
+def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
     class Later:
         short = False
 
@@ -110,13 +110,13 @@ def test_a_method_may_answer_a_whole_film_anew(recording: Path) -> None:
         bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
 
 
-def test_a_name_of_ours_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plug_in_cannot_have_a_reserved_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed(tmp_path, monkeypatch, physics="Push")
     with pytest.raises(UserError, match="physics"):
         comparison.simpler_methods(None, None)
 
 
-def test_the_answer_of_both_can_not_be_replaced(recording: Path) -> None:
-    own = {"network and physics": lambda *asked: bench.ForceEstimate(np.zeros(3))}
+def test_the_fusion_cannot_be_replaced(recording: Path) -> None:
+    own = {"network and physics": lambda *inputs: bench.ForceEstimate(np.zeros(3))}
     with pytest.raises(UserError):
         bench.score(recording, methods=own)

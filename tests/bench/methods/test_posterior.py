@@ -18,7 +18,7 @@ BARE = TissueKind("bonded", 0.0, 0.45)
 STILL = np.zeros(3)
 
 
-def seen(moved: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
+def observed(moved: Floats, noise_mm: float = 0.0, seed: int = 0) -> Observation:
     """(P, C) mm with white noise, whose deviation is stated."""
     noise = noise_mm * np.random.default_rng(seed).normal(size=moved.shape)
     return Observation((moved + noise).T, np.full(moved.T.shape, max(noise_mm, 0.01)))
@@ -47,27 +47,27 @@ def basis() -> LoadBasis:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("force", [[3.0, 0.0, 0.0], [0.0, -1.0, 4.0]])
-def test_a_contacts_force_is_found_and_held(basis: LoadBasis, force: list[float]) -> None:
+def test_a_contacts_force_is_estimated_and_in_its_interval(basis: LoadBasis, force: list[float]) -> None:
     moved = pressed(basis, BARE, force)
     for noise in (0.0, 0.03):
-        found = posterior.infer(basis, seen(moved, noise), STILL)
+        found = posterior.infer(basis, observed(moved, noise), STILL)
         assert found.force.mean == pytest.approx(force, abs=0.1 * np.linalg.norm(force))
         low, high = physics.size_interval(found.force, 0.08)
         assert low < np.linalg.norm(force) < high
         assert found.load.sum(axis=0) == pytest.approx(found.force.mean, abs=1e-6)
-    across = posterior.infer(posterior.load_basis(2, BARE), seen(moved[:, :2], 0.01), STILL[:2])
+    across = posterior.infer(posterior.load_basis(2, BARE), observed(moved[:, :2], 0.01), STILL[:2])
     assert across.force.mean[:2] == pytest.approx(force[:2], abs=0.15 * np.linalg.norm(force))
 
 
 @pytest.mark.slow
-def test_one_eye_says_that_it_hardly_sees_a_press_along_the_view(basis: LoadBasis) -> None:
-    one_eye, inside, count = posterior.load_basis(2, BARE), 0, 0
+def test_monocular_intervals_cover_presses_along_the_optical_axis(basis: LoadBasis) -> None:
+    monocular, inside, count = posterior.load_basis(2, BARE), 0, 0
     for size in (1.0, 2.0, 3.0, 5.0):
         moved = pressed(basis, BARE, [0.0, 0.0, size])[:, :2]
         for noise in (0.04, 0.06):
             for seed in range(5):
-                found = posterior.infer(one_eye, seen(moved, noise, seed), STILL[:2])
-                low, high = physics.size_interval(found.force, 0.08, eyes=1)
+                found = posterior.infer(monocular, observed(moved, noise, seed), STILL[:2])
+                low, high = physics.size_interval(found.force, 0.08, cameras=1)
                 inside, count = inside + (low <= size <= high), count + 1
     assert inside >= 0.85 * count
 
@@ -75,7 +75,7 @@ def test_one_eye_says_that_it_hardly_sees_a_press_along_the_view(basis: LoadBasi
 @pytest.mark.slow
 def test_no_motion_is_no_force(basis: LoadBasis) -> None:
     for noise in (0.0, 0.03):
-        found = posterior.infer(basis, seen(np.zeros((len(basis.known.points), 3)), noise), STILL)
+        found = posterior.infer(basis, observed(np.zeros((len(basis.known.points), 3)), noise), STILL)
         low, high = physics.size_interval(found.force, 0.08)
         assert np.linalg.norm(found.force.mean) < 0.2
         assert low == 0.0
@@ -83,22 +83,22 @@ def test_no_motion_is_no_force(basis: LoadBasis) -> None:
 
 
 @pytest.mark.slow
-def test_the_tissues_own_motion_is_learnt_where_nothing_touches(basis: LoadBasis) -> None:
+def test_the_tissues_own_motion_is_estimated_from_contact_free_frames(basis: LoadBasis) -> None:
     rng = np.random.default_rng(1)
     terms = posterior.polynomials(basis.known.points)
     own = [terms @ (rng.normal(size=(6, 3)) * [0.0, 0.05, 0.25]) for _ in range(9)]
-    sizes = posterior.own_motion(basis, [seen(one, 0.005) for one in own[:8]])
+    sizes = posterior.own_motion(basis, [observed(one, 0.005) for one in own[:8]])
     assert sizes[0] < 0.03
-    assert sizes[1:] == pytest.approx([0.1, 0.5], rel=0.5)  # twice the drawn: few frames show less
+    assert sizes[1:] == pytest.approx([0.1, 0.5], rel=0.5)  # twice the drawn size, as few frames show less
     force = np.array([0.5, 0.0, 2.0])
-    both = seen(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
-    told, untold = (posterior.infer(basis, both, size).force.mean for size in (sizes, STILL))
-    assert np.linalg.norm(told - force) < 0.25 * np.linalg.norm(force)
-    assert np.linalg.norm(told - force) < 0.5 * np.linalg.norm(untold - force)
+    both = observed(pressed(basis, BARE, force.tolist()) + own[8], 0.01)
+    known, unknown = (posterior.infer(basis, both, size).force.mean for size in (sizes, STILL))
+    assert np.linalg.norm(known - force) < 0.25 * np.linalg.norm(force)
+    assert np.linalg.norm(known - force) < 0.5 * np.linalg.norm(unknown - force)
 
 
 @pytest.mark.slow
-def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadBasis) -> None:
+def test_intervals_have_90_percent_coverage_of_draws_from_the_model(basis: LoadBasis) -> None:
     rng, inside, count, model = np.random.default_rng(2), 0, 150, posterior.MODEL
     sizes = np.array([0.02, 0.02, 0.05])
     for _ in range(count):
@@ -107,10 +107,10 @@ def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadB
         contact = size * rng.normal(size=3)
         inward = basis.contacts[:, rng.integers(basis.contacts.shape[1])] @ contact
         coefficients = np.append(smooth + inward, np.repeat(sizes, 6) * rng.normal(size=18))
-        spare = np.sqrt(basis.unseen) * spread * rng.normal(size=3)
+        spare = np.sqrt(basis.omitted) * spread * rng.normal(size=3)
         force = basis.force @ smooth + spare + contact
         moved = (basis.motion @ coefficients).reshape(3, -1)
-        # The model counts variances threefold; what it draws has them so.
+        # With the model's enlarged variances.
         local = basis.around @ np.square(moved).mean(axis=0)
         noise = np.sqrt(model.correlated * (0.02**2 + model.least_mm**2 + model.misfit**2 * local))
         drawn = Observation(moved + noise * rng.normal(size=moved.shape), np.full(moved.shape, 0.02))
@@ -120,7 +120,7 @@ def test_ninety_of_a_hundred_draws_of_the_model_lie_in_its_interval(basis: LoadB
 
 
 @pytest.mark.slow
-def test_theory_of_the_half_space_is_read(basis: LoadBasis) -> None:
+def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
     """Boussinesq's and Cerruti's point forces on a disc (Johnson, Contact Mechanics, 1985, ch. 3)."""
     nu, force, radius = 0.45, np.array([1.0, 0.0, 3.0]), 3.0
     steps = np.linspace(-1, 1, 30) * radius
@@ -138,27 +138,27 @@ def test_theory_of_the_half_space_is_read(basis: LoadBasis) -> None:
     w = p * 2 * (1 - nu) / r + q * (1 - 2 * nu) * x / r**2
     moved = np.stack([(part * share).sum(axis=1) for part in (u, v, w)], axis=1)
     free = posterior.load_basis(3, TissueKind("free", 0.0, nu))
-    # The block's walls are fixed 50 mm away, where the half-space still sinks: that is let be.
-    found = posterior.infer(free, seen(moved, 0.01), np.full(3, 0.05))
+    # The block's walls are fixed 50 mm away, where the half-space still sinks: allowed as own motion.
+    found = posterior.infer(free, observed(moved, 0.01), np.full(3, 0.05))
     assert found.force.mean == pytest.approx(force, abs=0.15 * 3.2)
 
 
 @pytest.mark.slow
-def test_a_film_tells_a_membrane_and_meta_narrows_it(basis: LoadBasis) -> None:
+def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: LoadBasis) -> None:
     side = 80
     scene = MethodContext(np.ones((side, side), bool), 12 * np.sqrt(np.pi) / side, 2.0)
     stiff = []
     for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
-        film = [seen(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
-        found = physics.weigh_tissues(scene, film, STILL)
+        frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
+        found = physics.weigh_tissues(scene, frames, STILL)
         stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
     assert "evidence for a membrane of about" in physics.describe(found, scene)
-    # Another mesh's bare tissue may look like a thin membrane, never like a thick one.
+    # On another mesh bare tissue may be taken for a thin membrane, never for a thick one.
     assert stiff[0] <= 5 + 1e-9
     assert stiff[1] > 20
-    told = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
-    assert {(one.membrane, one.poisson) for one in physics.grid_of(told)} == {(0.0, 0.49)}
-    # What no frame speaks of is as likely as it was beforehand.
+    stated = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
+    assert {(one.membrane, one.poisson) for one in physics.candidate_tissues(stated)} == {(0.0, 0.49)}
+    # Without frames the prior remains.
     nothing = physics.weigh_tissues(scene, [], STILL)
     thick = sum(one > 5 for one in physics.TISSUES.membranes_mm) / sum(
         one > 0 for one in physics.TISSUES.membranes_mm

@@ -1,4 +1,4 @@
-"""Reading recordings: times, gaps, rotation, and what is said of broken ones."""
+"""Reading recordings: times, gaps, rotation, pixel aspect and numbers."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_quoted_cell_is_one_cell_in_every_row(tmp_path: Path) -> None:
     assert got["fx_n"].tolist() == [2, 4, 6]
 
 
-def test_decimal_commas_are_read_where_they_can_be_told(tmp_path: Path) -> None:
+def test_decimal_commas_are_read_where_unambiguous(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("t_s;fx_n\n0,5;-1,25\n")
     assert [float(one[0]) for one in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == [0.5, -1.25]
@@ -117,10 +117,10 @@ def _numbered(folder: Path, count: int, first: int, lost: int) -> Recording:
 
 @given(count=st.integers(3, 14), first=st.integers(0, 1), lost=st.integers(0, 14))
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_what_is_of_one_moment_has_the_same_number(
+def test_files_of_one_moment_have_the_same_number(
     tmp_path_factory: pytest.TempPathFactory, count: int, first: int, lost: int
 ) -> None:
-    """One lost picture is a gap; counting from 1 is found out, or refused where a loss may hide it."""
+    """A lost picture is a gap; counting from 1 is detected, or refused where a loss makes it ambiguous."""
     folder = tmp_path_factory.mktemp("numbered")
     if lost < count and (first or lost == 0):
         with pytest.raises(UserError, match=r"frames\.csv"):
@@ -138,7 +138,7 @@ def test_what_is_of_one_moment_has_the_same_number(
 
 
 def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
-    """A disc that a 4:3 sensor wrote three quarters as wide is round."""
+    """A disc recorded with 4:3 pixels is round."""
     x, y = np.meshgrid(np.arange(96), np.arange(96))
     disc = (((x - 47.5) * 4 / 3) ** 2 + (y - 47.5) ** 2 < 30**2).astype(np.uint8)
     with av.open(str(tmp_path / "v.mp4"), "w") as out:
@@ -149,12 +149,12 @@ def test_pixels_of_a_video_are_made_square(tmp_path: Path) -> None:
         for packet in [*stream.encode(frame), *stream.encode()]:
             out.mux(packet)
     (picture,) = video.read_video(tmp_path / "v.mp4")
-    seen = picture.rgb[..., 0] > 127
-    assert seen.shape == (96, 128)
-    assert seen.any(0).sum() == pytest.approx(seen.any(1).sum(), abs=3)
+    disc_found = picture.rgb[..., 0] > 127
+    assert disc_found.shape == (96, 128)
+    assert disc_found.any(0).sum() == pytest.approx(disc_found.any(1).sum(), abs=3)
 
 
-def test_a_video_whose_container_states_no_number_of_frames_has_those_in_it(tmp_path: Path) -> None:
+def test_frames_are_counted_if_the_container_does_not_state_their_number(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=9, footage="mp4")
     with av.open(str(folder / "video.mp4")) as read, av.open(str(folder / "video.mkv"), "w") as copy:
         stream = copy.add_stream_from_template(read.streams.video[0])
@@ -166,7 +166,7 @@ def test_a_video_whose_container_states_no_number_of_frames_has_those_in_it(tmp_
     assert list(open_recording(folder).numbers()) == list(range(9))
 
 
-def test_a_written_meta_is_read_as_what_it_stands_for(tmp_path: Path) -> None:
+def test_a_written_meta_is_read_back_as_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "meta.yaml").write_text(meta.commented())
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
     assert set(meta.Stereo.model_fields) <= set(re.findall(r"\w+", meta.commented()))

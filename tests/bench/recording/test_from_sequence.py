@@ -1,4 +1,4 @@
-"""A sealed sequence exported as a recording gives back what it was, and nothing a lab wouldn't have."""
+"""A sequence exported as a recording has the same data, without ground truth that a lab lacks."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_pictures_forces_and_masks_come_back(tmp_path: Path) -> None:
     assert np.array_equal(mask, sequence["tool"][2])
 
 
-def test_nothing_of_the_truth_leaks(tmp_path: Path) -> None:
+def test_no_ground_truth_is_exported(tmp_path: Path) -> None:
     folder = export_recording(sealed(tmp_path), tmp_path / "rec")
     names = {path.relative_to(folder).parts[0] for path in folder.rglob("*")}
     assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
@@ -72,10 +72,10 @@ def test_the_first_sequence_that_no_model_was_trained_on(tmp_path: Path) -> None
     hashes = [sealed(tmp_path / "data", index).attrs["content_hash"] for index in range(3)]
     model = write_model(tmp_path / "model")
     words = ["from-dataset", str(tmp_path / "data"), "--unseen-by", "mono", "--unseen-by", str(model)]
-    for seen, exported in ((["fit", "select"], ["000002"]), (["test", "intervals"], ["000000"])):
-        split = {part: [content] for part, content in zip(seen, hashes, strict=False)}
+    for parts, exported in ((["fit", "select"], ["000002"]), (["test", "intervals"], ["000000"])):
+        split = {part: [content] for part, content in zip(parts, hashes, strict=False)}
         write_card(model, replace(read_card(model), split=split))
-        out = tmp_path / seen[0]
+        out = tmp_path / parts[0]
         assert CliRunner().invoke(app, [*words, "-o", str(out)]).exit_code == 0
         assert [folder.name for folder in out.iterdir()] == exported
     write_card(model, replace(read_card(model), split={"fit": hashes}))

@@ -1,4 +1,4 @@
-"""Broken recordings: each gives a clear line or a stated partial result; none crashes or hangs."""
+"""Broken recordings: each gives a one-line error or finding; none crashes."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from fake_recording import Maker, scored, texture
 from bench.recording import check, writer
 from synth.errors import UserError
 
-Spoil = Callable[[Path], object]
+Corruption = Callable[[Path], object]
 
 
-def text(name: str, content: str) -> Spoil:
+def text(name: str, content: str) -> Corruption:
     return lambda folder: (folder / name).write_text(content) and None
 
 
-def rows(change: Callable[[list[str]], list[str]]) -> Spoil:
-    def spoil(folder: Path) -> None:
+def rows(change: Callable[[list[str]], list[str]]) -> Corruption:
+    def corrupt(folder: Path) -> None:
         lines = (folder / "force.csv").read_text().splitlines()
         (folder / "force.csv").write_text("\n".join([lines[0], *change(lines[1:])]) + "\n")
 
-    return spoil
+    return corrupt
 
 
 def cut_video(folder: Path) -> None:
@@ -38,7 +38,7 @@ def cut_video(folder: Path) -> None:
 
 
 HEAD = "t_s,fx_n,fy_n,fz_n\n"
-CASES: dict[str, Spoil] = {
+CASES: dict[str, Corruption] = {
     "no meta": lambda folder: (folder / "meta.yaml").unlink(),
     "meta is not yaml": text("meta.yaml", "a: [1\nb: 2"),
     "pictures of two sizes": lambda folder: cv2.imwrite(str(folder / "frames/0003.png"), texture(50, 128)),
@@ -54,22 +54,22 @@ CASES: dict[str, Spoil] = {
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Maker(tmp_path_factory.mktemp("sound"))(frames=8)
+def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Maker(tmp_path_factory.mktemp("intact"))(frames=8)
 
 
-def test_the_sound_one_has_nothing_bad(sound: Path, tmp_path: Path) -> None:
+def test_an_intact_recording_has_no_bad_findings(intact: Path, tmp_path: Path) -> None:
     drawn = tmp_path / "tracked.png"
-    states = {finding.state for finding in check.check_recording(sound, picture=drawn)}
+    states = {finding.state for finding in check.check_recording(intact, picture=drawn)}
     assert states <= {"ok", "lack"}
     rows, columns = np.array(cv2.imread(str(drawn)).shape[:2]) // (4 * 96, 4 * 128)
     assert (rows, columns) == (2, 3)  # five frames and a legend, enlarged fourfold
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_broken_recording_is_told(sound: Path, tmp_path: Path, name: str) -> None:
+def test_a_broken_recording_is_reported(intact: Path, tmp_path: Path, name: str) -> None:
     folder = tmp_path / "rec"
-    shutil.copytree(sound, folder)
+    shutil.copytree(intact, folder)
     CASES[name](folder)
     findings = check.check_recording(folder)
     assert any(finding.state in ("odd", "bad") for finding in findings)

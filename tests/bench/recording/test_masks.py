@@ -1,4 +1,4 @@
-"""Masks of a recording: by frame, one for all, from another folder, and the part that is looked at."""
+"""Masks of a recording: by frame, one for all, and the tracked region."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _write(path: Path, left: int) -> None:
     assert cv2.imwrite(str(path), mask)
 
 
-def test_one_mask_serves_all_frames_that_have_none(tmp_path: Path) -> None:
+def test_mask_png_is_used_for_frames_without_a_mask(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=4)
     _write(folder / "mask.png", 10)
     _write(folder / "masks" / "000002.png", 30)
@@ -35,7 +35,7 @@ def test_one_mask_serves_all_frames_that_have_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["0 and 1", "alpha", "white", "soft", "16 bits"])
-def test_a_mask_is_read_however_it_was_saved(tmp_path: Path, kind: str) -> None:
+def test_masks_of_all_encodings_are_read(tmp_path: Path, kind: str) -> None:
     tool = np.zeros(_SIZE, np.uint8)
     tool[20:60, 30:90] = 1
     alpha = np.dstack([np.full((*_SIZE, 3), 255, np.uint8), 255 * tool])

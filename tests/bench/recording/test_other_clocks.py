@@ -1,4 +1,4 @@
-"""Stamps since 1970, bursts, sensors that lie across, and phantoms that are pushed hard."""
+"""Times since 1970, rotated sensors, and unknown scales."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def since_1970(folder: Path, frames: int, stamped: str = "both") -> None:
     writer.write_force(folder, t + EPOCH * (stamped != "frames"), newtons)
 
 
-def test_times_since_1970_are_brought_to_the_start_for_check_and_score(make: Maker) -> None:
+def test_times_since_1970_are_counted_from_the_start(make: Maker) -> None:
     spans = {"press_s": [EPOCH + 0.2, EPOCH + 1.0], "sensor": {"free_s": [[EPOCH, EPOCH + 0.15]]}}
     stamped = make("stamped", frames=20, meta=spans)
     since_1970(stamped, 20)
@@ -33,20 +33,19 @@ def test_times_since_1970_are_brought_to_the_start_for_check_and_score(make: Mak
     assert one.methods["bump"].scores["mae_mn"] == pytest.approx(
         other.methods["bump"].scores["mae_mn"], abs=1e-3
     )
-    said = {f.what: f.state for f in check.check_recording(stamped)}
-    assert said["clocks"] == "ok"
-    assert said["press"] == "ok"
+    states = {f.what: f.state for f in check.check_recording(stamped)}
+    assert (states["clocks"], states["press"]) == ("ok", "ok")
 
 
 @pytest.mark.parametrize("stamped", ["frames", "force"])
-def test_one_clock_since_1970_is_said_and_not_guessed_at(make: Maker, stamped: str) -> None:
+def test_a_single_clock_since_1970_is_not_scored(make: Maker, stamped: str) -> None:
     folder = make(frames=6)
     since_1970(folder, 6, stamped)
     result = scored(folder)
     assert result.methods["bump"].scores == {}
 
 
-def test_a_sensor_that_lies_across_is_turned_into_the_cameras_axes(make: Maker) -> None:
+def test_a_rotated_sensor_is_converted_to_the_cameras_axes(make: Maker) -> None:
     turn = Rotation.from_euler("xyz", [40, -25, 70], degrees=True).as_matrix()
     about = {"sensor": {"axes": "sensor", "to_camera": turn.tolist(), "low_pass_hz": None}}
     folder = make(frames=12, meta=about)
@@ -60,7 +59,7 @@ def test_a_sensor_that_lies_across_is_turned_into_the_cameras_axes(make: Maker) 
     assert set(result.methods["bump"].components) == {"x", "y", "z"}
 
 
-def test_unknown_scale_gives_answers_up_to_a_factor_and_says_so(make: Maker) -> None:
+def test_unknown_scale_gives_relative_forces(make: Maker) -> None:
     one = scored(make("one", frames=20, meta={"scale_mm_per_px": "unknown", "young_kpa": 1.0}))
     known = scored(make("two", frames=20, meta={"scale_mm_per_px": 32 / 128, "young_kpa": 1.0}))
     assert one.scale.mm_per_px == known.scale.mm_per_px

@@ -1,4 +1,4 @@
-"""A recording's second eye and depth camera, on a photograph warped by a motion in space that was put in."""
+"""A recording's right and depth camera, on a photograph warped by a known motion in three dimensions."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ SETTINGS = RecordingFlowSettings(rate_hz=None, pulse=False, masks="none")
 Make = Callable[..., Path]
 
 
-def seen(along: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: the photograph once its points have moved `along` px to the right."""
+def warped(along: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 RGB: the photograph with its points moved `along` px to the right."""
     wide = cv2.resize(data.astronaut(), (420, 420), interpolation=cv2.INTER_AREA)
     x = source(along) + 60
     return np.asarray(cv2.remap(wide, x.astype(np.float32), (ROWS + 30).astype(np.float32), cv2.INTER_CUBIC))
 
 
 def source(along: np.ndarray) -> np.ndarray:
-    """Rest columns (H, W) that are seen at each pixel."""
+    """Rest columns (H, W) that are visible at each pixel."""
     x = COLUMNS.astype(np.float64)
     for _ in range(40):
         x = COLUMNS - cv2.remap(along, x.astype(np.float32), ROWS.astype(np.float32), cv2.INTER_LINEAR)
@@ -50,12 +50,12 @@ def source(along: np.ndarray) -> np.ndarray:
 
 
 def rise(amount: float) -> np.ndarray:
-    """(H, W) mm that tissue on the left rest pixels went away by."""
+    """Motion (H, W) mm of the tissue away from the camera, on the left rest pixels."""
     return np.asarray(FOCAL * BASE / (FOCAL * BASE / AWAY - amount * DENT) - AWAY)
 
 
 def write_pair(folder: Path) -> dict[str, object]:
-    """Writes the calibration, and returns what meta.yaml says of it."""
+    """Writes the calibration and returns its section of meta.yaml."""
     storage = cv2.FileStorage(str(folder / "pair.yaml"), cv2.FILE_STORAGE_WRITE)
     right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
     for name, value in {"K1": K, "K2": right, "R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}.items():
@@ -76,9 +76,9 @@ def make(tmp_path: Path) -> Make:
             (folder / name).mkdir(parents=True)
         for t, amount in enumerate((0.0, 0.3, 0.6)):
             u, d = 2.5 * amount * DENT, -amount * DENT
-            cv2.imwrite(str(folder / f"frames/{t}.png"), seen(u)[..., ::-1])
+            cv2.imwrite(str(folder / f"frames/{t}.png"), warped(u)[..., ::-1])
             if second == "right":
-                cv2.imwrite(str(folder / f"right/{t}.png"), seen(u - d)[..., ::-1])
+                cv2.imwrite(str(folder / f"right/{t}.png"), warped(u - d)[..., ::-1])
             if second == "depth":
                 now = AWAY + cv2.remap(rise(amount), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
                 points = np.stack([np.zeros_like(now), np.zeros_like(now), now], axis=-1)
@@ -94,32 +94,32 @@ def make(tmp_path: Path) -> Make:
     return made
 
 
-class Looking:
-    """Keeps what it is told."""
+class Recorder:
+    """A method that stores the motion it is given."""
 
     def __init__(self) -> None:
-        self.told: list[Moved] = []
+        self.inputs: list[Moved] = []
 
     def __call__(
         self, flow: np.ndarray, confidence: np.ndarray, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        raise AssertionError("there is a second eye")
+        raise AssertionError("motion in three dimensions is available")
 
     def in_space(
         self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
-        self.told.append(moved)
+        self.inputs.append(moved)
         return ForceEstimate(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])
-def test_motion_in_space_is_what_was_put_in(make: Make, second: str) -> None:
-    method = Looking()
+def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> None:
+    method = Recorder()
     done = track_recording(open_recording(make(second)), {"it": method}, AWAY / FOCAL, SETTINGS)
-    assert len(method.told) == 3
-    assert not method.told[0].motion.any()
+    assert len(method.inputs) == 3
+    assert not method.inputs[0].motion.any()
     inner = (slice(15, -15), slice(15, -15))
-    for moved, amount in zip(method.told[1:], (0.3, 0.6), strict=True):
+    for moved, amount in zip(method.inputs[1:], (0.3, 0.6), strict=True):
         error = moved.motion[..., 2] - rise(amount)
         assert rise(amount).max() > 0.75
         assert np.sqrt((error[inner] ** 2).mean()) < 0.12
@@ -136,17 +136,17 @@ def test_motion_in_space_is_what_was_put_in(make: Make, second: str) -> None:
 
 
 @pytest.mark.parametrize(("second", "lost"), [("right", "1.png"), ("depth", "1.npy")])
-def test_a_picture_that_the_second_eye_lacks_is_a_gap(make: Make, second: str, lost: str) -> None:
+def test_a_missing_right_or_depth_picture_is_a_gap(make: Make, second: str, lost: str) -> None:
     folder = make(second)
     (folder / second / lost).unlink()
-    done = track_recording(open_recording(folder), {"it": Looking()}, AWAY / FOCAL, SETTINGS)
+    done = track_recording(open_recording(folder), {"it": Recorder()}, AWAY / FOCAL, SETTINGS)
     assert done.trusted == [True, False, True]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("second", ["right", "depth"])
-def test_a_breath_along_the_view_is_taken_off_depth(tmp_path: Path, second: str) -> None:
-    """The picture hardly shows it: the whole surface comes and goes, and is pressed in between."""
+def test_breathing_along_the_optical_axis_is_removed_from_depth(tmp_path: Path, second: str) -> None:
+    """The whole surface moves in depth, which one picture hardly shows, and is pressed meanwhile."""
     rate_hz, lift_mm, fps, count = 0.4, 0.5, 6.0, 72
     time = np.arange(count) / fps
     load = 0.5 * np.clip(np.sin(np.pi * (time - 5) / 2.5), 0, None) * ((time > 5) & (time < 7.5))
@@ -155,39 +155,39 @@ def test_a_breath_along_the_view_is_taken_off_depth(tmp_path: Path, second: str)
         (tmp_path / name).mkdir()
     for t, (amount, lift) in enumerate(zip(load, breath, strict=True)):
         u, depth = 2.5 * amount * DENT, AWAY + lift + rise(amount)
-        cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), seen(u)[..., ::-1])
+        cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), warped(u)[..., ::-1])
         if second == "right":
             d = FOCAL * BASE * (1 / depth - 1 / AWAY)
-            cv2.imwrite(str(tmp_path / f"right/{t:03d}.png"), seen(u - d)[..., ::-1])
+            cv2.imwrite(str(tmp_path / f"right/{t:03d}.png"), warped(u - d)[..., ::-1])
         else:
             now = cv2.remap(depth.astype(np.float32), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
             np.save(tmp_path / f"depth/{t:03d}.npy", now)
     about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": fps}
     about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
     writer.write_meta(tmp_path, about)
-    told = {}
+    motion = {}
     for pulse in (False, True):
-        method = Looking()
+        method = Recorder()
         done = track_recording(
             open_recording(tmp_path), {"it": method}, AWAY / FOCAL, replace(SETTINGS, pulse=pulse)
         )
-        told[pulse] = np.stack([moved.motion for moved in method.told[-count:]])
+        motion[pulse] = np.stack([moved.motion for moved in method.inputs[-count:]])
     (rhythm,) = done.pulse
     assert rhythm["rate_hz"] == pytest.approx(rate_hz, rel=0.03)
     assert rhythm["amplitude_mm"] == pytest.approx(lift_mm, rel=0.1)
     inner = (slice(1, None), slice(15, -15), slice(15, -15), 2)
     truth = np.stack([rise(amount) for amount in load])
-    before, after = (np.sqrt(np.square(told[k][inner] - truth[inner[:3]]).mean()) for k in (False, True))
+    before, after = (np.sqrt(np.square(motion[k][inner] - truth[inner[:3]]).mean()) for k in (False, True))
     assert before > 0.5
     assert after < 0.12
     deepest = int(np.argmax(load))
-    assert told[True][deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
+    assert motion[True][deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
     assert done.stereo is not None
-    assert len(method.told) == 2 * count
+    assert len(method.inputs) == 2 * count
 
 
 def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
-    """Two cameras that turn inwards: x_right = R x_left + T."""
+    """x_right = R x_left + T."""
     rng = np.random.default_rng(0)
     lenses = [
         Camera(K + 0, np.array([-0.1, 0.02, 0, 0, 0]), turn, rng.normal(0, 20, 3), SIZE, 0.0, 0.0, 0.2)
@@ -201,7 +201,7 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)
 
 
-def test_a_baseline_in_metres_is_named() -> None:
+def test_a_baseline_in_metres_is_reported() -> None:
     (found,) = judge_stereo(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
     assert found.state == "bad"
     assert "metres" in found.message
@@ -212,7 +212,7 @@ def test_a_baseline_in_metres_is_named() -> None:
     ("order", "lag"),
     [(lambda k: k, 0), (lambda k: np.maximum(k - 1, 0), 1), (lambda k: np.minimum(k + (k > 9), 23), -1)],
 )
-def test_a_right_eye_of_other_moments_is_found_by_its_motion(
+def test_a_lag_of_the_right_camera_is_found_by_its_motion(
     order: Callable[[NDArray[np.intp]], NDArray[np.intp]], lag: int
 ) -> None:
     rng = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""The whole way from a folder to score.json and report.html, displacement and force being known."""
+"""Scoring from folder to score.json and report.html, with known displacement and force."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def test_force_is_recovered_from_the_video(make: Maker, footage: str) -> None:
     assert scores["mae_mn"] < 8  # of 120: TV-L1 flattens peaks of a few pixels
     assert abs(scores["lag_s"]) <= 0.025
     assert scores["contact_f1"] == 1
-    assert scores["ghost_rate"] == 0
+    assert scores["false_positive_rate"] == 0
 
 
 def test_fast_footage_is_thinned_and_large_pictures_shrunk(make: Maker) -> None:
     folder = make(frames=13, fps=40.0, size=(96, 640))
     result = scored(folder, shrink=0, rate_hz=10.0)
-    assert result.followed.frame == [0, 4, 8, 12]
-    assert result.followed.tissue is not None
-    assert result.followed.tissue.shape == (48, 320)
+    assert result.tracked.frame == [0, 4, 8, 12]
+    assert result.tracked.tissue is not None
+    assert result.tracked.tissue.shape == (48, 320)
 
 
 def test_sensor_gap_is_not_scored(make: Maker) -> None:
@@ -53,28 +53,28 @@ def test_json_has_no_nan_and_the_page_stands_alone(make: Maker, tmp_path: Path) 
         assert outside not in page
 
 
-def test_page_escapes_what_a_recording_says(make: Maker) -> None:
+def test_the_page_escapes_texts_of_a_recording(make: Maker) -> None:
     result = scored(make(frames=5, meta={"specimen": "<script>alert(1)</script>"}))
     page = report.render_report(result, "</title><script>alert(2)</script>")
     assert "<script>alert" not in page
 
 
-def test_without_stiffness_only_what_no_factor_changes_is_scored(make: Maker) -> None:
+def test_without_stiffness_only_scores_independent_of_a_factor_are_reported(make: Maker) -> None:
     folder = make(frames=30, meta={"young_kpa": "unknown", "press_s": [0.2, 1.2]})
     result = scored(folder)
     scores, calibrated = result.methods["bump"].scores, result.methods["bump"].calibrated
     assert scores["r"] > 0.99
     assert all(np.isnan(scores[key]) for key in ("mae_mn", "rmse_mn", "ccc", "r2", "gain", "contact_f1"))
     assert set(result.methods["bump"].intervals) == {"r"}
-    assert calibrated["mae_mn"] < 10  # the press's gain gives newtons back
+    assert calibrated["mae_mn"] < 10  # after the press's gain forces are in newtons
     assert 'id="bland"' not in report.render_report(result, "t")
 
 
-def test_a_contact_ends_where_samples_are_left_out() -> None:
+def test_a_contact_ends_at_samples_that_are_not_scored() -> None:
     time = np.arange(100) / 10.0
     force = np.full(100, 50.0)
     force[:5] = 0
-    kept = np.ones(100, bool)
-    kept[40:60] = False
-    _, events = metrics.compute_all(time, force, force, 0.0, kept)
+    used = np.ones(100, bool)
+    used[40:60] = False
+    _, events = metrics.compute_all(time, force, force, 0.0, used)
     assert [(event["from_s"], event["to_s"]) for event in events] == [(0.5, 3.9), (6.0, 9.9)]

@@ -1,4 +1,4 @@
-"""What a report says first: nothing of lost recordings, shapes without E, the press before all else."""
+"""The headline of a report: no numbers for lost recordings, relative scores without E, the press first."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIZE = (96, 128)
 
 
 class Known(LocalFlow):
-    """A flow that is in proportion to the force, and that loses the frames it is told to."""
+    """A flow proportional to the force, which loses the given frames."""
 
     def __init__(self, lost: set[int], fps: float = 10.0) -> None:
         self.lost, self.fps, self.frame = lost, fps, 0
@@ -48,13 +48,13 @@ def run(folder: Path, lost: set[int] | None = None, **methods: Method) -> Result
     return scored(folder, methods, flow_here=Known(lost or set()))
 
 
-def test_lost_frames_are_out_of_the_scores_gaps_in_the_curves_and_counted(make: Maker) -> None:
+def test_lost_frames_are_not_scored_and_are_gaps_in_the_curves(make: Maker) -> None:
     whole, some = run(make("whole")), run(make("some"), {7, 8, 20})
     assert whole.lost.sum() == 0
     method = some.methods["bump"]
     assert np.flatnonzero(some.lost).tolist() == [7, 8, 20]
-    assert np.isnan(method.size_mn[some.lost]).all(), "what was said of a lost frame is no answer"
-    # 50 px would have been 2 N: an average over all frames knows of it, one over the followed ones doesn't.
+    assert np.isnan(method.size_mn[some.lost]).all(), "a lost frame has no estimate"
+    # 50 px would be 2 N: it must not be in the average.
     assert method.scores["mae_mn"] < 1
     assert method.scores["n"] == 27
     assert method.scores["dropout"] == pytest.approx(0.1)
@@ -66,42 +66,41 @@ def test_lost_frames_are_out_of_the_scores_gaps_in_the_curves_and_counted(make: 
     assert "3 of 30" in headline(some).trust
 
 
-def test_force_goes_with_the_scales_square_so_its_error_counts_twice(make: Maker) -> None:
+def test_scale_uncertainty_counts_twice_as_force_is_proportional_to_its_square(make: Maker) -> None:
     result = run(make(frames=4, meta={"scale_uncertainty": 0.05, "young_uncertainty": 0.1}))
     assert result.relative_uncertainty == pytest.approx(math.hypot(0.10, 0.1))
 
 
-def test_over_a_fifth_lost_no_number_is_said_first(make: Maker) -> None:
-    result = run(make(), set(range(8, 16)))
-    said = headline(result)
-    assert said.refused
-    assert said.tiles == ()
+def test_with_over_a_fifth_lost_the_headline_has_no_numbers(make: Maker) -> None:
+    first = headline(run(make(), set(range(8, 16))))
+    assert first.refused
+    assert first.tiles == ()
 
 
-def test_the_first_number_and_its_share_of_the_peak_are_of_one_score(make: Maker) -> None:
+def test_the_first_number_and_its_share_of_the_peak_are_of_the_same_score(make: Maker) -> None:
     for meta in ({}, {"press_s": [0.2, 1.2]}):
         result = run(make("pressed" if meta else "free", meta=meta))
         method = result.methods[result.main]
-        scores, said = method.calibrated if meta else method.scores, headline(result)
-        assert (said.tiles[0].value, said.of_peak) == (scores["mae_mn"], scores["mae_of_peak"])
+        scores, first = method.calibrated if meta else method.scores, headline(result)
+        assert (first.tiles[0].value, first.of_peak) == (scores["mae_mn"], scores["mae_of_peak"])
 
 
-def test_mean_and_peak_of_a_flow_by_hand() -> None:
+def test_mean_and_peak_length_of_a_flow() -> None:
     flow = np.zeros((10, 20, 2), np.float32)
     flow[..., 0] = np.arange(200).reshape(10, 20)
-    seen = np.ones((10, 20), np.float32)
-    seen[5:] = 0
+    visible = np.ones((10, 20), np.float32)
+    visible[5:] = 0
     scene = MethodContext(np.ones((10, 20), bool), 0.5, None)
-    sizes = {name: method(flow, seen, scene, False).force_mn[0] for name, method in flow_sizes().items()}
-    lengths = 0.5 * np.arange(200)  # what is hidden counts as it is filled in
+    sizes = {name: method(flow, visible, scene, False).force_mn[0] for name, method in flow_sizes().items()}
+    lengths = 0.5 * np.arange(200)  # hidden tissue counts with its filled-in flow
     assert sizes == pytest.approx({"mean |flow|": lengths.mean(), "peak |flow|": np.percentile(lengths, 98)})
-    nothing = flow_sizes()["mean |flow|"](flow, np.zeros_like(seen), scene, False)
+    nothing = flow_sizes()["mean |flow|"](flow, np.zeros_like(visible), scene, False)
     assert math.isnan(nothing.force_mn[0])
 
 
-def test_a_shape_that_is_wrong_shows(make: Maker) -> None:
+def test_shape_error_of_a_wrong_curve(make: Maker) -> None:
     result = run(make(), late=lambda *given: ForceEstimate(np.sqrt(Bump()(*given).force_mn)))
-    # min over g of mean |g sqrt(x) - x| / mean peak, x being the half-waves: by hand.
+    # min over g of mean |g sqrt(x) - x| / mean peak, x being the half-waves.
     x = force_curve(np.arange(30) / 10)
     g = float(x @ np.sqrt(x) / x.sum())
     peak = np.mean([x[:12].max(), x[12:].max()])
@@ -109,15 +108,15 @@ def test_a_shape_that_is_wrong_shows(make: Maker) -> None:
     assert result.methods["late"].scores["shape_error"] == pytest.approx(expected, rel=0.02)
 
 
-def test_ambiguous_clocks_are_said_and_scored_as_stated(make: Maker) -> None:
-    # Presses every two seconds fit at -2, 0 and 2 s alike.
+def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Maker) -> None:
+    # Presses every two seconds fit equally at -2, 0 and 2 s.
     about = {"sync": {"method": "correlate", "calibration_s": [3.0, 9.0], "search_s": 2.5}}
     folder = make(frames=130, meta=about)
     result = run(folder)
     assert result.sync is not None
     assert result.sync.refused
     assert not result.aligned
-    assert result.methods["bump"].scores["r"] > 0.99, "scored all the same, at the stated clock"
+    assert result.methods["bump"].scores["r"] > 0.99, "scored at the stated offset"
     offsets, r = np.array(result.sync.correlogram).T
     assert offsets[[0, -1]] == pytest.approx([-2.5, 2.5], abs=0.02)
     near = [float(np.nanmax(r[np.abs(offsets - at) < 0.1])) for at in (-2, 0, 2)]

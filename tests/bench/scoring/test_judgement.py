@@ -1,4 +1,4 @@
-"""One judgement of a recording: `bench check` and `bench score` find the same, and no number stands on it."""
+"""Findings on recordings: the same in `bench check` and `bench score`, and no scores with bad ones."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ STATED = {
 
 
 @pytest.mark.parametrize("case", STATED)
-def test_what_is_stated_in_another_unit_is_found_by_check_and_score_and_no_number_given(
-    make: Maker, case: str
-) -> None:
+def test_wrong_units_are_found_by_check_and_score(make: Maker, case: str) -> None:
     meta, what = STATED[case]
     folder = make(frames=6, meta=meta)
     result = scored(folder, backend="dis")
@@ -38,7 +36,7 @@ def test_what_is_stated_in_another_unit_is_found_by_check_and_score_and_no_numbe
 
 
 @pytest.mark.parametrize(("frames", "young", "code"), [(8, 1.0, 0), (8, 1500.0, 2), (2, 1.0, 2)])
-def test_scoring_ends_in_a_refusal_where_no_number_may_be_said_and_writes_all_the_same(
+def test_a_refused_score_writes_its_files_and_exits_with_code_2(
     make: Maker, frames: int, young: float, code: int
 ) -> None:
     folder = make(frames=frames, meta={"young_kpa": young})
@@ -71,12 +69,12 @@ SENSORS = {
     "saturated": (PRESS.clip(-9, 2.0), "odd"),
     "0.6 s late": (np.roll(PRESS, 6, axis=0), "odd"),
     "backwards": (PRESS[::-1], "odd"),
-    "0.5 s of the film missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "odd"),
+    "0.5 s of the video missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "odd"),
 }
 
 
 @pytest.mark.parametrize("case", SENSORS)
-def test_a_sensor_that_the_film_contradicts_is_found(case: str) -> None:
+def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
     moved, methods = np.linalg.norm(PRESS, axis=1) ** 0.9, [0.6 * PRESS, 1.5 * PRESS]
     assert judge_sensor(TIME, PRESS, moved, methods, 3) == []
     assert judge_sensor(TIME, PRESS, moved, [60 * PRESS], 3) == [], "one method may be wrong itself"

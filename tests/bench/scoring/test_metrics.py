@@ -1,4 +1,4 @@
-"""Scores against hand-computed numbers, and what they must notice."""
+"""Scores against numbers computed by hand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from bench.scoring import metrics
 
 
-def test_agreement_by_hand_over_what_both_have() -> None:
+def test_agreement_over_samples_where_both_are_finite() -> None:
     got = metrics.agreement(np.array([0.0, 10, 20, np.nan]), np.array([2.0, 10, 24, 5]))
     assert got["n"] == 3
     assert got["mae_mn"] == pytest.approx(2.0)
@@ -47,11 +47,11 @@ def test_events_close_short_gaps_and_drop_short_contacts() -> None:
     assert metrics.events(t, contact, 0.25) == [slice(10, 30)]
 
 
-def test_what_the_sensor_felt_is_no_matter_of_the_prediction() -> None:
-    """Half of one contact, its peak too, and all of another were lost: the sensor felt them all the same."""
+def test_the_sensors_contacts_do_not_depend_on_the_prediction() -> None:
+    """Half of one contact with its peak and all of another are lost in the prediction."""
     t = np.arange(0, 8, 0.01)
-    felt = [100 * np.exp(-((t - at) ** 2) / 0.1) for at in (2, 4, 6)]
-    x = np.sum(felt, axis=0)
+    parts = [100 * np.exp(-((t - at) ** 2) / 0.1) for at in (2, 4, 6)]
+    x = np.sum(parts, axis=0)
     y = 1.2 * x
     y[(t > 1.9) & (t < 2.5) | (t > 3) & (t < 5)] = np.nan
     whole, whole_rows = metrics.compute_all(t, x, 1.2 * x)
@@ -62,28 +62,28 @@ def test_what_the_sensor_felt_is_no_matter_of_the_prediction() -> None:
     assert scores["event_peak_mn"] == pytest.approx(whole["event_peak_mn"])
     for key in ("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"):
         assert np.isnan(rows[1][key])
-    assert [rows[k]["peak_error"] for k in (0, 2)] == pytest.approx([0.2, 0.2]), "over what was followed"
+    assert [rows[k]["peak_error"] for k in (0, 2)] == pytest.approx([0.2, 0.2]), "over predicted samples"
     assert scores["peak_mae"] == pytest.approx(0.2)
     assert scores["impulse_mae"] == pytest.approx(0.2)
 
 
-def test_ghosts_are_counted_only_without_contact() -> None:
+def test_false_positives_are_counted_only_without_contact() -> None:
     t = np.arange(200) / 20
     x = np.where((t > 4) & (t < 6), 100.0, 0.0)
-    ghost = x + np.where(t < 2, 30.0, 0.0)
-    scores, _ = metrics.compute_all(t, x, ghost)
-    assert scores["ghost_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
-    assert scores["ghost_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
+    predicted = x + np.where(t < 2, 30.0, 0.0)
+    scores, _ = metrics.compute_all(t, x, predicted)
+    assert scores["false_positive_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
+    assert scores["background_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
     assert metrics.compute_all(t, x, x)[0]["contact_f1"] == 1
 
 
-def test_limits_of_agreement_see_groups_that_share_their_error() -> None:
+def test_limits_of_agreement_account_for_groups_of_correlated_error() -> None:
     rng = np.random.default_rng(0)
     group = np.repeat(np.arange(200), 20)
     difference = rng.normal(0, 3, 200)[group] + rng.normal(0, 4, len(group)) + 1
     got = metrics.limits_of_agreement(difference, group)
     assert got["bias_mn"] == pytest.approx(1, abs=0.6)
     assert got["high_mn"] - got["low_mn"] == pytest.approx(2 * 1.96 * 5, rel=0.05)
-    # Two groups only, in which plain pooling would see almost no spread between: theirs counts once each.
+    # With two groups, plain pooling would underestimate the variance between groups.
     pair = metrics.limits_of_agreement(np.repeat([0.0, 10.0], 50), np.repeat([0, 1], 50))
     assert pair["high_mn"] - pair["low_mn"] == pytest.approx(2 * 1.96 * np.sqrt(50), rel=0.02)

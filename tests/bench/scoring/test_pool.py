@@ -1,4 +1,4 @@
-"""Pooled scores by hand, and what can't be pooled."""
+"""Pooled scores, and scores that can't be pooled."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_means_and_intervals_over_specimens() -> None:
     tree = pool.pool([score("a", 1.0, "x"), score("b", 3.0, "x"), score("c", 5.0, "y")])
     net = tree["methods"]["net"]["scores"]["mae_mn"]
     assert net["mean"] == pytest.approx(3.0)
-    assert (net["low"], net["high"]) == (None, None)  # of two specimens it would be their two values
+    assert (net["low"], net["high"]) == (None, None)  # too few specimens
     five = pool.pool([score(name, 1.0 + (name == "e"), name) for name in "abcde"])["methods"]["net"]["scores"]
     assert five["mae_mn"]["low"] < five["mae_mn"]["mean"] < five["mae_mn"]["high"]
     assert tree["methods"]["zero"]["main_worse_by_mn"]["mean"] == pytest.approx(-1.0)
@@ -44,7 +44,7 @@ def test_means_and_intervals_over_specimens() -> None:
     assert tree["specimens"] == 2
 
 
-def test_methods_are_what_their_hash_says(tmp_path: Path) -> None:
+def test_methods_are_identified_by_their_hash(tmp_path: Path) -> None:
     tree = pool.pool(
         [score("a", 1.0, net="x", one="y", two="z"), score("b", 3.0, net="x", other="y", two="w")]
     )
@@ -66,7 +66,7 @@ def test_methods_are_what_their_hash_says(tmp_path: Path) -> None:
         {"sync": {"refused": "ambiguous"}},
     ],
 )
-def test_what_its_own_report_refuses_is_not_pooled(odd: dict[str, Any], tmp_path: Path) -> None:
+def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path: Path) -> None:
     tree = pool.pool(
         [score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}, score("b", 1.0) | odd]
     )

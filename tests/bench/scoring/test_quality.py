@@ -1,4 +1,4 @@
-"""Pictures that show nothing get a word for it, and no 0.0 mN."""
+"""Pictures without texture are lost and have no force, rather than 0 mN."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BLACK = np.zeros((96, 128, 3), np.uint8)
 
 
 @pytest.mark.parametrize("picture", [BLACK + 3, BLACK + 128, texture(16, 16), texture(96, 128)])
-def test_nothing_to_measure_is_said_and_no_number_given(make: Maker, picture: np.ndarray) -> None:
+def test_recordings_without_texture_or_motion_have_no_scores(make: Maker, picture: np.ndarray) -> None:
     folder = make(frames=4)
     for k in range(4):
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), picture)
@@ -23,7 +23,7 @@ def test_nothing_to_measure_is_said_and_no_number_given(make: Maker, picture: np
     assert headline(result).refused
 
 
-def test_a_frame_that_went_black_is_lost_alone(make: Maker) -> None:
+def test_a_single_black_frame_is_lost(make: Maker) -> None:
     folder = make(frames=8)
     cv2.imwrite(str(folder / "frames" / "0004.png"), BLACK)
     result = scored(folder, backend="dis")

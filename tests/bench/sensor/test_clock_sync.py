@@ -1,4 +1,4 @@
-"""Offsets between clocks: found within a frame, refused when the recording doesn't determine them."""
+"""Offsets between clocks: found within a frame, or refused if the recording doesn't determine them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bench.sensor import clock_sync
 
 
 def presses(t: np.ndarray, seed: int) -> np.ndarray:
-    """Irregular presses, as a hand makes them, mN."""
+    """Irregular presses, as by hand [mN]."""
     rng = np.random.default_rng(seed)
     out = np.zeros_like(t)
     for centre in np.cumsum(rng.uniform(0.6, 1.8, 20)):
@@ -20,7 +20,7 @@ def presses(t: np.ndarray, seed: int) -> np.ndarray:
 def recording(
     lag_s: float, seed: int = 0, noise: float = 0.15, fps: float = 25.0, span_s: float = 8.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frames and a sensor whose clock reads `lag_s` too little."""
+    """Frames, speed, sensor times and force; the sensor's clock is `lag_s` slow."""
     rng = np.random.default_rng([seed, 1])
     frames = 1 + np.cumsum(rng.uniform(0.8, 1.2, round(span_s * fps)) / fps)  # variable frame rate
     speed = np.abs(np.diff(presses(frames, seed), prepend=0)) / np.diff(frames, prepend=frames[0] - 1 / fps)
@@ -62,7 +62,7 @@ def test_lag_beyond_the_search_is_refused() -> None:
     assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused
 
 
-def test_intervals_that_were_not_followed_are_left_out() -> None:
+def test_intervals_that_were_not_tracked_are_left_out() -> None:
     frames, speed, t, force = recording(0.2)
     lost = np.arange(20, 60)
     speed[lost] = np.nan

@@ -1,4 +1,4 @@
-"""Sensor processing against signals whose answer is known, and scales against drawn boards."""
+"""Sensor processing of known signals, and scales from drawn boards."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def three(x: np.ndarray) -> np.ndarray:
     return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
 
 
-def test_tare_and_drift_come_off() -> None:
+def test_tare_and_drift_are_removed() -> None:
     t = np.arange(0, 10, 0.01)
     press = 100 * np.exp(-((t - 5) ** 2))
     raw = Force(t, three(press + 30 + 2 * t))
@@ -37,16 +37,16 @@ def test_noise_floor_is_the_standard_deviation() -> None:
     assert got.noise_floor_mn == pytest.approx(3 * np.sqrt(3), rel=0.03)
 
 
-def test_gravity_of_what_hangs_on_a_turning_tool() -> None:
+def test_gravity_of_a_rotating_tool_is_removed() -> None:
     t = np.arange(0, 5, 0.01)
     down = np.stack([np.sin(t), np.zeros_like(t), np.cos(t)], axis=1)
     on_tool = -three(50 * np.exp(-((t - 2) ** 2))) + 20 * force_sensor.STANDARD_GRAVITY * down
-    raw = Force(t, -on_tool, down)  # the reader has turned the sign: force on the tissue
+    raw = Force(t, -on_tool, down)  # the sign was reversed on reading: force on the tissue
     got = force_sensor.process_force(raw, SensorMeta(acts_on="tool", mass_g=20, low_pass_hz=None), 0.0)
     assert got.force_mn == pytest.approx(three(50 * np.exp(-((t - 2) ** 2))), abs=1e-9)
     with pytest.raises(UserError, match="gx, gy, gz"):
         force_sensor.process_force(Force(t, -on_tool), SensorMeta(mass_g=20), 0.0)
-    # As an accelerometer gives it; the weight taken off would be ten times that of what hangs there.
+    # In m/s², as from an accelerometer: the removed weight would be ten times too large.
     with pytest.raises(UserError, match="gx, gy, gz"):
         force_sensor.process_force(Force(t, -on_tool, 9.80665 * down), SensorMeta(mass_g=20), 0.0)
 
@@ -64,7 +64,7 @@ def test_the_low_pass_has_no_delay() -> None:
 
 
 @pytest.mark.parametrize(("burst", "filtered"), [(4, True), (40, False)])
-def test_stamps_in_bursts_are_filtered_or_said_not_to_be(burst: int, filtered: bool) -> None:
+def test_stamps_in_bursts_are_filtered_or_reported_as_not(burst: int, filtered: bool) -> None:
     """A link that delivers samples of 500 Hz in packets, all of one packet stamped within 10 us each."""
     n = np.arange(8000)
     t = 0.002 * burst * (n // burst) + 1e-5 * (n % burst)
@@ -77,14 +77,14 @@ def test_stamps_in_bursts_are_filtered_or_said_not_to_be(burst: int, filtered: b
     assert any("not filtered" in step for step in got.steps) is not filtered
 
 
-def test_a_hole_changes_no_sample_time() -> None:
+def test_a_gap_does_not_change_the_sample_interval() -> None:
     t = np.concatenate([np.arange(0, 5, 0.01), np.arange(2000, 2005, 0.01)])
     got = force_sensor.process_force(Force(t, three(np.sin(2 * np.pi * 30 * t))), SensorMeta(), 0.0)
     assert got.steps == ("zero-phase Butterworth low-pass, order 4, 10 Hz",)
     assert np.abs(got.force_mn[50:450]).max() < 0.05
 
 
-def test_frames_in_a_hole_have_no_truth() -> None:
+def test_frames_in_a_gap_have_no_force() -> None:
     t = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
     got = force_sensor.process_force(Force(t, three(t)), SensorMeta(low_pass_hz=None), 0.5)
     at = force_sensor.force_at(got, np.array([0.2, 0.75, 2.0, 2.75]))
@@ -116,7 +116,7 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
         pixel_scale.find_scale(worse, tmp_path)
 
 
-def test_scale_of_a_bar_knows_its_error() -> None:
+def test_scale_bar() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
     found = pixel_scale.find_scale(about, Path())
     assert found.mm_per_px == pytest.approx(0.05)

@@ -1,4 +1,4 @@
-"""The sensor's rotation, from tissue in closed form (Cerruti and Boussinesq), off the picture's middle."""
+"""The sensor's rotation, from the closed form of a half-space (Cerruti and Boussinesq), off centre."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 def _pressed(seed: int, flat: float = 0.6) -> tuple[Floats, Floats, Floats, Rotation]:
-    """Motion (T, P, 2), what is seen (T, P), the sensor's force (T, 3), and the rotation between."""
+    """Motion (T, P, 2), visibility (T, P), the sensor's force (T, 3), and the rotation between."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(-15, 16, 2.0), np.arange(-11, 12, 2.0))
     at = rng.uniform(-4, 4, 2)
@@ -29,11 +29,11 @@ def _pressed(seed: int, flat: float = 0.6) -> tuple[Floats, Floats, Floats, Rota
 
 
 @pytest.mark.slow
-def test_rotation_is_found_and_its_error_known() -> None:
+def test_rotation_is_found_within_its_stated_error() -> None:
     errors, deviations = [], []
     for seed in range(12):
-        moved, seen, force, turn = _pressed(seed)
-        found = find_rotation(moved, seen, force)
+        moved, visible, force, turn = _pressed(seed)
+        found = find_rotation(moved, visible, force)
         assert found.refused == ""
         errors.append(np.degrees((Rotation.from_matrix(found.rows) * turn.inv()).magnitude()))
         deviations.append(found.deviation_deg)
@@ -42,10 +42,10 @@ def test_rotation_is_found_and_its_error_known() -> None:
     assert max(np.array(errors) / deviations) < 2
 
 
-def test_what_determines_no_rotation_is_refused() -> None:
-    moved, seen, force, _ = _pressed(1)
-    assert "needed" in find_rotation(moved[:10], seen[:10], force[:10]).refused
-    assert "plane" in find_rotation(moved, seen, force * [1, 1, 0]).refused
-    assert "nothing moves" in find_rotation(0 * moved, seen, force).refused
+def test_undetermined_rotations_are_refused() -> None:
+    moved, visible, force, _ = _pressed(1)
+    assert "needed" in find_rotation(moved[:10], visible[:10], force[:10]).refused
+    assert "plane" in find_rotation(moved, visible, force * [1, 1, 0]).refused
+    assert "nothing moves" in find_rotation(0 * moved, visible, force).refused
     other = np.random.default_rng(5).normal(size=force.shape)
-    assert "follows the force" in find_rotation(moved, seen, other).refused
+    assert "follows the force" in find_rotation(moved, visible, other).refused
