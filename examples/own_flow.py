@@ -1,8 +1,8 @@
-"""A flow back end of one's own: Farneback's, behind the protocol that the tracker and the bench ask for.
+"""A flow estimator of your own: Farneback's, with the protocol of the tracker and the bench.
 
     python examples/own_flow.py out
 
-Installed in a package, an entry point makes it a job's `flow.backend` and a `--flow` of the bench:
+In an installed package this entry point makes it a job's `flow.backend` and the bench's `--flow`:
 
     [project.entry-points."sulcus.flow"]
     farneback = "own_flow:Farneback"
@@ -29,7 +29,7 @@ class Farneback:
         now_usable: np.ndarray,
         initial: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Flow (H, W, 2) px at the pixels of `rest`, and how far it is to be trusted, (H, W) in 0..1."""
+        """Flow (H, W, 2) px at the pixels of `rest`, and its confidence (H, W) in 0..1."""
         first, second = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (rest, now))
         start = np.zeros((*first.shape, 2), np.float32) if initial is None else initial.copy()
         flags = 0 if initial is None else cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -42,7 +42,7 @@ class Farneback:
 
 
 def error_px(sequence: synth.Sequence) -> float:
-    """Mean endpoint error over visible tissue of all frames but the first."""
+    """Mean endpoint error [px] over visible tissue of all frames but the first."""
     recovered = synth.recover_flow(
         sequence["rgb"][:], sequence["tool"][:], sequence["tissue"][:], Farneback()
     )

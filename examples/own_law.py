@@ -1,11 +1,11 @@
-"""A material law of one's own: tissue that stiffens exponentially, against neo-Hookean, under one pull.
+"""A material law of your own: tissue that stiffens exponentially, compared with neo-Hookean under a pull.
 
     python examples/own_law.py
 
 The energy is W = mu/(2b) (exp(b (tr C - 3 - 2 log J)) - 1) + lambda/2 (log J)^2: neo-Hookean for b -> 0
 (after H. Demiray, "A note on the elasticity of soft biological tissues", J. Biomechanics 5, 1972).
 
-Installed in a package, an entry point makes it a job's `fem.law`:
+In an installed package this entry point makes it a job's `fem.law`:
 
     [project.entry-points."sulcus.law"]
     stiffening = "own_law:Stiffening"
@@ -19,10 +19,10 @@ import synth
 
 
 class Stiffening:
-    """Tissue that stiffens exponentially; at rest it is as stiff as under any other law."""
+    """Exponentially stiffening tissue, whose stiffness at rest is that of the other laws."""
 
     largest_load = 0.3
-    """Largest P = F/(E a^2) that jobs may ask for."""
+    """Largest P = F/(E a^2) that jobs may use."""
 
     def __init__(self, b: float = 2.0) -> None:
         self.b = b
@@ -39,7 +39,7 @@ class Stiffening:
 
 
 def peak_mm(law: str, load: float = 0.3) -> float:
-    """Largest displacement of the surface under a pull of P = F/(E a^2) = `load`."""
+    """Largest displacement of the surface [mm] under a pull of P = F/(E a^2) = `load`."""
     pull = {"gestures": ["pull"], "load": load, "law": law, "tets": 400}
     job = synth.Job.model_validate({"seed": 1, "frames": 5, "anatomy": {"vertices": 2500}, "fem": pull})
     return float(np.linalg.norm(synth.simulate(job, 0).motion.displacement, axis=2).max())

@@ -1,4 +1,4 @@
-"""Reads a dataset: what was applied, how far the tissue moved, and how well the flow was recovered.
+"""Reads a dataset: applied force, motion of the tissue, and error of the recovered flow.
 
 python examples/read_dataset.py out
 """
@@ -13,10 +13,10 @@ import synth
 
 
 def describe(sequence: synth.Sequence) -> dict[str, float]:
-    """A sequence in five numbers."""
+    """Five numbers of a sequence."""
     force = np.linalg.norm(sequence["force"][:], axis=1)  # (T,) mN
     t = int(force.argmax())
-    # Traction is the label: over the area that each pixel sees it adds up to the force.
+    # Traction integrated over the tissue area of each pixel is the force.
     traction, area = sequence["traction"][t], sequence["area"][:]  # (H, W, 3) kPa, (H, W) mm2
     labelled = np.linalg.norm(np.einsum("hwk,hw->k", traction, area))  # 1 kPa mm2 = 1 mN
     flow, visible = sequence["flow"][t], sequence["visible"][t]  # (H, W, 2) px, (H, W)

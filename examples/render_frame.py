@@ -1,4 +1,4 @@
-"""Renders one frame with its ground truth: a push on a cortex viewed at 15 degrees, without a folder.
+"""Renders one frame with its ground truth: a push on cortex, tilted by 15 degrees, in warm light.
 
 python examples/render_frame.py frame.png
 """
@@ -14,7 +14,7 @@ import synth
 
 
 def push(load: float = 0.3) -> synth.Scene:
-    """A scene under a peak load of P = F/(E a^2) = `load`."""
+    """A scene with a push of peak load P = F/(E a^2) = `load`."""
     job = synth.Job.model_validate(
         {
             "seed": 4,
@@ -29,7 +29,7 @@ def push(load: float = 0.3) -> synth.Scene:
 
 
 def describe(scene: synth.Scene, frame: synth.Frame) -> dict[str, float]:
-    """What is true of a frame, in numbers."""
+    """Ground truth of a frame in numbers."""
     labelled = np.einsum("hwk,hw->k", frame.traction, scene.area)  # 1 kPa mm2 = 1 mN
     return {
         "force_mn": float(np.linalg.norm(frame.force)),
