@@ -6,6 +6,8 @@ import csv
 import hashlib
 import json
 import tarfile
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,20 @@ from typer.testing import CliRunner
 
 from learn import cli
 from learn.checkpoint import ModelCard, read_card
-from learn.data.clips import load_clips
+from learn.data.clips import Clip, load_clips
 from learn.data.grid import Scales
 from learn.settings import preset
-from learn.split import Split, choose_unseen, divide, find_sides, find_unit, name_parts, regroup
+from learn.split import (
+    Split,
+    choose_unseen,
+    divide,
+    find_obstacle,
+    find_sides,
+    find_unit,
+    keep_back,
+    name_parts,
+    regroup,
+)
 from synth.cli import app as synth
 from synth.dataset import index, split
 from synth.dataset.folder import claim
@@ -29,7 +41,7 @@ from synth.job.schema import Job
 from synth.publish.export.registry import FORMATS, export_dataset
 
 run = CliRunner().invoke
-BASE = preset("tiny", size=32)
+BASE, SCALES = preset("tiny", size=32), Scales(1.0, 0.2, 1.0, 100.0, 0.3)
 
 
 def make(folder: Path, anatomies: list[int], first: int = 0, opening: list[str] | None = None) -> Path:
@@ -47,7 +59,7 @@ def divided(*datasets: Path) -> tuple[ModelCard, Split]:
     clips = [clip for one in datasets for clip in load_clips(one, BASE.grid, ["ideal"])]
     clips, parts = divide(clips, datasets, seed=0)
     named = name_parts(clips, parts)
-    return ModelCard(BASE, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, *named, [*parts.hashes]), parts
+    return ModelCard(BASE, SCALES, 1.7, *named, [*parts.hashes]), parts
 
 
 def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
@@ -173,3 +185,43 @@ def test_train_and_eval_use_the_split(tmp_path: Path) -> None:
     done = run(cli.app, ["eval", str(tmp_path / "model"), str(own), "--json"])
     assert len(json.loads(done.stdout)["sequences"]) == len(card.split["test"])
     assert run(cli.app, ["train", str(own), "-o", str(tmp_path / "b"), "folds=3"]).exit_code == 2
+
+
+def many(clips: list[Clip], brains: int, each: int = 2) -> list[Clip]:
+    """Sequences that differ in name alone."""
+    one = clips[0]
+    return [
+        replace(one, content_hash=f"{b}-{k}", group=f"brain-{b}") for b in range(brains) for k in range(each)
+    ]
+
+
+def of(brains: Iterable[int], each: int = 2) -> tuple[int, ...]:
+    return tuple(b * each + k for b in brains for k in range(each))
+
+
+def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: list[Clip]) -> None:
+    some = many(clips, 40)
+    first = Split(of(range(10)), of(range(10, 30)), of(range(30, 40)))
+    found = keep_back(some, first, seed=0)
+    assert len({some[i].group for i in found.intervals}) == 10
+    assert sorted((*found.select, *found.intervals)) == sorted(first.select)
+    assert not {some[i].group for i in found.select} & {some[i].group for i in found.intervals}
+    assert (found.fit, found.test) == (first.fit, first.test)
+    assert keep_back(some, first, seed=0) == found
+    assert keep_back(some, first, seed=1) != found
+    assert find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
+
+
+def test_brains_in_the_card_or_in_a_test_are_not_used_for_intervals(clips: list[Clip]) -> None:
+    some = many(clips, 30)
+    named = name_parts(some, Split(of(range(6)), of(range(6, 10)), of([10, 11])))
+    known = ModelCard(preset("tiny"), SCALES, 1.7, *named)
+    # A sequence of its own of a brain that was fitted, of one that is test, and a brain marked test.
+    some += [
+        replace(some[0], content_hash="new-a", group="brain-3"),
+        replace(some[0], content_hash="new-b", group="brain-10"),
+    ]
+    found = find_sides(some, known, {"12-0"}, from_test=False)
+    assert {some[i].group for i in found.intervals} == {f"brain-{b}" for b in range(13, 30)}
+    assert {some[i].group for i in found.test} == {"brain-10", "brain-11", "brain-12"}
+    assert {some[i].group for i in found.fit} == {f"brain-{b}" for b in range(6)}

@@ -26,21 +26,13 @@ def test_shapes_mask_and_bounds(output: str, stem: int, levels: int) -> None:
     x = 50 * torch.randn(2, 5, 64, 64)
     x[:, 3] = 0
     x[:, 3, 8:40, 8:40] = 1
-    with torch.no_grad():
-        y = model(x)
+    y = model(x)
     assert y.shape == (2, arch.components, 64, 64)
     assert torch.all(y[..., 40:, :] == 0)
     assert y[..., 8:40, 8:40].abs().max() > 0
     assert y.abs().max() <= max(BOUNDS)
     assert output == "vector" or y.min() >= 0
-
-
-@pytest.mark.parametrize(("output", "stem"), [("magnitude", 1), ("vector", 1), ("magnitude", 4)])
-def test_every_parameter_has_a_gradient(output: str, stem: int) -> None:
-    model = D2FNet(Architecture(width=8, levels=2, stem=stem, output=output))  # type: ignore[arg-type]
-    x = torch.randn(2, 5, 32, 32)
-    x[:, 3] = 1
-    model(x).square().sum().backward()
+    y.square().sum().backward()
     assert not [n for n, p in model.named_parameters() if p.grad is None]
 
 

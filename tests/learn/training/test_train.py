@@ -11,12 +11,13 @@ import torch
 from learn import checkpoint
 from learn.data.clips import Clip
 from learn.inference.predict import load_model
-from learn.settings import TrainingSettings, preset, replace
+from learn.settings import TrainingSettings, as_changes, preset, replace
 from learn.split import Split, unseen
 from learn.training.batches import Batch, FrameDataset, FrameItem, add_surface_motion, measure_scales
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
+from synth.system.config_file import override
 
 
 def small(**changes: object) -> TrainingSettings:
@@ -117,18 +118,16 @@ def test_force_does_not_depend_on_the_resolution(model: Path) -> None:
     assert force(240, 0.15) == pytest.approx(force(120, 0.3), rel=0.05)
 
 
-def test_a_folder_with_another_run_is_not_overwritten(clips: list[Clip], split: Split, model: Path) -> None:
+def test_other_runs_and_leaking_splits_are_refused(
+    clips: list[Clip], split: Split, model: Path, tmp_path: Path
+) -> None:
     before = (model / "weights.pt").read_bytes()
     with pytest.raises(UserError, match="settings"):
         train(clips, split, small(input="mixed", learning_rate=0.1), model)
     with pytest.raises(UserError):
         train(clips[:-1], Split((2, 5), (0, 1), (3, 4, 6)), small(input="mixed"), model)
     assert (model / "weights.pt").read_bytes() == before
-
-
-def test_a_split_that_leaks_is_refused(clips: list[Clip], tmp_path: Path) -> None:
-    # Clips 0 and 1 share an anatomy.
-    with pytest.raises(UserError):
+    with pytest.raises(UserError):  # a leaking split: clips 0 and 1 share an anatomy
         train(clips, Split((0, 2), (3,), (1,)), small(), tmp_path / "m")
 
 
@@ -181,3 +180,17 @@ def test_the_force_gain_corrects_an_underestimate(
     assert found["select_gain"] == pytest.approx(np.clip(slope, *limits), rel=1e-6)
     if limits == (1.0, 1.5):
         assert 1.0 < slope < 1.5, "else the limits are tested twice"
+
+
+@pytest.mark.parametrize(("change", "key"), [("bacth=3", "'batch'"), ("arch.depth=true", "arch.depth")])
+def test_invalid_settings_are_refused(change: str, key: str) -> None:
+    with pytest.raises(UserError, match=key):
+        override(preset("live"), [change])
+
+
+def test_settings_may_stand_anywhere_and_need_a_value() -> None:
+    words = ["--epochs", "3", "data", "--seed=1", "loss=mse", "seed=2"]
+    assert as_changes(words) == ({"epochs": "3", "seed": "2", "loss": "mse"}, ["data"])
+    for broken in (["--compile", "--epochs", "3"], ["data", "--epochs"]):
+        with pytest.raises(UserError):
+            as_changes(broken)

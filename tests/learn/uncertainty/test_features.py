@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from sklearn.covariance import LedoitWolf
+from sklearn.linear_model import Ridge
 
+from learn.uncertainty.error_model import fit_error_model
 from learn.uncertainty.features import FLOOR_MM, MOTION, motion_features
-from learn.uncertainty.out_of_distribution import describe_out_of_distribution, fit_distribution
+from learn.uncertainty.out_of_distribution import (
+    describe_out_of_distribution,
+    fit_distribution,
+    shrunk_covariance,
+)
 
 Floats = NDArray[np.float64]
 
@@ -102,3 +109,23 @@ def test_frames_at_rest_have_no_distance() -> None:
     resting = [np.full((4, 3), -5.0)]
     assert fit_distribution(resting, cloud(rng, 3)) is None
     assert fit_distribution(cloud(rng, 3), resting) is None
+
+
+@pytest.mark.parametrize("count", [12, 400])
+def test_the_covariance_is_ledoits_and_wolfs(count: int) -> None:
+    rng = np.random.default_rng(3)
+    samples = rng.normal(size=(count, 8)) @ rng.normal(size=(8, 8)) + 5
+    assert shrunk_covariance(samples) == pytest.approx(LedoitWolf().fit(samples).covariance_, rel=1e-9)
+
+
+def test_the_scale_is_a_ridges() -> None:
+    rng = np.random.default_rng(4)
+    features = rng.normal(size=(60, 3)) * [1, 10, 0.1] + [0, 5, 2]
+    error, weight = np.exp(features[:, 0] + rng.normal(size=60)), rng.uniform(0.2, 2, 60)
+    rule = fit_error_model(features, error, weight, 0.1)
+    spread = features.std(0)
+    theirs = Ridge(alpha=1.0).fit(
+        features / spread, np.log(error + 0.1), sample_weight=weight / weight.mean()
+    )
+    assert rule.slopes == pytest.approx(theirs.coef_ / spread, rel=1e-6)
+    assert rule.intercept == pytest.approx(float(theirs.intercept_), rel=1e-6)
