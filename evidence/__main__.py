@@ -1,24 +1,24 @@
-"""`python -m evidence status`: what made each kept result, and whether that has changed since."""
+"""`python -m evidence status`: what made each stored result, and whether that has changed since."""
 
 from __future__ import annotations
 
 import typer
 
 from evidence import report
-from evidence import status as kept
+from evidence.status import gather
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 
 
 @app.callback()
 def main() -> None:
-    """This project's own measurements; each is a script: python -m evidence.ROOM.NAME."""
+    """This project's own measurements; each is a script: python -m evidence.PACKAGE.NAME."""
 
 
 @app.command()
 def status() -> None:
-    """For each kept result: current or stale, commit, CPU-hours to make it again, command."""
-    report.show({"kept results": [one.row() for one in kept.gather(report.RESULTS)]})
+    """For each stored result: current or stale, commit, CPU-hours to make it again, command."""
+    report.show({"stored results": [one.row() for one in gather(report.RESULTS)]})
 
 
 if __name__ == "__main__":

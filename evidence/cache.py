@@ -1,4 +1,4 @@
-"""Results and packed clips kept in a folder under a key of all that made them: an interrupted run goes on."""
+"""Results and packed clips, cached in a folder by a key of all inputs: an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from synth.job import identity
 
 @cache
 def code() -> str:
-    """Hash of every source file of ours and of packages' versions: what other code computed isn't found."""
+    """Hash of this project's source files and of the packages' versions."""
     return provenance.source("synth", "learn", "bench", "evidence")
 
 
 def key(*parts: Any) -> str:
-    """Key of settings and content hashes, given as JSON could hold them, and of the code."""
+    """Key of the code and of settings and content hashes that JSON can hold."""
     return hashlib.blake2b(identity.canonical([code(), *parts]), digest_size=8).hexdigest()
 
 
 def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any:
-    """What `compute` gives, as JSON holds it; computed only if the folder has none of this key."""
+    """Value of `compute`, as JSON holds it; computed only if the folder has no result of this key."""
     file = folder / f"{name}-{key}.json"
     if not file.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any
 
 
 def clip(folder: Path, make: Callable[[], Clip]) -> Clip:
-    """The clip packed in a folder whose name has its key; made and packed if there is none."""
+    """Clip packed in a folder whose name contains its key; made and packed if there is none."""
     if not folder.is_dir():
         pack(make(), folder)
     return unpack(folder)

@@ -1,4 +1,4 @@
-"""Cross-validation of an experiment's own: folds that share no anatomy."""
+"""Cross-validation folds that share no anatomy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from synth.dataset.split import draw_groups
 
 
 def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]:
-    """`count` sets of clips that share no group, of nearly equal size; the largest groups are dealt first."""
+    """Indices of `count` sets of clips of nearly equal size that share no group."""
     number = groups(clips)
     order = np.random.default_rng(seed).permutation(sorted(set(number))).tolist()
     part = draw_groups(number, [1.0] * count, order)
@@ -20,7 +20,7 @@ def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]
 
 
 def nested(clips: Sequence[Clip], count: int, fold: int, seed: int) -> Split:
-    """Fold `fold` of `count` is the test; of the rest a fifth chooses the epoch and the others are fitted."""
+    """Split whose test is fold `fold` of `count`; a fifth of the remainder selects the epoch."""
     test = folds(clips, count, seed)[fold]
     rest = [i for i in range(len(clips)) if i not in set(test)]
     inner = [clips[i] for i in rest]

@@ -1,7 +1,7 @@
-"""Everything that a GPU changes, checked and timed in one call, each step a process of its own.
+"""Checks and timings of everything that a GPU changes, each step in a process of its own.
 
-Run: python -m evidence.gpu, or one step: --only training. What is done is not done again. The last two make
-labels and train the paper's network on them: 256², 20,000 frames, 50 epochs.
+Run: python -m evidence.gpu, or one step: --only training. Steps that have passed are skipped. The last two
+make labels and train the paper's network on them: 256², 20,000 frames, 50 epochs.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ app = typer.Typer(add_completion=False)
 def main(
     context: typer.Context,
     out: Path = report.RESULTS / "gpu",
-    only: Annotated[str | None, typer.Option(help="One step, by its name.")] = None,
+    only: Annotated[str | None, typer.Option(help="Name of the only step to run.")] = None,
     limit_s: Annotated[float, typer.Option(help="A step that takes longer is stopped.")] = 580.0,
 ) -> None:
     """Checks and times everything that an NVIDIA GPU changes. Exit code 1 if a step fails."""
     if context.invoked_subcommand:
         return
     if gpu.probe() is None:
-        raise UserError("no NVIDIA GPU and driver were found; `synth doctor` says what is missing")
-    named = {name: arguments for name, arguments in steps(out)}
+        raise UserError("no NVIDIA GPU and driver were found; `synth doctor` lists what is missing")
+    named = dict(steps(out))
     if only is not None and only not in named:
         raise UserError(f"--only {only}: the steps are {', '.join(named)}")
     chosen = [(only, named[only])] if only else list(named.items())
@@ -57,7 +57,7 @@ def main(
 
 
 def steps(out: Path) -> Sequence[Step]:
-    """What is run, in order: first whether it is right, then how fast it is."""
+    """Steps in order: first correctness, then speed."""
     data, model = str(out / "data"), str(out / "model")
     cuda = ("--device", "cuda")
     return (
@@ -77,7 +77,7 @@ def steps(out: Path) -> Sequence[Step]:
 
 @app.command()
 def labels(cache: Path, sequences: int = 500, frames: int = 52, size: int = 256, workers: int = 8) -> None:
-    """Makes the labels of the full size in parallel; those that are there already are kept."""
+    """Makes the labels of the full size in parallel; existing ones are reused."""
     job, grid = _job(sequences, frames), preset("paper", size=size).grid
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(_make, [(job, index, grid, cache) for index in range(sequences)]))
@@ -95,7 +95,7 @@ def full_size(
     batch: int = 64,
     accelerator: str = "auto",
 ) -> None:
-    """Trains on these labels as the paper does, and scores the fold that was kept. Goes on if stopped."""
+    """Trains on these labels as the paper does and scores the held-out fold. Continues if it was stopped."""
     set_threads(1)
     base, job = preset("paper", size=size, epochs=epochs, batch=batch), _job(sequences, frames)
     clips = [whole(job, index, base.grid, cache) for index in range(sequences)]
@@ -109,7 +109,7 @@ def full_size(
     )
     split = nested(clips, 10, 0, settings.seed)
     fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)
-    whole_run = not (out / "model").exists()  # what goes on after a stop tells no rate
+    whole_run = not (out / "model").exists()  # a continued training has no meaningful rate
     began = time.perf_counter()
     train(clips, split, settings, out / "model", fabric=fabric)
     trained = time.perf_counter() - began

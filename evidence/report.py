@@ -1,6 +1,6 @@
-"""Results of a measurement: data as JSON with what made them, a page with charts, tables for the terminal.
+"""Results of a measurement: data as JSON with their provenance, a page with charts, tables for the terminal.
 
-A script measures, gives its data to `save` and `show`, and draws a `Page` from the data alone.
+A script measures, draws a `Page` from its data alone, and passes both to `publish`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +35,7 @@ RESULTS = CHECKOUT / "docs/results"
 
 _COLOURS = ("#1f6feb", "#c2352b", "#2b7a4b", "#8a6d00", "#a04f9c", "#00798c", "#3b3f46", "#b8562b", "#6b8e23")
 _WIDTH, _PANEL, _NAME, _ROW = 960, 310, 15, 19
-"""Of a picture; height of a panel, of a line of names below it, of a row of intervals [points]."""
+"""Width of a chart; heights of a panel, of a legend's line below it, of a row of intervals [points]."""
 _PICTURES = ("chart.svg", "intervals.svg")
 
 
@@ -46,14 +46,10 @@ class Curve:
     name: str
     x: tuple[float, ...]
     y: tuple[float, ...]
-    labels: tuple[str, ...] = ()
-    """What the points are; empty: a line goes through them."""
-    ringed: tuple[int, ...] = ()
-    """Points to be looked at, as defaults: ringed, and their labels stand among the names."""
-    ends: tuple[tuple[float, float], ...] = ()
-    """Interval of every y; empty: none."""
-    named: bool = True
-    """Whether labels of ringed points stand among the names."""
+    labels: tuple[str, ...] = ()  # of the points; empty: a line joins them
+    ringed: tuple[int, ...] = ()  # indices of points to emphasise, as defaults
+    ends: tuple[tuple[float, float], ...] = ()  # interval of every y; empty: none
+    named: bool = True  # whether the legend lists the labels of ringed points
 
 
 @dataclass(frozen=True)
@@ -66,8 +62,7 @@ class Panel:
     curves: tuple[Curve, ...]
     log_x: bool = False
     log_y: bool = False
-    front: bool = False
-    """Whether a line joins the points that none beats in both x and y (less is better)."""
+    front: bool = False  # whether a line joins the Pareto front of x and y (less is better)
 
 
 @dataclass(frozen=True)
@@ -76,10 +71,8 @@ class Row:
 
     name: str
     value: float
-    interval: tuple[float, float] = (math.nan, math.nan)
-    """NaN ends draw no bar."""
-    group: int = 0
-    """Which colour."""
+    interval: tuple[float, float] = (math.nan, math.nan)  # NaN: no bar
+    group: int = 0  # selects the colour
 
 
 @dataclass(frozen=True)
@@ -97,12 +90,11 @@ class Section:
 
     heading: str
     rows: Sequence[Mapping[str, Any]] = ()
-    words: Sequence[str] = ()
-    """Paragraphs; one that begins with "- " is an item of a list."""
+    words: Sequence[str] = ()  # paragraphs; one that begins with "- " is an item of a list
 
     @property
     def columns(self) -> list[str]:
-        """Keys of all rows, but for those of trees, which are no cells."""
+        """Keys of all rows, without those of nested mappings."""
         names = dict.fromkeys(name for row in self.rows for name in row)
         return [name for name in names if not any(isinstance(row.get(name), Mapping) for row in self.rows)]
 
@@ -112,16 +104,13 @@ class Page:
     """Words, charts and tables."""
 
     title: str
-    found: Mapping[str, Any]
-    """The data: command, commit and machine are said if they are in it."""
-    charts: Sequence[Chart | Panel] = ()
-    """Intervals and curves, a picture each kind."""
+    found: Mapping[str, Any]  # the data: command, commit and machine are listed if they are in it
+    charts: Sequence[Chart | Panel] = ()  # intervals and curves, one image for each kind
     sections: Sequence[Section] = ()
-    words: Sequence[str] = ()
-    """Paragraphs at the top; may hold Markdown's `code` and *emphasis*."""
+    words: Sequence[str] = ()  # paragraphs at the top; may hold Markdown's `code` and *emphasis*
 
     def text(self) -> str:
-        """The page in Markdown: what was found first, what made it last."""
+        """The page in Markdown: verdict first, provenance last."""
         made = [f"{key} {self.found[key]}" for key in ("commit", "seed") if key in self.found]
         made += [f"{key} {value}" for key, value in self.found.get("machine", {}).items()]
         parts = [f"# {self.title}", *self.words]
@@ -148,9 +137,11 @@ def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = 
     """Writes data and page into a folder.
 
     Args:
-        found: data; floats are kept to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this
-            process and its children: less than all where a cache held parts) are put before them; where the
-            data have such a key, theirs is kept.
+        folder: made if it is missing.
+        file: name of the JSON file.
+        found: data; floats are rounded to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this
+            process and its children: less than the total where a cache held parts) are put before them,
+            unless the data have such a key.
         page: drawn from the data.
     """
     times = os.times()
@@ -167,23 +158,35 @@ def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = 
         replace(page, found=found).write(folder)
 
 
+def publish(
+    folder: Path,
+    file: str,
+    found: Mapping[str, Any],
+    page: Callable[[Mapping[str, Any]], Page],
+    shown: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes data and the page drawn from them, as `save`, and prints them, or `shown` in their place."""
+    save(folder, file, found, page(found))
+    show(found if shown is None else shown)
+
+
 def command() -> str:
     """This process's shell line: `python -m MODULE ARGUMENTS`, paths cut to their names, without --out."""
     main = sys.modules["__main__"].__spec__
     name = main.name.removesuffix(".__main__") if main else Path(sys.argv[0]).name
     words = iter(sys.argv[1:])
-    kept = []
+    line = []
     for word in words:
         if word in ("--out", "-o"):
             next(words, None)
         elif not word.startswith("--out="):
             option, equal, value = word.rpartition("=")
-            kept.append(f"{option}{equal}{Path(value).name or value}")
-    return shlex.join(["python", "-m", name, *kept])
+            line.append(f"{option}{equal}{Path(value).name or value}")
+    return shlex.join(["python", "-m", name, *line])
 
 
 def commit() -> str:
-    """The checkout's commit, "+" behind it if files but results differ from it; empty outside of git."""
+    """The checkout's commit, with "+" if files other than results differ from it; empty outside git."""
 
     def git(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(["git", "-C", str(CHECKOUT), *words], capture_output=True, text=True)
@@ -194,7 +197,7 @@ def commit() -> str:
 
 
 def shortened(value: Any) -> Any:
-    """A tree with its floats to six digits: what is behind them is noise, and takes half of a file."""
+    """A tree with its floats rounded to six digits: the others are noise and take half of a file."""
     if isinstance(value, Mapping):
         return {key: shortened(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -203,7 +206,7 @@ def shortened(value: Any) -> Any:
 
 
 def show(found: Mapping[str, Any]) -> None:
-    """Prints data: lists of rows as tables, all else line by line."""
+    """Prints data: lists of rows as tables, other values line by line."""
     console = Console(width=None if sys.stdout.isatty() else 140)
     for name, value in found.items():
         if isinstance(value, Mapping):
@@ -222,24 +225,24 @@ def show(found: Mapping[str, Any]) -> None:
 def bars(
     values: Mapping[str, float], ends: Mapping[str, tuple[float, float]] | None = None
 ) -> tuple[Row, ...]:
-    """A row a value, with its interval where there is one."""
+    """A row for each value, with its interval where there is one."""
     known, none = ends or {}, (math.nan, math.nan)
     return tuple(Row(name, float(value), known.get(name, none)) for name, value in values.items())
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Which points (cost, error) no other beats in both, cheapest first."""
-    kept: list[int] = []
+    """Indices of the Pareto front of points (cost, error), cheapest first."""
+    best: list[int] = []
     least = math.inf
     for k in sorted(range(len(points)), key=lambda k: points[k]):
         if points[k][1] < least:
-            kept.append(k)
+            best.append(k)
             least = points[k][1]
-    return kept
+    return best
 
 
 def curves(panels: Sequence[Panel]) -> str:
-    """Panels as one SVG, two a line; a name has one colour in all of them."""
+    """Panels as one SVG, two in a line; a name has one colour in all of them."""
     names = dict.fromkeys(curve.name for panel in panels for curve in panel.curves)
     colours = dict(zip(names, itertools.cycle(_COLOURS), strict=False))
     across = min(2, len(panels))
@@ -282,13 +285,13 @@ def _panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:
 
 
 def _names(panel: Panel) -> list[str]:
-    """Entries of the legend, which stands below a panel."""
+    """Entries of the legend below a panel."""
     ringed = [c.labels[k] for c in panel.curves if c.named for k in c.ringed]
     return [*(c.name for c in panel.curves), *ringed]
 
 
 def _across(panel: Panel) -> int:
-    """How many of its names stand side by side: what 480 points hold."""
+    """Columns of the legend: as many as fit in 480 points."""
     return max(1, min(3, 70 // (6 + max(len(name) for name in _names(panel)))))
 
 
@@ -343,8 +346,22 @@ def _figures(row: Row) -> str:
     return f"{row.value:.4g} [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
 
 
+def mean_cell(values: Sequence[float], form: str = ".3g", factor: float = 1.0) -> str:
+    """A cell of a table: a mean and its interval, each times a factor; without an interval the mean alone."""
+    mean, low, high = (f"{factor * value:{form}}" for value in values)
+    return mean if math.isnan(values[1]) else f"{mean} [{low}, {high}]"
+
+
+def percent(values: Sequence[float | None] | None) -> str | None:
+    """As `mean_cell`, of shares in percent; an end that is None is left out."""
+    if values is None:
+        return None
+    mean, *ends = (f"{100 * value:.0f}" for value in values if value is not None)
+    return f"{mean}% [{', '.join(ends)}]" if ends else f"{mean}%"
+
+
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A table in Markdown, columns being the keys of all rows."""
+    """A table in Markdown; its columns are the keys of all rows."""
     names = Section("", rows).columns
     lines = [names, ["---"] * len(names), *([_cell(row.get(name)) for name in names] for row in rows)]
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
@@ -359,7 +376,7 @@ def _cell(value: Any) -> str:
 
 
 def _json(what: Any, depth: int = 2) -> str:
-    """JSON with a line for each key, and for each row of a list under it: short, and rows can be compared."""
+    """JSON with a line for each key and for each row of a list under it: short, and easy to compare."""
     if depth and isinstance(what, dict) and what:
         lines = (f"{json.dumps(k)}: {_json(v, depth - 1)}" for k, v in what.items())
         return "{\n" + ",\n".join(lines) + "\n}"

@@ -1,4 +1,4 @@
-"""What every kept result was made by, whether that has changed since, and what making it again takes."""
+"""What made every stored result, whether that has changed since, and what making it again costs."""
 
 from __future__ import annotations
 
@@ -22,39 +22,35 @@ _SCORED = re.compile(r"^\s*bench score", re.M)
 
 @dataclass(frozen=True)
 class Status:
-    """One kept result."""
+    """One stored result."""
 
     file: str
     command: str
     commit: str
     changed: tuple[str, ...] | None
-    """Files that its script imports, and data of the checkout that it read, that differ from what made it;
-    None where script or commit are unknown."""
+    """Files imported by its script, and data of the checkout that it read, that differ from those that made
+    it; None where script or commit are unknown."""
     cpu_hours: float | None
 
     def row(self) -> dict[str, Any]:
         """Cells of a table."""
-        state = (
-            "current"
-            if self.changed == ()
-            else f"stale: {len(self.changed)} files"
-            if self.changed
-            else "unknown"
-        )
+        state = "unknown" if self.changed is None else "current"
+        if self.changed:
+            state = f"stale: {len(self.changed)} files"
         made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": self.command}
         return {"result": self.file, "state": state, **made}
 
 
 def gather(results: Path, home: Path = CHECKOUT) -> list[Status]:
-    """Every JSON file of a folder in the checkout `home`, by name."""
+    """Status of every JSON file of a folder in the checkout `home`, sorted by name."""
     return [_status(file, home) for file in sorted(results.rglob("*.json"))]
 
 
 def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
-    """Files of a module and of all modules of ours that these import, at whatever depth.
+    """Files of a module and of all modules of this project that it imports, directly or indirectly.
 
-    Names of modules in strings count too: work that other processes import. Flow estimators are found by
-    name, so whoever imports one of them depends on all.
+    Module names in strings count too: they are imported by other processes. Flow estimators are found by
+    name, so that a module which imports one of them depends on all.
     """
     found: set[Path] = set()
     waiting = [module]
@@ -70,7 +66,7 @@ def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
 
 
 def content(path: Path) -> str:
-    """One word for a file's content; of a folder, of all its JSON and YAML, hashes of arrays among them."""
+    """Hash of a file's content, or of all JSON and YAML files of a folder, which include hashes of arrays."""
     total = hashlib.blake2b(digest_size=8)
     files = [path] if path.is_file() else [p for kind in ("json", "yaml") for p in path.rglob(f"*.{kind}")]
     for file in sorted(files):
@@ -79,7 +75,7 @@ def content(path: Path) -> str:
 
 
 def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
-    """What a result keeps as `data`: content by path in the checkout; of data elsewhere by name."""
+    """Content hashes by path in the checkout, or by name for data elsewhere; results store them."""
     found = {}
     for path in map(Path.resolve, paths):
         found[str(path.relative_to(home)) if path.is_relative_to(home) else path.name] = content(path)

@@ -1,4 +1,4 @@
-"""Steps of a long run: one after another, each a process of its own; what has passed is not run again."""
+"""Steps of a long run, one after another, each in a process of its own; passed ones are skipped."""
 
 from __future__ import annotations
 
@@ -15,31 +15,30 @@ import typer
 
 from evidence import report
 
-Step = tuple[str, Sequence[str]]
-"""Its name, and the arguments after `python`."""
+Step = tuple[str, Sequence[str]]  # its name, and the arguments after `python`
 
 
 def run_steps(
-    steps: Sequence[Step], kept: Path, logs: Path, limit_s: float | None = None
+    steps: Sequence[Step], journal: Path, logs: Path, limit_s: float | None = None
 ) -> list[dict[str, Any]]:
-    """Runs the steps, each into `NAME.log` of a folder; one that fails does not stop the next.
+    """Runs the steps in order; one that fails does not stop the next.
 
-    A step that has passed before, by the same command and commit, is not run again.
+    A step that has passed before, by the same command and commit, is skipped.
 
     Args:
-        steps: in order.
-        kept: JSON of what was run, rewritten after every step.
-        logs: folder.
-        limit_s: a step that takes longer is stopped.
+        steps: names and arguments.
+        journal: JSON of the steps that were run, rewritten after every step.
+        logs: folder of a log a step, `NAME.log`.
+        limit_s: time after which a step is stopped.
 
     Returns:
         `name`, `command`, `commit`, `exit_code` (-1: stopped at its time limit), `wall_s` and `cpu_s` of
         these steps.
     """
     logs.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = json.loads(kept.read_text("utf-8"))["steps"] if kept.is_file() else []
+    rows: list[dict[str, Any]] = json.loads(journal.read_text("utf-8"))["steps"] if journal.is_file() else []
     commit = report.commit()
-    # What is not committed may have changed since.
+    # Files that are not committed may have changed since.
     rows = [row for row in rows if row.get("commit", "") == commit and not commit.endswith("+")]
     passed = {row["command"] for row in rows if row["exit_code"] == 0}
     for name, arguments in steps:
@@ -59,6 +58,6 @@ def run_steps(
         about = {"exit_code": code, "wall_s": round(spent, 1), "cpu_s": round(cpu, 1)}
         rows.append({"name": name, "command": line, "commit": commit, **about})
         typer.echo(f"{name}: exit code {code}, {spent:.0f} s, {cpu:.0f} of the CPU", err=True)
-        report.save(kept.parent, kept.name, {"steps": rows})
-    asked = {name for name, _ in steps}
-    return [row for row in rows if row["name"] in asked]
+        report.save(journal.parent, journal.name, {"steps": rows})
+    wanted = {name for name, _ in steps}
+    return [row for row in rows if row["name"] in wanted]

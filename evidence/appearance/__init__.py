@@ -1,1 +1,1 @@
-"""The look against a photograph: a classifier of patches."""
+"""Appearance: a classifier that distinguishes patches of renderings from those of a photograph."""

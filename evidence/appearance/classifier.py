@@ -1,4 +1,4 @@
-"""Can a small network tell crops of renderings from a photograph's? Held out by region and sequence.
+"""Held-out AUC of a small network that distinguishes crops of renderings from those of a photograph.
 
 Run: python -m evidence.appearance.classifier cortex.jpg --frames 5 --epochs 8 --seed 31
 """
@@ -31,9 +31,9 @@ Flags = npt.NDArray[np.bool_]
 Picture = npt.NDArray[np.uint8]
 
 _FOLDS = 5
-_UNSEEN = (3, 4), (0, 1)  # sectors that a look is not fitted on, and is asked on
+_HELD_OUT = (3, 4), (0, 1)  # pairs of sectors: the camera is fitted on the others and tested on these
 _BATCH, _RATE, _WIDTH = 32, 2e-3, 16
-_PATCHES = 40  # of the photograph, that the control gives one label each
+_PATCHES = 40  # of the photograph; the control assigns one label to each
 _BLURRED_PX = 3.0
 
 
@@ -46,20 +46,20 @@ def main(
     epochs: int = 10,
     seed: int = 31,
 ) -> None:
-    """AUC of a patch classifier, photograph against rendered crops; two controls have to be near 0.5.
+    """AUC of a patch classifier, photograph against rendered crops; two controls should be near 0.5.
 
-    Fitted looks are asked on sectors that `synth fit` did not see. `outline`, `width_mm`: of the cortex in
-    the photograph, as in realism; `frames`: one of each rendered sequence.
+    Fitted cameras are tested on sectors that `synth fit` did not use. `outline`, `width_mm`: of the cortex in
+    the photograph, as in realism; `frames`: number of rendered sequences, one frame each.
     """
     torch.set_num_threads(1)
     (theirs, places), rng = crops.of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
     away = places - places.mean(axis=0)
     turn = np.arctan2(away[:, 1], away[:, 0])
-    region = turn.argsort().argsort() * _FOLDS // len(turn)  # sectors round the middle, equally many crops
+    region = turn.argsort().argsort() * _FOLDS // len(turn)  # sectors about the centre, of equally many crops
     near = crops.overlapping(places)
     rows = []
 
-    def ask(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
+    def add(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
         scores = held_out(pictures, label, fold, near, epochs, seed)
         rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
@@ -70,15 +70,15 @@ def main(
         return np.concatenate([theirs, ours]), label, fold, both
 
     pictures, label, fold, both = against(crops.read_job({}, frames, seed, width_mm))
-    ask("default job", pictures, label, fold, both)
+    add("default job", pictures, label, fold, both)
     for k in (1, 2, 3):
-        ask(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
+        add(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
-    looks = []
-    for pair in _UNSEEN:
-        seen = crops.without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
-        looks.append(fit_camera(seen))
-        pictures, label, fold, both = against(crops.read_job(looks[-1], frames, seed, width_mm))
+    fitted = []
+    for pair in _HELD_OUT:
+        usable = crops.without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
+        fitted.append(fit_camera(usable))
+        pictures, label, fold, both = against(crops.read_job(fitted[-1], frames, seed, width_mm))
         grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
         blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
         shown = {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
@@ -86,21 +86,21 @@ def main(
             scores = held_out(of, label, fold, both, epochs, seed, pair)
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
-    ask("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
+    add("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
     means, ends = ({row["crops"]: row[key] for row in rows} for key in ("auc", "ends"))
-    about = {"data": status.data(photo), "epochs": epochs, "looks": looks, "rows": rows}
-    chart = report.Chart(
-        "Told apart at 1, not at 0.5", "AUC, lowest to highest fold", report.bars(means, ends)
+    bars = report.bars(means, ends)
+    chart = report.Chart("1: separable, 0.5: not separable", "AUC, lowest to highest fold", bars)
+    sections = [report.Section("AUC", rows)]
+    report.publish(
+        out,
+        "classifier.json",
+        {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows},
+        lambda found: report.Page("Rendered crops against a photograph's", found, [chart], sections),
     )
-    title = "Can a network tell crops from a photograph's?"
-    report.save(
-        out, "classifier.json", about, report.Page(title, about, [chart], [report.Section("AUC", rows)])
-    )
-    report.show(about)
 
 
 def shuffled(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:
-    """Each fold's labels dealt out anew, so that no fold's tell of another's."""
+    """Labels permuted within each fold, so that one fold's contain no information on another's."""
     label = label.copy()
     for k in np.unique(fold):
         label[fold == k] = rng.permutation(label[fold == k])
@@ -108,13 +108,13 @@ def shuffled(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:
 
 
 def patch_labels(places: Floats, rng: np.random.Generator) -> Ints:
-    """A label (N,) for each crop, the same for all of a patch: overlapping ones can't tell on each other."""
+    """A label (N,) for each crop, the same for all of a patch, so that overlapping crops agree."""
     _, patch = kmeans2(places, _PATCHES, minit="++", rng=rng)
     return np.asarray(rng.permutation(np.arange(_PATCHES) % 2)[patch], np.int64)
 
 
 def summary(scores: list[float]) -> dict[str, Any]:
-    """Of the AUC of some folds."""
+    """Mean and range of the AUC of some folds."""
     return {"auc": float(np.mean(scores)), "ends": (min(scores), max(scores))}
 
 
@@ -125,14 +125,14 @@ def held_out(
     near: Flags,
     epochs: int,
     seed: int,
-    asked: tuple[int, ...] = tuple(range(_FOLDS)),
+    tested: tuple[int, ...] = tuple(range(_FOLDS)),
 ) -> dict[int, float]:
-    """AUC of each asked fold; no crop that shows some of its, their region or sequence was trained on.
+    """AUC of each tested fold, without training on that fold or on crops that overlap it.
 
-    Args: pictures: (N, n, n, 3) sRGB; label: (N,) 0 or 1; fold: (N,); near: (N, N) show some of the same.
+    Args: pictures: (N, n, n, 3) sRGB; label: (N,) 0 or 1; fold: (N,); near: (N, N) which crops overlap.
     """
     found = {}
-    for k in asked:
+    for k in tested:
         inside = fold == k
         taught = ~inside & ~near[inside].any(axis=0)
         if len(np.unique(label[inside])) == len(np.unique(label[taught])) == 2:
@@ -141,8 +141,8 @@ def held_out(
     return found
 
 
-def trained_scores(pictures: Picture, label: Ints, asked: Picture, epochs: int, seed: int) -> Floats:
-    """Scores of crops by a network trained on turned and mirrored others, both labels counting as much."""
+def trained_scores(pictures: Picture, label: Ints, test: Picture, epochs: int, seed: int) -> Floats:
+    """Scores of test crops by a network trained on rotated and mirrored others, labels weighted equally."""
     order = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -163,7 +163,7 @@ def trained_scores(pictures: Picture, label: Ints, asked: Picture, epochs: int, 
                 optimiser.step()
             schedule.step()
     with torch.no_grad():
-        scores = [net.eval()(part)[:, 0] for part in torch.split(_tensor(asked), 64)]
+        scores = [net.eval()(part)[:, 0] for part in torch.split(_tensor(test), 64)]
     return np.asarray(torch.cat(scores).double().numpy())
 
 

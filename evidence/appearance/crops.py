@@ -1,7 +1,4 @@
-"""Crops of a photograph and of rendered frames that differ in what they show, not in how they were taken.
-
-Both are at the same scale; both get the same noise and go through the same codec last.
-"""
+"""Crops of a photograph and of rendered frames at the same scale, with the same noise and codec."""
 
 from __future__ import annotations
 
@@ -24,15 +21,14 @@ Ints = npt.NDArray[np.int64]
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
-MM_PER_PX = 0.0547
-"""Of all crops."""
+MM_PER_PX = 0.0547  # of all crops
 
 
 def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Picture, Places]:
     """Crops (N, 128, 128, 3) of the photograph inside an outline, and their corners (N, 2) in it [px].
 
     Raises:
-        UserError: it is no picture, or no crop fits.
+        UserError: the file is not an image, or no crop fits.
     """
     image = scaled_photograph(photo, width_mm / MM_PER_PX)
     found = corners(outlined(outline, image.shape[:2]), SIDE_PX, step)
@@ -42,12 +38,12 @@ def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) ->
 
 
 def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
-    """Crops of tissue in the first frame of each sequence, without instruments; (N,) their sequence."""
+    """Crops of tissue in the first frame of each sequence, without instruments; and their sequence (N,)."""
     field = job.render.size[0] * MM_PER_PX
-    asked = job.model_dump()
-    asked["render"] |= {"tool": False, "field_mm": (field, field)}
-    asked["sensor"]["bitrate_mbps"] = None  # the codec is that of all crops
-    bare = Job.model_validate(asked)
+    keys = job.model_dump()
+    keys["render"] |= {"tool": False, "field_mm": (field, field)}
+    keys["sensor"]["bitrate_mbps"] = None  # `taken` applies the codec
+    bare = Job.model_validate(keys)
     pictures, of = [], []
     for index in range(job.sequences):
         one = case(bare, index)
@@ -60,7 +56,7 @@ def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
 
 
 def without(given: Photograph, places: Places) -> Photograph:
-    """A photograph with nothing to be measured where crops of it are."""
+    """The photograph with the pixels of some crops marked as unusable."""
     usable, scale = given.usable.copy(), MM_PER_PX / given.mm_per_px
     for x, y in places:
         rows, columns = (slice(int(scale * at), int(scale * (at + SIDE_PX)) + 1) for at in (y, x))
@@ -68,14 +64,14 @@ def without(given: Photograph, places: Places) -> Photograph:
     return given._replace(usable=usable)
 
 
-def read_job(look: dict[str, Any], frames: int, seed: int, width_mm: float) -> Job:
-    """The job whose frames are compared: a default one with the sections that `synth fit` found.
+def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) -> Job:
+    """The job whose frames are compared: a default one with the sections fitted by `synth fit`.
 
-    The fitted loss of light towards the corners is the photograph's, `width_mm` wide. These frames are like a
-    piece of its middle, where there is less of it: by the square of the width.
+    The fitted vignetting is that of the whole photograph, `width_mm` wide. These frames correspond to a piece
+    of its centre, where vignetting is less by the square of the width.
     """
-    job = Job.model_validate({"sequences": frames, "seed": seed, **look})
-    if not look:
+    job = Job.model_validate({"sequences": frames, "seed": seed, **sections})
+    if not sections:
         return job
     share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
     sensor = job.sensor.model_copy(update={"vignette": job.sensor.vignette * share**2})
@@ -83,7 +79,7 @@ def read_job(look: dict[str, Any], frames: int, seed: int, width_mm: float) -> J
 
 
 def taken(rgb: Picture, seed: int) -> Picture:
-    """A picture with the same noise and codec as any other."""
+    """The image with the noise and JPEG compression common to all crops."""
     noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
     noisy = np.clip(rgb + noise, 0, 255).astype(np.uint8)
     _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
@@ -91,7 +87,7 @@ def taken(rgb: Picture, seed: int) -> Picture:
 
 
 def overlapping(places: Places) -> npt.NDArray[np.bool_]:
-    """Which crops (N, N) of one picture show some of the same."""
+    """Which crops of one image overlap, (N, N)."""
     return np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))
 
 

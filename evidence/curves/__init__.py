@@ -1,1 +1,1 @@
-"""What more sequences buy: learning curves."""
+"""Learning curves: error of the force against the number of training sequences."""

@@ -1,7 +1,7 @@
-"""What answers with a force: rules fitted on flow, physics alone, a network.
+"""Force estimators: rules fitted on flow, physics alone, a network.
 
-The force turns with the picture, so fitted rules see every sequence in its eight turns and mirrors, as the
-network does by drawing them.
+Force rotates with the image, so rules are fitted on every sequence in its eight rotations and reflections,
+which the network draws at random.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from bench.methods import baselines, physics, posterior
 from bench.methods.compliance import TissueKind
-from bench.methods.protocol import Field
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
@@ -27,8 +26,7 @@ from learn.training.train import train
 from synth.flow.confidence import deviation
 
 Floats = NDArray[np.float64]
-Answer = Callable[[Clip], Floats]
-"""A clip with `recovered` displacement → force (T, 3) mN, camera axes."""
+Estimate = Callable[[Clip], Floats]  # clip with `recovered` displacement → force (T, 3) mN, camera axes
 
 RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "physics"
 _FOLDS = 4
@@ -36,18 +34,10 @@ _MM_PER_PX = 0.12  # of the bench's scenes; flow's deviations are in pixels
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
 
 
-def build(model: str, fit: Sequence[Clip]) -> Answer:
-    """A model, fitted on sequences unless it is physics alone."""
+def build(model: str, fit: Sequence[Clip]) -> Estimate:
+    """An estimator by its name, fitted on sequences unless it is physics alone."""
     if model == PHYSICS:
-        return lambda clip: (
-            clip.young_kpa
-            * np.stack(
-                [
-                    read_bare(moved, clip.mask, sure)
-                    for moved, sure in zip(clip.displacement["recovered"], clip.confidence, strict=True)
-                ]
-            )
-        )
+        return _by_physics
     x, force, group = samples(fit)
     live = np.abs(x).max(axis=0) > 0
     x = x[:, live]
@@ -55,26 +45,28 @@ def build(model: str, fit: Sequence[Clip]) -> Answer:
     return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
 
 
-def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
-    """Physics of one frame of still tissue without a membrane, a rule as the baselines are."""
-    spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
-    seen = physics.observe(moved, spread, mask)
-    return posterior.infer(
-        posterior.load_basis(len(moved), TissueKind()), seen, np.zeros(len(moved))
-    ).force.mean
+def _by_physics(clip: Clip) -> Floats:
+    """Posterior mean force of each frame, for still tissue without a membrane."""
+    forces = []
+    for moved, sure in zip(clip.displacement["recovered"], clip.confidence, strict=True):
+        spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
+        observed = physics.observe(moved, spread, clip.mask)
+        basis = posterior.load_basis(len(moved), TissueKind())
+        forces.append(posterior.infer(basis, observed, np.zeros(len(moved))).force.mean)
+    return clip.young_kpa * np.stack(forces)
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
-    """Ridge from displacement to force over E; arguments as `samples` gives them."""
-    # Every sequence weighs alike, as it does in the score: what is linear may be scaled.
+    """Ridge regression from displacement to force over E; arguments as `samples` returns them."""
+    # Every sequence has the same weight, as in the score; a linear relation may be scaled.
     size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
     x, force = x / size[group, None], force / size[group, None]
-    # Flow shows the force along the line of sight far less well than that across it.
+    # The force along the line of sight is far less visible in flow than that across it.
     return baselines.ridge(x, force, group % _FOLDS, _STRENGTHS, (slice(0, 2), slice(2, 3)))
 
 
 def turned(clip: Clip) -> list[Clip]:
-    """The clip in its four quarter turns and their mirrors, all arrays and the force turned with it."""
+    """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
     return [_turned(clip, turn) for turn in range(8)]
 
 
@@ -93,12 +85,12 @@ def _turned(clip: Clip, turn: int) -> Clip:
 
 
 def rows(clip: Clip, source: str = "recovered") -> Floats:
-    """Displacement of a clip, (T, 2 N N) mm, of two eyes (T, 3 N N)."""
+    """Displacement of a clip, (T, 2 N N) mm, or in stereo (T, 3 N N)."""
     return (clip.displacement[source] * clip.mask).reshape(clip.frames, -1).astype(np.float64)
 
 
 def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Frames of all turns: displacement, force over E (n, 3), and which sequence; its turns are together."""
+    """Frames in all orientations: displacement, force over E (n, 3), and the index of their sequence (n,)."""
     clips = [turned(clip) for clip in fit]
     x = np.concatenate([rows(t, source) for turns in clips for t in turns])
     force = np.concatenate([t.force / t.young_kpa for turns in clips for t in turns])
@@ -107,32 +99,33 @@ def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Flo
 
 
 def train_network(
-    fit: Sequence[Clip], choose: Sequence[Clip], settings: TrainingSettings, folder: Path
+    fit: Sequence[Clip], select: Sequence[Clip], settings: TrainingSettings, folder: Path
 ) -> Predictor:
-    """A network of vectors; `choose` chooses the epoch. Kept in `folder`."""
-    clips = [*fit, *choose]
+    """A network with vector output, stored in `folder`; the clips `select` choose the epoch."""
+    clips = [*fit, *select]
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(clips))), ())
     train(clips, split, settings, folder)
     return load_model(folder)
 
 
-def read_force(predictor: Predictor, clip: Clip, source: str, told: bool = False) -> Floats:
-    """Force (T, 3) mN that a network of vectors gives for a displacement (`told`: and membrane), summed."""
+def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bool = False) -> Floats:
+    """Total force (T, 3) mN estimated by a network with vector output."""
     moved = np.asarray(clip.displacement[source])
-    membrane = clip.membrane if told else "unknown"
+    membrane = clip.membrane if membrane_known else "unknown"
     density = predictor.density(moved, clip.mask, clip.young_kpa, clip.confidence_of(source), membrane)
     return np.asarray(density.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)
 
 
 def errors(predicted: Sequence[Floats], true: Sequence[Floats]) -> dict[str, list[float]]:
-    """Root mean square error of the force as a part of the force's own, by sequence: (T, 3) mN, camera axes.
+    """Root mean square error relative to that of the force, for each sequence: (T, 3) mN, camera axes.
 
-    Whole, and its parts across and along the line of sight.
+    Returns:
+        `errors` of the whole vector, and its parts `across` and `along` the line of sight.
     """
     found: dict[str, list[float]] = {"errors": [], "across": [], "along": []}
-    for answer, force in zip(predicted, true, strict=True):
+    for estimate, force in zip(predicted, true, strict=True):
         own = np.square(force).sum(axis=1).mean()
-        off = np.square(answer - force).mean(axis=0) / own
+        off = np.square(estimate - force).mean(axis=0) / own
         for name, parts in (("errors", off), ("across", off[:2]), ("along", off[2:])):
             found[name].append(float(np.sqrt(parts.sum())))
     return found

@@ -1,18 +1,18 @@
 """Error of the force against cost, for whole pipelines: law, mesh, paths, flow and model.
 
-A pipeline makes sequences, recovers their flow and fits a model on them; it is asked for the force of
-sequences that a finer pipeline made of scenes it has not seen, from the flow that its own estimator recovers
-there. Its cost is the CPU time of one frame of its data and of one answer.
+A pipeline makes sequences, recovers their flow and fits a model on them. It is tested on sequences of other
+scenes that a finer pipeline made, with flow recovered by its own estimator. Its cost is the CPU time of one
+frame of its data and of one estimate.
 
-One instrument pulls or pushes: flow shows the force along the line of sight only through the little that
-tissue spreads under a push, so the part across the line of sight is judged by itself besides.
+One instrument pulls or pushes. The force along the line of sight is visible in flow only through the little
+that tissue spreads under a push, so that the part across the line of sight is also reported by itself.
 
 Run: python -m evidence.end_to_end.pareto --fit 8 --test 6 --out runs/end-to-end
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,50 +22,49 @@ import typer
 
 from evidence import report
 from evidence.end_to_end import models
-from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Sequences, chosen, default_world, errors
+from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Sequences, chosen, default_rendering, errors
 from learn.evaluation.statistics import interval, paired
 
 PARTS = {"": "errors", "across_": "across"}
-"""What defaults are judged by: the whole force, and its part across the line of sight. Prefix of the names in
-a row, and the errors by sequence."""
+"""The whole force, and its part across the line of sight: prefix of a row's keys, and key of the errors."""
 _WHAT = {"": "the force", "across_": "the force across the line of sight"}
 
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for results.")] = report.RESULTS / "end-to-end",
-    work: Annotated[Path, typer.Option(help="Folder for sequences, flow and answers, to go on from.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder of intermediate results; a later run continues.")] = Path(
         "runs/end-to-end-work"
     ),
     fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 40,
-    test: Annotated[int, typer.Option(min=3, help="Sequences that all are asked about.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 31,
+    test: Annotated[int, typer.Option(min=3, help="Sequences that all are tested on.")] = 24,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 31,
 ) -> None:
     """Error of the force against CPU time a frame, for whole pipelines."""
-    asked, pipelines = Sequences(FINE, FINE.job(seed + 1, test), work), chosen()
-    worlds = dict.fromkeys(one.world for one in pipelines)
-    made = {world: Sequences(world, world.job(seed, fit), work) for world in worlds}
+    tested, pipelines = Sequences(FINE, FINE.job(seed + 1, test), work), chosen()
+    renderings = dict.fromkeys(one.rendering for one in pipelines)
+    made = {one: Sequences(one, one.job(seed, fit), work) for one in renderings}
     rows: list[dict[str, Any]] = []
     for one in pipelines:
-        row = one.as_row() | errors(one, made[one.world], asked, work)
-        costs = {"data_s": made[one.world].data_s(), "flow_s": made[default_world()].flow_s(one.flow)}
-        rows.append(row | costs | {"cpu_s": sum(costs.values()) + row["answer_s"]})
+        row = one.as_row() | errors(one, made[one.rendering], tested, work)
+        flow_s = made[default_rendering()].flow_s(one.flow)
+        costs = {"data_s": made[one.rendering].data_s(), "flow_s": flow_s}
+        rows.append(row | costs | {"cpu_s": sum(costs.values()) + row["estimate_s"]})
         done = f"{len(rows)} of {len(pipelines)}: {one.name}, {100 * np.mean(row['errors']):.0f}%"
         typer.echo(done, err=True)
-    still = [clip.force for clip in asked.clips("ideal")]
-    nothing = models.errors([0 * force for force in still], still)
+    true = [clip.force for clip in tested.clips("ideal")]
+    nothing = models.errors([0 * force for force in true], true)
     found = {
-        "asked": asdict(FINE) | {"size": SIZE, "frames": FRAMES, "sequences": test},
+        "tested": asdict(FINE) | {"size": SIZE, "frames": FRAMES, "sequences": test},
         "seed": seed,
         "zero": float(np.mean(nothing["errors"])),
         "across_zero": float(np.mean(nothing["across"])),
         "rows": summarised(rows, seed),
     }
-    report.save(out, "pareto.json", found, page(found))
-    report.show({"rows": page(found).sections[0].rows})
+    report.publish(out, "pareto.json", found, page, {"rows": page(found).sections[0].rows})
 
 
 def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
-    """Rows with means over sequences and what they err more than the default pipeline with the same model.
+    """Rows with mean errors and their difference from the default pipeline with the same model.
 
     `rmse`, `low`, `high` of the whole force, and of its part across as `across_rmse` and so on, BCa;
     `difference` and `across_difference`: mean, low, high; None for a default.
@@ -84,13 +83,13 @@ def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
 
 
 def difference(usual: list[float], other: list[float], seed: int) -> list[float]:
-    """Mean, low and high of what `other` errs more than `usual` on the same sequences (BCa)."""
+    """Mean, low and high of the error of `other` less that of `usual` on the same sequences (BCa)."""
     found = paired(np.asarray(usual), np.asarray(other), np.random.default_rng(seed)).difference
     return [found.mean, found.low, found.high]
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Error against cost, which pipelines differ from the defaults, and a table, the cheapest first."""
+    """Error against cost, and a table of the ridge pipelines, cheapest first."""
     rows = sorted(found["rows"], key=lambda row: float(row["cpu_s"]))
     ridge = [row for row in rows if row["model"] == models.RIDGE]
     flow = next(row["flow"] for row in ridge if row["default"])
@@ -105,19 +104,19 @@ def page(found: Mapping[str, Any]) -> report.Page:
         [_panel(found, part) for part in PARTS],
         [report.Section("", [_cells(row) for row in ridge])],
         (
-            f"**Across the line of sight ridge errs by {least[0]:.0f} to {most[0]:.0f}% on flow by {flow}, "
-            f"whatever law, mesh and paths, on other estimators' by {least[1]:.0f} to {most[1]:.0f}%.**",
-            "Root mean square error over frames as a part of the force's own, mean over "
-            "sequences with BCa intervals; *more*: paired with the defaults. Other readers are in the data. "
-            f"No force at all errs by {100 * found['zero']:.0f}%, across the line of sight by "
-            f"{100 * found['across_zero']:.0f}%. CPU time is that of a frame of data, its flow and an "
-            "answer, the least that was measured.",
+            f"**Across the line of sight the error of ridge is {least[0]:.0f} to {most[0]:.0f}% with flow by "
+            f"{flow}, for every law, mesh and number of paths, and {least[1]:.0f} to {most[1]:.0f}% with "
+            "other flow estimators.**",
+            "Root mean square error relative to that of the force, mean over sequences with BCa intervals; "
+            "*difference*: from the defaults, paired. Other models are in the data. Zero force has an error "
+            f"of {100 * found['zero']:.0f}%, across the line of sight of {100 * found['across_zero']:.0f}%. "
+            "CPU time: least measured for a frame of data, its flow and an estimate.",
         ),
     )
 
 
 def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
-    """A curve a model, a dot a pipeline; and what no force at all errs by."""
+    """A curve for each model, a dot for each pipeline, and the error of zero force."""
     rows = found["rows"]
     curves = []
     for model in dict.fromkeys(row["model"] for row in rows):
@@ -128,25 +127,20 @@ def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
         cost, labels = tuple(float(row["cpu_s"]) for row in own), tuple(map(_name, own))
         curves.append(report.Curve(model, cost, errs, labels, ringed, ends, named=False))
     costs, level = [float(row["cpu_s"]) for row in rows], 100 * float(found[f"{part}zero"])
-    curves.append(report.Curve("no force at all", (min(costs), max(costs)), (level, level)))
+    curves.append(report.Curve("zero force", (min(costs), max(costs)), (level, level)))
     title, unit = f"Error of {_WHAT[part]} (rings: defaults)", "RMSE [% of the whole force]"
     return report.Panel(title, "CPU s a frame", unit, tuple(curves), log_y=True, front=True)
 
 
 def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
-    def ends(values: Sequence[float] | None, form: str) -> str | None:
-        if values is None:
-            return None
-        mean, low, high = (f"{100 * value:{form}}" for value in values)
-        return f"{mean} [{low}, {high}]"
-
+    more = row["across_difference"]
     return {
         "pipeline": _name(row),
         "model": row["model"],
         "CPU s": f"{row['cpu_s']:.3f}",
-        "error [%]": ends([row["rmse"], row["low"], row["high"]], ".0f"),
-        "across [%]": ends([row["across_rmse"], row["across_low"], row["across_high"]], ".0f"),
-        "more across": ends(row["across_difference"], "+.1f"),
+        "error [%]": report.mean_cell([row[key] for key in ("rmse", "low", "high")], ".0f", 100),
+        "across [%]": report.mean_cell([row[f"across_{key}"] for key in ("rmse", "low", "high")], ".0f", 100),
+        "difference across": None if more is None else report.mean_cell(more, "+.1f", 100),
     }
 
 

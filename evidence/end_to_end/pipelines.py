@@ -1,4 +1,4 @@
-"""Whole pipelines from physics to model: the sequences that each makes, and what it errs by."""
+"""Whole pipelines from physics to model: the sequences that each makes, and its errors."""
 
 from __future__ import annotations
 
@@ -30,13 +30,12 @@ from synth.sequence import pipeline
 
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
 _MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
-_KEPT = ("peak_rss_mb", "store")
-"""Of a sequence's timings, what is no cost of making it."""
+_NO_COST = ("peak_rss_mb", "store")  # timings of a sequence that are not costs of making it
 
 
 @dataclass(frozen=True)
-class World:
-    """How sequences are made."""
+class Rendering:
+    """Settings by which sequences are made."""
 
     law: str
     tets: int
@@ -60,62 +59,60 @@ class World:
         return f"{self.law}-{self.tets}-{self.spp}"
 
 
-def default_world() -> World:
-    """What a job without these keys gets at this load."""
+def default_rendering() -> Rendering:
+    """Defaults of a job at this load."""
     fem = FemSection(load=LOAD)
-    return World(fem.chosen_law[0], fem.tets, RenderSection().spp)
+    return Rendering(fem.chosen_law[0], fem.tets, RenderSection().spp)
 
 
-FINE = World("neo-hookean", 3000, 8)
-"""Makes the sequences that all are asked about."""
+FINE = Rendering("neo-hookean", 3000, 8)  # of the sequences that all pipelines are tested on
 
 
 @dataclass(frozen=True)
 class Pipeline:
     """One dot of the chart."""
 
-    world: World
+    rendering: Rendering
     flow: str
     model: str
 
     @property
     def name(self) -> str:
-        return f"{self.world.name}, {self.flow}, {self.model}"
+        return f"{self.rendering.name}, {self.flow}, {self.model}"
 
     @property
     def default(self) -> bool:
-        """Whether it is made of defaults alone; the model is none of a job's."""
-        return self.world == default_world() and self.flow == FlowSection().backend
+        """Whether rendering and flow are the defaults; a job doesn't specify the model."""
+        return self.rendering == default_rendering() and self.flow == FlowSection().backend
 
     def as_row(self) -> dict[str, Any]:
-        """What names it in a row of results."""
-        return asdict(self.world) | {"flow": self.flow, "model": self.model, "default": self.default}
+        """Settings that identify it in a row of results."""
+        return asdict(self.rendering) | {"flow": self.flow, "model": self.model, "default": self.default}
 
 
 def chosen() -> list[Pipeline]:
-    """One thing changed at a time from the defaults, all at their cheapest, and as dear as what is asked."""
-    usual, flow = default_world(), FlowSection().backend
-    cheapest = World("linear", 400, 1)
+    """Defaults, changes of one setting at a time, all settings at their cheapest, and those of `FINE`."""
+    usual, flow = default_rendering(), FlowSection().backend
+    cheapest = Rendering("linear", 400, 1)
     changed = [replace(usual, law="linear"), replace(usual, tets=400), replace(usual, spp=1)]
-    worlds = dict.fromkeys([usual, *changed, cheapest, FINE])
-    pairs = [(world, flow) for world in worlds]
+    pairs = [(rendering, flow) for rendering in dict.fromkeys([usual, *changed, cheapest, FINE])]
     pairs += [(usual, other) for other in ("dis", "opencv-tvl1", "ideal")] + [(cheapest, "dis")]
-    made = [Pipeline(world, flow, model) for world, flow in pairs for model in _MODELS]
-    # Physics alone learns nothing from the sequences: it is one dot for every flow that it is asked with.
-    return [p for p in made if p.model != models.PHYSICS or (p.world == usual and p.flow != "ideal")]
+    made = [Pipeline(rendering, flow, model) for rendering, flow in pairs for model in _MODELS]
+    # Physics alone is not fitted: one dot for each flow estimator of the tested sequences.
+    return [p for p in made if p.model != models.PHYSICS or (p.rendering == usual and p.flow != "ideal")]
 
 
 class Sequences:
-    """Sequences of one world on the baselines' grid, with the flow that any estimator recovers from them.
+    """Sequences of one rendering on the baselines' grid, with the flow that any estimator recovers from them.
 
-    Costs are the least CPU time a frame of all sequences: what else runs on a machine only ever adds, and
-    the first of a process compiles.
+    Costs are the least CPU time a frame of all sequences: other processes only add to it, and the first
+    sequence of a process includes compilation.
     """
 
-    def __init__(self, world: World, job: Job, work: Path) -> None:
-        """Renders what is not there yet."""
+    def __init__(self, rendering: Rendering, job: Job, work: Path) -> None:
+        """Renders the sequences that are missing."""
         self._job = job
-        self._folder = work / f"{world.name}-{job.seed}-{cache.key(identity.identify_job(job))}"
+        self._folder = work / f"{rendering.name}-{job.seed}-{cache.key(identity.identify_job(job))}"
         self._folder.mkdir(parents=True, exist_ok=True)
         for index in range(job.sequences):
             target = location.store(self._folder, index)
@@ -124,7 +121,7 @@ class Sequences:
                 pipeline.render_sequence(job, index, self._folder, lambda stage, done, of: None)
 
     def clips(self, flow: str) -> list[Clip]:
-        """The clips with `recovered` displacement of an estimator; kept beside the sequences."""
+        """Clips with the `recovered` displacement of an estimator, stored next to the sequences."""
         return [
             cache.clip(self._folder / f"clips-{flow}" / f"{k:06d}", functools.partial(self._recover, k, flow))
             for k in range(self._job.sequences)
@@ -136,11 +133,11 @@ class Sequences:
         for k in range(self._job.sequences):
             one = open_sequence(location.store(self._folder, k))
             times = one.attrs["timings"].items()
-            spent.append(sum(t["cpu_s"] for stage, t in times if stage not in _KEPT) / one.frames)
+            spent.append(sum(t["cpu_s"] for stage, t in times if stage not in _NO_COST) / one.frames)
         return min(spent)
 
     def flow_s(self, flow: str) -> float:
-        """CPU time [s] of a frame's masks and flow; 0 of ideal flow. Of clips that are there."""
+        """CPU time [s] of a frame's masks and flow, 0 for ideal flow; requires `clips` first."""
         if flow == "ideal":
             return 0.0
         return min(float(self._flow_cost(k, flow).read_text("utf-8")) for k in range(self._job.sequences))
@@ -162,36 +159,38 @@ class Sequences:
         return recovered
 
 
-def errors(one: Pipeline, made: Sequences, asked: Sequences, work: Path) -> dict[str, Any]:
-    """What a pipeline errs by, and CPU time [s] of an answer; one fitted on ideal flow is asked with the
-    default's. Kept in `work`."""
+def errors(one: Pipeline, made: Sequences, tested: Sequences, work: Path) -> dict[str, Any]:
+    """Errors of a pipeline and CPU time of an estimate [s], cached in `work`.
+
+    A pipeline fitted on ideal flow is tested with the default's flow.
+    """
     fit = [] if one.model == models.PHYSICS else made.clips(one.flow)
-    tests = asked.clips(FlowSection().backend if one.flow == "ideal" else one.flow)
+    tests = tested.clips(FlowSection().backend if one.flow == "ideal" else one.flow)
 
     def compute() -> dict[str, Any]:
-        answer = models.build(one.model, fit)
-        given, spent = [], []
+        estimate = models.build(one.model, fit)
+        forces, spent = [], []
         for clip in tests:
             began = time.process_time()
-            given.append(answer(clip))
+            forces.append(estimate(clip))
             spent.append((time.process_time() - began) / clip.frames)
-        return models.errors(given, [clip.force for clip in tests]) | {"answer_s": min(spent)}
+        return models.errors(forces, [clip.force for clip in tests]) | {"estimate_s": min(spent)}
 
     key = cache.key(one.name, [clip.content_hash for clip in (*fit, *tests)])
-    found: dict[str, Any] = cache.result(work / "answers", one.name.replace(", ", "-"), key, compute)
+    found: dict[str, Any] = cache.result(work / "estimates", one.name.replace(", ", "-"), key, compute)
     return found
 
 
 def recover_flow(
     sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: NDArray[np.bool_], grid: Grid
 ) -> tuple[Clip, float]:
-    """The clip with the flow that an estimator recovers, and the CPU time of the flow over all frames [s].
+    """Clip with recovered flow, and the CPU time of the flow over all frames [s].
 
     Args:
         sequence: rendered, with `rgb` and `tissue`.
         clip: of the sequence on `grid`.
         estimator: or its name.
-        blocked: (T, H, W) what is masked: tool, glare.
+        blocked: (T, H, W) masked pixels: tool, specular highlights.
         grid: of the clip.
     """
     tissue = sequence["tissue"][:].astype(bool)

@@ -1,4 +1,4 @@
-"""What the engine costs over the bare stages, and what a second worker brings.
+"""Overhead of the engine over the bare stages, and speed-up by a second worker.
 
 Run: python -m evidence.engine.speed (10 CPU-minutes)
 """
@@ -27,8 +27,7 @@ from synth.job import reader
 from synth.job.schema import Job
 from synth.system.stopwatch import StageCallback
 
-_CPU_S = "STAND_IN_CPU_S"
-"""Variable that tells workers how long a stand-in computes [s]."""
+_CPU_S = "STAND_IN_CPU_S"  # environment variable: how long a stand-in computes in a worker [s]
 
 
 def main(
@@ -40,28 +39,28 @@ def main(
 ) -> None:
     """Overhead from `rendered` sequences of a job; workers from stand-ins of `cpu_s` processor time each."""
     found = {"overhead": overhead(job, rendered), "workers": workers(sequences, cpu_s)}
-    report.save(out, "speed.json", found, page(found))
-    report.show(found)
+    report.publish(out, "speed.json", found, page)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Verdicts against what was asked."""
+    """Overhead and speed-up against their targets."""
     over, two = found["overhead"], found["workers"]
     words = (
-        f"A second worker brings {two['ratio']:.2f} times the sequences (at least 1.8 were asked; "
-        f"{two['sequences']} stand-ins of {two['scene_cpu_s']:g} CPU-s). Engine, store, index and card cost "
-        f"{over['overhead']:.1%} over the stages alone (at most 8%), the store {over['store_share']:.1%}.",
-        "Kills, damage, faults and Dask are tests: `tests/slow`. Measured before, by code in git's "
+        f"**With two workers throughput is {two['ratio']:.2f} times that of one (target: at least 1.8; "
+        f"{two['sequences']} stand-ins of {two['scene_cpu_s']:g} CPU-s). Engine, store, index and card add "
+        f"{over['overhead']:.1%} to the stages alone (target: at most 8%), "
+        f"the store {over['store_share']:.1%}.**",
+        "Kills, damage, faults and Dask are tested in `tests/slow`. Earlier measurements, by code in git's "
         "history: 200 SIGKILLs over 50 sequences, and 50 over 12 rendered ones, left equal bytes (6dd5d3e, "
         "bad03fb); a random frame of 640 × 480 px with flow and traction takes 7.9 ms to read, all fields "
-        "17.4 ms; of 100,000 sequences the status took 0.9 s, the report 1.3 s (22268e1).",
+        "17.4 ms; for 100,000 sequences the status took 0.9 s, the report 1.3 s (22268e1).",
     )
     sections = [report.Section(name, [found[name]]) for name in ("overhead", "workers")]
-    return report.Page("What does the engine cost?", found, (), sections, words)
+    return report.Page("Engine: overhead and workers", found, (), sections, words)
 
 
 def overhead(name: str, count: int) -> dict[str, float | int]:
-    """CPU time of a whole run (engine, workers, store, index, film, card) over that of its stages alone."""
+    """CPU time of a whole run (engine, store, index, preview, card) relative to its stages alone."""
     job = reader.load_job(name, [f"sequences={count}"])
     alone = {
         **os.environ,
@@ -91,7 +90,7 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
 
 
 class _Nowhere:
-    """Takes what a store takes, and keeps nothing."""
+    """Accepts every call of a store and stores nothing."""
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
 
@@ -129,8 +128,8 @@ def workers(sequences: int, cpu_s: float) -> dict[str, float | int]:
     }
 
 
-def compute(job: Job, index: int, folder: Path, tell: StageCallback) -> None:
-    """A stand-in for rendering: so much arithmetic, then a store of random fields."""
+def compute(job: Job, index: int, folder: Path, progress: StageCallback) -> None:
+    """A stand-in for rendering: arithmetic for a given CPU time, then a store of random fields."""
     rng = np.random.default_rng((job.seed, index))
     matrix = rng.normal(size=(200, 200))
     until = time.process_time() + float(os.environ[_CPU_S])
@@ -143,7 +142,7 @@ def compute(job: Job, index: int, folder: Path, tell: StageCallback) -> None:
     writer.put("tissue", rng.random(size) > 0.2)
     writer.put("area", rng.random(size))
     for t in range(job.frames):
-        tell("render", t, job.frames)
+        progress("render", t, job.frames)
         writer.put_frame("rgb", t, rng.integers(0, 256, (*size, 3)).astype(np.uint8))
         for name in ("visible", "tool", "glare"):
             writer.put_frame(name, t, rng.random(size) > 0.5)
@@ -161,7 +160,7 @@ def compute(job: Job, index: int, folder: Path, tell: StageCallback) -> None:
 
 
 def _path() -> dict[str, str]:
-    """What lets a process find this module, wherever the command was given."""
+    """Environment with which a process finds this module in any working directory."""
     known = filter(None, [str(report.CHECKOUT), os.environ.get("PYTHONPATH")])
     return {"PYTHONPATH": os.pathsep.join(known)}
 

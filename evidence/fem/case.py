@@ -1,4 +1,4 @@
-"""One contact on the procedural brain, as the measurements of the physics need it."""
+"""One contact on the procedural brain, for measurements of the physics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 ANATOMY = schema.AnatomySection()
 WAYS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
 CONTACTS = ((0.0, 0.0, 4.5), (5.0, 2.0, 3.0), (-3.0, -5.0, 6.0), (-2.0, 6.0, 3.5))
-"""World x, y and radius, mm: the default range of radii, near the centre and near the rim."""
+"""x, y and radius, mm, world axes: the default range of radii, near the centre and near the rim."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,7 @@ class Patch:
     vertices: Floats
     faces: NDArray[np.int32]
     area: Floats
-    opening: NDArray[np.bool_]
-    """(V,) in the opening, where errors are measured."""
+    opening: NDArray[np.bool_]  # (V,) in the opening, where errors are measured
 
 
 def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:
@@ -50,12 +49,11 @@ def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:
 
 @dataclass(frozen=True)
 class Brain:
-    """A mesh finest under one contact, its equations and the surface on it."""
+    """A mesh refined under one contact, its equations and the surface embedded in it."""
 
     system: System
     embedding: Embedding
-    kernel: Floats
-    """(V,) share of a unit force at every vertex."""
+    kernel: Floats  # (V,) share of a unit force at every vertex
     radius_mm: float
 
     def load(self, load: float, way: str) -> Floats:
@@ -64,7 +62,7 @@ class Brain:
 
 
 def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4) -> Brain:
-    """Meshes, assembles and embeds."""
+    """Mesh, equations and embedded surface of one contact."""
     volume = tetrahedra.block(ANATOMY, tets, (contact,))
     embedding = surface_embedding.embed(volume, on.vertices)
     pressure = tool_gesture.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
@@ -73,7 +71,7 @@ def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], p
 
 
 def moved(case: Brain, load: float, way: str, steps: int = 3) -> Floats:
-    """(V, 3) mm under a load that was raised in a few steps."""
+    """Displacement (V, 3) mm under a load that is raised in a few steps."""
     part = np.linspace(0, 1, steps + 1)
     path = equilibrium.solve_path(case.system, part[:, None, None] * case.load(load, way), load * part)
     return case.embedding.move(path.displacement[-1])
@@ -85,7 +83,7 @@ def error(u: Floats, exact: Floats, on: Patch) -> float:
 
 
 def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
-    """CPU milliseconds a frame of a pull with ramp, hold and release, moving the surface included."""
+    """CPU milliseconds a frame of a pull with ramp, hold and release, including the surface's motion."""
     fem, tissue = schema.FemSection(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
     gesture = scenario.draw_gesture(
         fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)

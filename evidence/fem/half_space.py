@@ -39,12 +39,11 @@ def main(out: Path = report.RESULTS / "fem/half-space", tets: str = "1600,5000")
     """
     settings = product((int(n) for n in tets.split(",")), _POISSONS, _SHEETS)
     found = {"rows": [row for setting in settings for row in measure(*setting)]}
-    report.save(out, "half-space.json", found, page(found))
-    report.show(found)
+    report.publish(out, "half-space.json", found, page)
 
 
 def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
-    """Relative root mean squares inside the disc and outside, to twice its radius.
+    """Relative root mean square errors inside the disc and outside, to twice its radius.
 
     Args:
         count: tetrahedra to aim for.
@@ -73,10 +72,10 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
         u = shell + system.solve(load.gather(np.outer(share, way)) - held)
         for place, radii in (("inside", inside), ("outside", outside)):
             spots = np.concatenate([np.outer(radii, [np.cos(t), np.sin(t)]) for t in turn[::6]])
-            seen = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
+            moved = surface_embedding.embed(free, np.column_stack([spots, np.zeros(len(spots))])).move(u)
             unit = spots / np.linalg.norm(spots, axis=1, keepdims=True)
-            radial = np.einsum("nd,nd->n", seen[:, :2], unit)
-            got = {"u_z": -seen[:, 2], "u_r": radial, "u_x": seen[:, 0]}
+            radial = np.einsum("nd,nd->n", moved[:, :2], unit)
+            got = {"u_z": -moved[:, 2], "u_r": radial, "u_x": moved[:, 0]}
             exact = covered(radii, a, poisson, sheet_mm, disc) if sheet_mm else bare(radii, a, poisson, disc)
             setting = {"tets": count, "poisson": poisson, "sheet_mm": sheet_mm, "disc": disc}
             for part, value in exact.items():
@@ -87,15 +86,15 @@ def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
 
 
 def bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
-    """Motion of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4 and 3.6).
+    """Displacement of the surface under a unit force, E = 1 kPa (Johnson, Contact Mechanics, 3.4 and 3.6).
 
     Under a tangential load the kernel of point forces is [(1 - nu)/s + nu (x/s)^2/s] / (2 pi G). Its square
     averages to a half on the ring, which leaves 1 - nu/2 of the potential of which a normal load has 1 - nu.
 
     Args:
-        r: (n,) mm from the middle.
+        r: (n,) mm from the centre.
         a: radius of the disc, mm.
-        poisson: its ratio.
+        poisson: Poisson's ratio.
         disc: `uniform`, `hertz` or `tangential`.
 
     Returns:
@@ -120,18 +119,22 @@ def bare(r: Floats, a: float, poisson: float, disc: str) -> dict[str, Floats]:
 
 
 def covered(r: Floats, a: float, poisson: float, sheet_mm: float, disc: str) -> dict[str, Floats]:
-    """Motion of the surface under a linear membrane without thickness, by Hankel integrals; E = 1 kPa.
+    """Displacement of the surface under a linear membrane of no thickness, by Hankel integrals; E = 1 kPa.
 
-    A surface wave k of the half-space moves by (1 - nu) t / (G k) along its own load, along or across the
-    surface, by (1 - 2 nu) t / (2 G k) crosswise, and sideways by t / (G k) (Johnson 2.8, 3.2, in waves). The
-    membrane takes 4/3 S k^2 of what moves along the wave and S k^2 / 3 of what moves sideways.
+    Under a surface load t of wavenumber k the half-space moves by (1 - nu) t / (G k) along the load, normal
+    or parallel to the wave vector, by (1 - 2 nu) t / (2 G k) in the other of these directions, and by
+    t / (G k) under a load transverse to the wave (Johnson 2.8, 3.2, in Fourier space). The membrane carries
+    4/3 S k^2 of the displacement along the wave and S k^2 / 3 of the transverse one.
 
     Args:
-        r: (n,) mm from the middle.
+        r: (n,) mm from the centre.
         a: radius of the disc, mm.
-        poisson: of the half-space.
-        sheet_mm: S, thickness times Young's modulus of the membrane.
-        disc: as in `bare`, whose keys come back.
+        poisson: Poisson's ratio of the half-space.
+        sheet_mm: S, stiffness of the membrane over Young's modulus of the half-space.
+        disc: as in `bare`.
+
+    Returns:
+        As `bare`.
     """
     shear = 1 / (2 * (1 + poisson))
     k = (np.arange(400_000) + 0.5) * 2e-3 / a
@@ -174,7 +177,7 @@ def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """The worst of the discs, inside and outside, with and without a membrane."""
+    """Largest error of the discs, inside and outside, with and without a membrane."""
     rows = found["rows"]
     panels = []
     for part in ("u_z", "u_r", "u_x"):

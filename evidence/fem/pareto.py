@@ -1,5 +1,4 @@
-"""The physics' error against its cost by law and size, what each law is worth at each load, and what a
-sequence takes.
+"""Error of the physics against cost by law and mesh, error of each law by load, and cost of a sequence.
 
 Run: python -m evidence.fem.pareto
 """
@@ -48,19 +47,18 @@ def main(
 ) -> None:
     """Error against CPU time a frame by law and size, and costs.
 
-    `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`: how
-    many of four.
+    `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`:
+    number of contacts, at most four.
     """
     on = fem_case.patch()
     found: Row = {
-        "meaning": "errors: relative root mean square of displacement in the opening; ms_a_frame: CPU, one "
-        "core, 60 frames, 40,000 vertices moved",
+        "meaning": "errors: relative root mean square of displacement in the opening; ms_a_frame: CPU time "
+        "of one core over 60 frames with 40,000 vertices",
         "rows": discretisation(on, refined, contacts, load),
         "laws": law_table(on),
         "sequence": [sequence(law, 0.15) for law in ("linear", "neo-hookean")],
     }
-    report.save(out, "pareto.json", found, page(found))
-    report.show(found)
+    report.publish(out, "pareto.json", found, page)
 
 
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
@@ -94,7 +92,7 @@ def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float)
 
 
 def _mean(values: list[float]) -> float | None:
-    """None where a value is none."""
+    """Mean, or None if a value isn't finite."""
     return float(np.mean(values)) if np.isfinite(values).all() else None
 
 
@@ -111,7 +109,7 @@ def _mean_error(u: Mapping[str, Floats], exact: Mapping[str, Floats], on: fem_ca
 
 
 def law_table(on: fem_case.Patch) -> list[Row]:
-    """Each law against neo-Hookean on the same mesh, for load and direction."""
+    """Error of each law against neo-Hookean on the same mesh, by load and direction."""
     cases = {law: fem_case.brain(on, law, 1600, fem_case.CONTACTS[0]) for law in NUMBER}
     rows: list[Row] = []
     for load in _LOADS:
@@ -135,7 +133,7 @@ def law_table(on: fem_case.Patch) -> list[Row]:
 
 
 def sequence(law: str, load: float) -> Row:
-    """Mesh and mechanics of 60 frames with 40,000 vertices in a process of its own: CPU time, peak memory."""
+    """CPU time and peak memory of mesh and mechanics, 60 frames of 40,000 vertices, in an own process."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(_sequence, law, load).result()
 
@@ -151,7 +149,7 @@ def _sequence(law: str, load: float) -> Row:
     meshed = time.process_time()
     solver.deform(fem, tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
     spent = 1e3 * (time.process_time() - meshed) / _FRAMES
-    # The kernel's high-water mark: getrusage would count the parent's before exec.
+    # The kernel's high-water mark; getrusage would include the parent's memory before exec.
     status = Path("/proc/self/status").read_text("utf-8")
     peak = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
     row: Row = {"law": law, "load": load, "mesh_s": meshed - start, "ms_a_frame": spent}
@@ -159,9 +157,9 @@ def _sequence(law: str, load: float) -> Row:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Error of mesh and law against cost, and each law's largest over the load."""
+    """Error of mesh and law against cost, and the largest error of each law by load."""
     rows, laws = found["rows"], found["laws"]
-    cost, worth = [], []
+    cost, by_load = [], []
     for law in dict.fromkeys(row["law"] for row in rows):
         mine = [row for row in rows if row["law"] == law and row["error"] is not None]
         x, y = (
@@ -171,15 +169,15 @@ def page(found: Mapping[str, Any]) -> report.Page:
         ringed = tuple(k for k, row in enumerate(mine) if row["default"])
         cost.append(report.Curve(law, x, y, labels, ringed))
         errors = {load: [r["error"] for r in laws if (r["law"], r["load"]) == (law, load)] for load in _LOADS}
-        held = {load: 100 * max(each) for load, each in errors.items() if each and None not in each}
-        if held:
-            worth.append(report.Curve(law, tuple(held), tuple(held.values())))
+        complete = {load: 100 * max(each) for load, each in errors.items() if each and None not in each}
+        if complete:
+            by_load.append(report.Curve(law, tuple(complete), tuple(complete.values())))
     unit = "CPU ms a frame"
     title = "Physics: error against cost"
     panels = [
         report.Panel(title, unit, "error [%]", tuple(cost), True, True, front=True),
         report.Panel(
-            "Laws against neo-Hookean, worst", "P = F/(E a2)", "error [%]", tuple(worth), True, True
+            "Laws against neo-Hookean, worst", "P = F/(E a2)", "error [%]", tuple(by_load), True, True
         ),
     ]
     sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]

@@ -1,4 +1,4 @@
-"""Default scenes with the mesh refined: what the default mesh leaves out of gyri, sulci and contact.
+"""Discretisation error of default scenes: the default mesh against refined ones.
 
 Run: python -m evidence.fem.relief
 """
@@ -25,9 +25,9 @@ _JOB = Job(sequences=1000)
 
 
 def main(out: Path = report.RESULTS / "fem/relief", scenes: int = 40, tets: str = "1600,5000,20000") -> None:
-    """Peak and loaded mean of default scenes at full load, by mesh, against the finest mesh.
+    """Peak and load-weighted mean displacement of default scenes at full load, relative to the finest mesh.
 
-    `scenes`: how many of the default job; `tets`: tetrahedra, the last is the reference.
+    `scenes`: number of scenes of the default job; `tets`: tetrahedra, the last is the reference.
     """
     sizes = [int(n) for n in tets.split(",")]
     rows: list[Row] = []
@@ -35,15 +35,12 @@ def main(out: Path = report.RESULTS / "fem/relief", scenes: int = 40, tets: str 
     for count in reversed(sizes):
         rows += [measure_scene(index, count) for index in range(scenes)]
         found = {"summary": summarise(rows, sizes), "rows": rows}
-        report.save(out, "relief.json", found, page(found))  # what is there so far
+        report.save(out, "relief.json", found, page(found))  # intermediate results too
     report.show({"summary": found["summary"]})
 
 
 def measure_scene(index: int, count: int) -> Row:
-    """Largest displacement and the mean under the load, weighted by it, mm, at a scene's full load.
-
-    Half of the load is taken first.
-    """
+    """Largest and load-weighted mean displacement [mm] of a scene at full load, reached in two steps."""
     case = scenario.draw_scenario(_JOB, index)
     surface, _ = mechanics.cortex(_JOB, case)
     gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
@@ -71,7 +68,7 @@ def measure_scene(index: int, count: int) -> Row:
 
 
 def summarise(rows: list[Row], sizes: list[int]) -> list[Row]:
-    """Median and worst deviation from the finest mesh, of the scenes that have one there."""
+    """Median and worst deviation from the finest mesh, over scenes that converge on it."""
     made = []
     exact = {r["index"]: r for r in rows if r["tets"] == sizes[-1] and "peak_mm" in r}
     for count in sizes[:-1]:
@@ -85,7 +82,7 @@ def summarise(rows: list[Row], sizes: list[int]) -> list[Row]:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Deviation from the finest mesh by size."""
+    """Deviation from the finest mesh, by number of tetrahedra."""
     rows = [row for row in found["summary"] if row["scenes"]]
     sizes = tuple(float(row["tets"]) for row in rows)
     curves = tuple(

@@ -1,13 +1,13 @@
-"""Trains the corrections of flow and of depth on rendered truth, and on closed forms that no renderer drew.
+"""Trains the corrections of flow and of depth on rendered ground truth and on motion in closed form.
 
 Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 480 --depth]
 
-Sequences of `mission` from the 2,000th on (no reader learns from those), each as rendered and once more as
-another camera might show it (gain, colour, contrast, noise, blur, JPEG; for one eye also its size, and now
-and then a frame that can't be followed). Flow also learns from the warped pairs of `evidence.flow.scenes` and
-from drawn textures in motion. EXAMPLES keeps what was made, so that a run that was stopped goes on. Depth is
-corrected after flow, hence learnt by a second run with `--depth`. Writes weights and card beside
-`synth.flow.correction` or `synth.flow.stereo.depth_correction`.
+Data are sequences of `mission` from the 2,000th on (no force estimator is trained on these), each as rendered
+and once more as from another camera (gain, colour, contrast, noise, blur, JPEG; if monocular also another
+size, and some corrupted frames that cannot be tracked). Flow is also trained on the warped pairs of
+`evidence.flow.scenes` and on drawn textures in motion. Examples are stored in EXAMPLES: an interrupted run
+continues. Depth is corrected after flow, hence trained by a second run with `--depth`. Writes weights and
+card next to `synth.flow.correction` or `synth.flow.stereo.depth_correction`.
 """
 
 from __future__ import annotations
@@ -40,15 +40,14 @@ from synth.job import reader
 from synth.sequence.scene import simulate
 
 Pairs = tuple[tuple[int, int], ...]
-Film = dict[str, Any]
-"""Arrays by name."""
+Frames = dict[str, Any]  # arrays of a sequence, by name
 _FIRST = 2000
-_EYES, _TOOLS = ("rgb", "rgb_right"), ("tool", "tool_right")
-_KEPT = (*_EYES, *_TOOLS, "flow", "visible", "motion")
+_RGB, _TOOLS = ("rgb", "rgb_right"), ("tool", "tool_right")
+_STORED = (*_RGB, *_TOOLS, "flow", "visible", "motion")
 _BASELINES_MM = 24, 24, 24, 14, 34
-_PRESSED = 2.5  # times the weight of contacts' depth
-_SHORT = 0.06  # of frames are such as can't be followed
-_FREEDOM, _PLAIN = 5.0, 4.0  # of Student's distribution; weight of the error itself beside its likelihood
+_PRESSED = 2.5  # factor on the weight of depth at contacts
+_CORRUPTED = 0.06  # share of frames that cannot be tracked
+_FREEDOM, _PLAIN = 5.0, 4.0  # of Student's distribution; weight of the absolute error in the loss
 _BATCH, _RATE = 8, 2e-3
 
 
@@ -61,14 +60,14 @@ def main(
     seed: int = 0,
     depth: bool = False,
 ) -> None:
-    """Follows sequences, pulls and drawn pairs, as many as asked, and trains for so many CPU-minutes."""
+    """Makes examples of `scenes`, `closed` warped and `drawn` pairs, and trains for some CPU-minutes."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     examples.mkdir(parents=True, exist_ok=True)
-    films = _films(scenes, closed, drawn, depth)
+    sources = _sources(scenes, closed, drawn, depth)
     describe, before = (depth_example, "depth_") if depth else (example, "")
-    files = [examples / f"{before}{name}.npz" for name, _ in films]
-    for file, (_, make) in zip(files, films, strict=True):
+    files = [examples / f"{before}{name}.npz" for name, _ in sources]
+    for file, (_, make) in zip(files, sources, strict=True):
         if not file.exists():
             np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
             (examples / "part.npz").rename(file)
@@ -89,8 +88,8 @@ def main(
     report.show(card)
 
 
-def _films(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
-    """Names of examples, and what makes their films."""
+def _sources(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
+    """Names of examples, and functions that make their frames."""
     rendered = [
         (f"{i:05d}_{k}", lambda i=i, k=k: _varied(_rendered(i), np.random.default_rng([i, k]), k, depth))
         for i in range(_FIRST, _FIRST + scenes)
@@ -103,25 +102,25 @@ def _films(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str,
 
 
 @lru_cache(1)
-def _rendered(index: int) -> Film:
-    """Both eyes' pictures and tools, `tissue`, lenses; true `flow`, `visible`, `motion`, where `pressed`."""
+def _rendered(index: int) -> Frames:
+    """Images, tool masks and calibration of both cameras; true `flow`, `visible`, `motion`, `pressed`."""
     job = reader.load_job("mission")
     baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
     scene = simulate(
         job.model_copy(update={"render": job.render.model_copy(update={"stereo_mm": baseline_mm})}), index
     )
-    frames = list(scene.frames())
-    film = {name: np.stack([getattr(f, name) for f in frames]) for name in _KEPT}
-    size = np.linalg.norm(np.stack([f.traction for f in frames]), axis=-1)
+    shots = list(scene.frames())
+    frames = {name: np.stack([getattr(f, name) for f in shots]) for name in _STORED}
+    size = np.linalg.norm(np.stack([f.traction for f in shots]), axis=-1)
     pressed = size > 0.05 * np.maximum(size.max((1, 2), keepdims=True), 1e-6)
     left, right = scene.view, scene.renderer.right
     assert right is not None
     lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
-    return film | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+    return frames | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
 
 
-def _warped(index: int) -> Film:
-    """A pull under a tool on drawn cortex."""
+def _warped(index: int) -> Frames:
+    """A pair with a pull under a tool, on drawn cortex."""
     rng = np.random.default_rng([77, index])
     recipe = replace(
         Recipe(),
@@ -136,10 +135,10 @@ def _warped(index: int) -> Film:
     return _pair([pair.rest, pair.now], hidden, pair.flow, pair.inside, pair.hidden, pair.inside)
 
 
-def _drawn(index: int) -> Film:
-    """Noise, leaves or cortex without instrument or with a bar, in any motion and in none.
+def _drawn(index: int) -> Frames:
+    """A pair of noise, ellipses or cortex, with or without a bar as instrument, moving or still.
 
-    Without them the correction made flow worse on photographs, whose flow lacks nothing.
+    Without these pairs the correction made flow worse on photographs, where it needs no correction.
     """
     rng = np.random.default_rng([4321, index])
     size = int(rng.choice([160, 192, 224]))
@@ -170,8 +169,8 @@ def _drawn(index: int) -> Film:
     return _pair(rgb, hidden, flow, inside, covered, inside if rng.random() < 0.5 else np.ones_like(inside))
 
 
-def _drawn_depth(index: int) -> Film:
-    """Both eyes' view of drawn textures on a slope, in any motion, away from the lenses too and by itself."""
+def _drawn_depth(index: int) -> Frames:
+    """Stereo pairs of drawn textures on a slope, with lateral motion and independent motion in depth."""
     rng = np.random.default_rng([8642, index])
     size = int(rng.choice([160, 192, 224]))
     texture, flow = _texture(2 * size, rng), _motion(size, rng)
@@ -183,17 +182,17 @@ def _drawn_depth(index: int) -> Film:
     depth = own * rng.uniform(0, 0.7) * (rng.random() < 0.7) + length * away / focal * rng.uniform(-1, 1)
     middle = focal * baseline / away
     aside, moved = (focal * baseline / z - middle for z in (rest, rest + depth))
-    eyes, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(aside)
-    for eye, side in zip(_EYES, (0, 1), strict=True):
+    images, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(aside)
+    for name, side in zip(_RGB, (0, 1), strict=True):
         shifts = -side * np.stack([aside, nothing], -1), flow - side * np.stack([moved, nothing], -1)
         places = [(inverse(shift) + 0.5) * 2 - 0.5 for shift in shifts]
         shown = [np.stack([sample(texture[..., c], one) for c in range(3)], -1) for one in places]
         noisy = np.stack(shown) + rng.normal(0, noise, (2, size, size, 3))
-        eyes[eye] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+        images[name] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
     K, other = (np.array([[focal, 0, size / 2 + c], [0, focal, size / 2], [0, 0, 1]]) for c in (0, middle))
     inside = np.all((pixels(size, size) + flow >= 0) & (pixels(size, size) + flow <= size - 1), axis=-1)
     free = np.zeros((2, size, size), bool)
-    return eyes | {
+    return images | {
         "tool": free,
         "tool_right": free,
         "tissue": np.ones((size, size), bool),
@@ -208,7 +207,7 @@ def _drawn_depth(index: int) -> Film:
     }
 
 
-def _pair(rgb: list[Any], hidden: Any, flow: Any, inside: Any, covered: Any, tissue: Any) -> Film:
+def _pair(rgb: list[Any], hidden: Any, flow: Any, inside: Any, covered: Any, tissue: Any) -> Frames:
     length = np.linalg.norm(flow, axis=-1)
     pressed = (length > 0.7 * max(float(length.max()), 1e-6)) & inside
     return {
@@ -245,7 +244,7 @@ def _texture(size: int, rng: np.random.Generator) -> Any:
 
 
 def _motion(size: int, rng: np.random.Generator) -> Any:
-    """(H, W, 2) px: a pull, a smooth field, an affine motion, or none."""
+    """Displacement (H, W, 2) px of a pull, a smooth field, an affine motion, or none."""
     kind = rng.integers(4)
     if kind == 0:
         direction, reach = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.06, 0.2))
@@ -260,10 +259,10 @@ def _motion(size: int, rng: np.random.Generator) -> Any:
     return np.float32(middle @ affine.T + shift) * (kind == 2)
 
 
-def example(film: Film) -> Film:
-    """What the network sees of a film, what its flow misses, and weights: (T - 1, C, h, w) x, y, w."""
-    rgb, tissue = film["rgb"], film["tissue"]
-    hidden = film["hidden"] if "hidden" in film else mask_detection.hidden(rgb, film["tool"])
+def example(frames: Frames) -> Frames:
+    """Features, error of the flow and weights of the frames: x, y, w, each (T - 1, C, h, w)."""
+    rgb, tissue = frames["rgb"], frames["tissue"]
+    hidden = frames["hidden"] if "hidden" in frames else mask_detection.hidden(rgb, frames["tool"])
     tracker = Tracker(Tvl1(corrected=False), rgb[0], hidden[0], tissue)
     rows = []
     rest = _normalised(rgb[0], tracker.usable)[0, 0].numpy()
@@ -272,28 +271,28 @@ def example(film: Film) -> Film:
         assert tracker.last is not None
         flow, agreed = tracker.last.flow, tracker.last.confidence
         now, along = _normalised(rgb[t], ~hidden[t]), torch.from_numpy(flow).movedim(-1, 0)[None]
-        warped, seen = (one[0, 0].numpy() for one in image.warp(now, image.flags(~hidden[t]), along))
-        x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), seen, flow, agreed)
-        missing = ((film["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
+        warped, usable = (one[0, 0].numpy() for one in image.warp(now, image.flags(~hidden[t]), along))
+        x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), usable, flow, agreed)
+        missing = ((frames["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
         share = correction.means(1.0 * tissue)
         y = correction.means(*missing) / np.maximum(share, 0.05)
-        visible, pressed = film["visible"][t] & tissue, film["pressed"][t] & tissue
+        visible, pressed = frames["visible"][t] & tissue, frames["pressed"][t] & tissue
         rows.append((x, y, _weight(share, *correction.means(visible, pressed))))
     return _example(rows)
 
 
 def _weight(share: Any, visible: Any, pressed: Any) -> Any:
-    """(1, h, w) of cells: what is hidden counts little, contacts much."""
+    """Weights (1, h, w) of cells: low for hidden ones, high at contacts."""
     return (share * (0.2 + 0.8 * visible) * (1 + 3 * pressed)).reshape(1, *visible.shape)
 
 
-def _example(rows: list[Any]) -> Film:
-    kept = [[correction.padded(np.asarray(one, np.float32)) for one in row] for row in rows]
-    return {name: np.stack(column) for name, column in zip("xyw", zip(*kept, strict=True), strict=True)}
+def _example(rows: list[Any]) -> Frames:
+    padded = [[correction.padded(np.asarray(one, np.float32)) for one in row] for row in rows]
+    return {name: np.stack(column) for name, column in zip("xyw", zip(*padded, strict=True), strict=True)}
 
 
 class _Observed(StereoTracker):
-    """Keeps what the network sees of the last frame, and the depth motion (H, W) mm without correction."""
+    """Tracker that stores the network's features and the uncorrected depth motion (H, W) mm of a frame."""
 
     def _moved(self, change: Change, flow: Any, confidence: Any, lost: bool) -> Moved:
         r = self.rectified
@@ -302,27 +301,29 @@ class _Observed(StereoTracker):
         return Moved.nothing(self.tissue.shape)
 
 
-def depth_example(film: Film) -> Film:
-    """As `example`, of the depth solver: y in units of `depth_correction`."""
-    tissue = film["tissue"]
-    hidden = [mask_detection.hidden(film[rgb], film[tool]) for rgb, tool in zip(_EYES, _TOOLS, strict=True)]
-    found = track(Tvl1(), film["rgb"], hidden[0], tissue)
-    eyes = Intrinsics(film["K"], film["dist"]), Intrinsics(film["Kr"], film["distr"])
-    pair = StereoRig(*eyes, np.eye(3), np.array([-float(film["baseline"]), 0, 0]), tissue.shape[::-1])
+def depth_example(frames: Frames) -> Frames:
+    """As `example`, for the depth solver: y in units of `depth_correction`."""
+    tissue = frames["tissue"]
+    hidden = [
+        mask_detection.hidden(frames[rgb], frames[tool]) for rgb, tool in zip(_RGB, _TOOLS, strict=True)
+    ]
+    found = track(Tvl1(), frames["rgb"], hidden[0], tissue)
+    cameras = Intrinsics(frames["K"], frames["dist"]), Intrinsics(frames["Kr"], frames["distr"])
+    pair = StereoRig(*cameras, np.eye(3), np.array([-float(frames["baseline"]), 0, 0]), tissue.shape[::-1])
     still = still_frames(found.flow, tissue)
-    left, right = (film[rgb] for rgb in _EYES)
+    left, right = (frames[rgb] for rgb in _RGB)
     try:
         tracker = _Observed(pair, left[:still], right[:still], hidden[0][0], hidden[1][0], tissue)
-    except UserError:  # so blurred or noisy that the eyes don't match: nothing is learnt from it
+    except UserError:  # too blurred or noisy to match left and right: an example without weight
         return _example([_empty(depth_correction.CHANNELS)])
     rows, r, coarse = [], tracker.rectified, tracker.solver.coarse
     inside = r.flags(tissue, 0).astype(np.float32)
-    for t in range(1, len(film["rgb"])):
+    for t in range(1, len(frames["rgb"])):
         tracker.step(left[t], right[t], hidden[0][t], hidden[1][t], found.flow[t], found.confidence[t])
-        there = film["visible"][t] & tissue
+        there = frames["visible"][t] & tissue
         true, visible, pressed = (
             r.picture(np.ascontiguousarray(one, np.float32), 0)
-            for one in (film["motion"][t][..., 2], there, there & film["pressed"][t])
+            for one in (frames["motion"][t][..., 2], there, there & frames["pressed"][t])
         )
         share = coarse(inside)
         missing = coarse((true - tracker.depth) * inside) / np.maximum(share, 0.05) / depth_correction.UNIT_MM
@@ -340,45 +341,47 @@ def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
     return image.normalise(image.tensor(rgb), image.flags(usable))
 
 
-def _varied(film: Film, rng: np.random.Generator, again: int, depth: bool) -> Film:
-    """A film as another camera might show it, its right eye too if depth is asked for; as it is at first."""
+def _varied(frames: Frames, rng: np.random.Generator, again: int, depth: bool) -> Frames:
+    """The frames as from another camera if `again`; those of the right camera too if for depth."""
     if not again:
-        return film
+        return frames
     if not depth and rng.random() < 0.5:
-        film = _resized(film, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35)))))
+        frames = _resized(frames, float(np.exp(rng.uniform(np.log(0.7), np.log(1.35)))))
     gain, gamma, white = rng.uniform(0.6, 1.3), np.exp(rng.normal(0, 0.15)), np.exp(rng.normal(0, 0.08, 3))
     contrast = rng.uniform(0.5, 1.1) if rng.random() < 0.4 else 1.0
     noise, blur, drift = rng.choice([0, 1, 2, 4]), rng.choice([0, 0, 0.5, 0.9]), rng.normal(0, 0.05)
     quality = int(rng.choice([0, 95, 85, 70, 50]))
-    shown: dict[str, list[Any]] = {name: [] for name in (_EYES if depth else _EYES[:1])}
+    shown: dict[str, list[Any]] = {name: [] for name in (_RGB if depth else _RGB[:1])}
     for name in shown:
         balance = white * np.exp(rng.normal(0, 0.03, 3))
-        for t, picture in enumerate(film[name]):
+        for t, picture in enumerate(frames[name]):
             one = picture / 255.0
             one = cv2.GaussianBlur(one, (0, 0), float(blur)) if blur else one
             one = np.clip(one.mean((0, 1)) + contrast * (one - one.mean((0, 1))), 0, 1)
             one = 255 * np.clip(gain * (1 + drift * t / 7) * balance * one**gamma, 0, 1)
             one = np.clip(np.round(one + noise * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8)
-            spoilt = not depth and t and rng.random() < _SHORT
-            shown[name].append(_spoilt(_jpeg(one, quality), rng) if spoilt else _jpeg(one, quality))
-    return film | {name: np.stack(pictures) for name, pictures in shown.items()}
+            corrupt = not depth and t and rng.random() < _CORRUPTED
+            shown[name].append(_corrupted(_jpeg(one, quality), rng) if corrupt else _jpeg(one, quality))
+    return frames | {name: np.stack(pictures) for name, pictures in shown.items()}
 
 
-def _resized(film: Film, share: float) -> Film:
-    height, width = film["tissue"].shape
+def _resized(frames: Frames, share: float) -> Frames:
+    height, width = frames["tissue"].shape
     size = round(width * share / 4) * 4, round(height * share / 4) * 4
 
     def resize(stack: Any, how: int) -> Any:
-        frames = stack if stack.ndim > 2 else stack[None]
-        frames = frames.astype(np.uint8) if stack.dtype == bool else frames
-        made = np.stack([cv2.resize(one, size, interpolation=how) for one in frames]).astype(stack.dtype)
+        images = stack if stack.ndim > 2 else stack[None]
+        images = images.astype(np.uint8) if stack.dtype == bool else images
+        made = np.stack([cv2.resize(one, size, interpolation=how) for one in images]).astype(stack.dtype)
         return made if stack.ndim > 2 else made[0]
 
-    small = {name: resize(a, cv2.INTER_NEAREST) for name, a in film.items() if a.dtype == bool}
-    flow = resize(film["flow"], cv2.INTER_LINEAR) * np.array([size[0] / width, size[1] / height], np.float32)
+    small = {name: resize(a, cv2.INTER_NEAREST) for name, a in frames.items() if a.dtype == bool}
+    flow = resize(frames["flow"], cv2.INTER_LINEAR) * np.array(
+        [size[0] / width, size[1] / height], np.float32
+    )
     return small | {
         "flow": flow,
-        "rgb": resize(film["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC),
+        "rgb": resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC),
     }
 
 
@@ -389,8 +392,8 @@ def _jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
 
 
-def _spoilt(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Dark, out of focus, shifted or turned: nothing is to be followed, and the variance must say so."""
+def _corrupted(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The image dark, out of focus, shifted or rotated: untrackable, so that the variance must be large."""
     ways = (
         lambda: (picture * 0.02).astype(np.uint8),
         lambda: cv2.GaussianBlur(picture, (0, 0), rng.uniform(2, 5)),
@@ -400,8 +403,10 @@ def _spoilt(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.
     return np.ascontiguousarray(ways[int(rng.integers(4))]())
 
 
-def fit(examples: list[Film], depth: bool, minutes: float, seed: int) -> tuple[correction.CorrectionNet, int]:
-    """The network after so many minutes of one core, its weights averaged over the last steps."""
+def fit(
+    examples: list[Frames], depth: bool, minutes: float, seed: int
+) -> tuple[correction.CorrectionNet, int]:
+    """The network after training for some minutes of one core, its weights averaged over the last steps."""
     torch.manual_seed(seed)
     rng, kind = np.random.default_rng(seed), depth_correction if depth else correction
     net = correction.CorrectionNet(kind.CHANNELS, 1 if depth else 2)
@@ -418,7 +423,7 @@ def fit(examples: list[Film], depth: bool, minutes: float, seed: int) -> tuple[c
         group = list(groups.values())[rng.choice(len(groups), p=chances / chances.sum())]
         drawn = [group[k] for k in rng.integers(len(group), size=_BATCH)]
         x, y, w = (torch.from_numpy(np.stack([examples[i][n][t] for i, t in drawn])).float() for n in "xyw")
-        # Depth knows where the second eye is: its pictures aren't turned.
+        # Depth depends on the direction of the baseline: its features aren't rotated.
         x, y, w = _turned(x, y, w, int(rng.integers(4 if depth else 8)), kind.VECTORS)
         optimiser.zero_grad()
         _loss(net(x), y, w).backward()  # type: ignore[no-untyped-call]
@@ -426,13 +431,13 @@ def fit(examples: list[Film], depth: bool, minutes: float, seed: int) -> tuple[c
         optimiser.step()
         steps += 1
         with torch.no_grad():
-            for kept, now in zip(average.parameters(), net.parameters(), strict=True):
-                kept.lerp_(now, max(0.002, 9 / (steps + 10)))
+            for mean, now in zip(average.parameters(), net.parameters(), strict=True):
+                mean.lerp_(now, max(0.002, 9 / (steps + 10)))
     return average.eval(), steps
 
 
-def _standardise(net: correction.CorrectionNet, examples: list[Film], vectors: Pairs) -> None:
-    """Every channel to about mean 0 and deviation 1; vectors keep their direction."""
+def _standardise(net: correction.CorrectionNet, examples: list[Frames], vectors: Pairs) -> None:
+    """Scales channels to mean 0 and deviation 1; vectors retain their direction."""
     some = np.concatenate(
         [np.moveaxis(one["x"], 1, -1).reshape(-1, one["x"].shape[1])[::60] for one in examples]
     )
@@ -443,7 +448,7 @@ def _standardise(net: correction.CorrectionNet, examples: list[Film], vectors: P
 
 
 def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple[Tensor, Tensor, Tensor]:
-    """One of the eight turned and mirrored views of the same; of y, two parts are a vector and one is not."""
+    """One of the eight rotations and reflections; y is a vector field if it has two channels."""
     for bit, side, axis in ((1, -1, 0), (2, -2, 1)):
         if turn & bit:
             x, y, w = x.flip(side).clone(), y.flip(side).clone(), w.flip(side)

@@ -1,8 +1,8 @@
-"""Films whose motion is known in closed form, on pictures that no renderer of ours made.
+"""Videos with motion in closed form, on images not made by this project's renderer.
 
-Photographs that scikit-image's wheel carries, and drawn phantoms, are warped by an analytic field; tools,
-lamps, highlights, endoscopes, compression and mishaps of the camera are drawn over them. Nothing is shared
-with `synth.render`, nor with the scenes that trained the tool net.
+Photographs included in scikit-image, and drawn phantoms, are warped by an analytic field; tools, lamps,
+highlights, endoscopes, compression and camera faults are drawn over them. Nothing is shared with
+`synth.render` or with the training scenes of the tool network.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skimage import data as photographs  # type: ignore[import-not-found, unused
 from evidence.flow.scenes import Flags, Floats, Rgb, noise_field, pixels
 
 _FINE = 2  # samples of the source a pixel
-_MARGIN = 24  # px of the source beyond the picture, that motion may bring in
+_MARGIN = 24  # px of the source beyond the image, which motion may bring into view
 _PHOTOGRAPHS = (
     "astronaut", "brick", "camera", "cell", "chelsea", "coffee", "coins", "grass", "gravel",
     "hubble_deep_field", "immunohistochemistry", "moon", "retina", "rocket",
@@ -35,54 +35,44 @@ _TOOLS = {
 }
 _MOTIONS = ("pull", "press", "press from behind", "shift", "twist")
 _LAMPS = {"white": (1.0, 1.0, 1.0), "warm": (1.1, 0.9, 0.62), "cold": (0.8, 0.95, 1.15)}
-_MISHAPS = ("doubled", "dropped", "black", "defocus", "covered", "jump")
+_FAULTS = ("doubled", "dropped", "black", "defocus", "covered", "jump")
 HALVES = ("tuning", "reporting")
-"""Even scenes and even pictures (in alphabetical order) are tuned on, odd ones are reported."""
+"""Even scenes and even photographs (in alphabetical order) are tuned on, odd ones are reported."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One film. Lengths in px."""
+    """One video. Lengths in px."""
 
     index: int
     surface: str
-    tool: str
-    """Its colour; empty: none."""
-    tool_at_rest: bool
-    """The tool already is in the rest frame, beside the contact."""
+    tool: str  # its colour; empty: none
+    tool_at_rest: bool  # whether the tool is in the rest frame, next to the contact
     motion: str
     peak_px: float
     lamp: str
-    glare: float
-    """Share of the picture in highlights."""
-    scope: bool
-    """An endoscope's round picture."""
+    glare: float  # share of the image in highlights
+    scope: bool  # whether the image is round, as an endoscope's
     mono: bool
-    quality: int
-    """Of JPEG; 0: not compressed."""
-    noise: float
-    """Grey levels."""
-    mishaps: tuple[str, ...]
+    quality: int  # of JPEG; 0: not compressed
+    noise: float  # grey levels
+    faults: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """One frame and all that is true of it."""
+class Frame:
+    """One frame and its ground truth."""
 
     rgb: Rgb
-    flow: Floats
-    """(H, W, 2) px from the rest frame, on its pixels."""
-    seen: Flags
-    """(H, W) on the rest frame's pixels: tissue that both pictures show, free of tool and glare."""
-    free: Flags
-    """(H, W) on this frame's pixels: tissue without tool and glare, nor next to them."""
-    amplitude: float
-    """Share of the full motion."""
-    mishap: str
+    flow: Floats  # (H, W, 2) px from the rest frame, on its pixels
+    visible: Flags  # (H, W) on the rest frame's pixels: unobstructed tissue in both images
+    free: Flags  # (H, W) on this frame's pixels: tissue away from tool and highlights
+    amplitude: float  # share of the full motion
+    fault: str
 
 
 def recipes(half: str, count: int, first: int = 0) -> list[Recipe]:
-    """So many films of a half (one of `HALVES`) after the first ones; each is drawn from its number alone."""
+    """`count` videos of a half (one of `HALVES`) after the `first` ones; each depends on its number alone."""
     side = HALVES.index(half)
     surfaces = [*(f"drawn {name}" for name in _DRAWN), *_PHOTOGRAPHS[side::2]]
     return [_recipe(2 * k + side, surfaces) for k in range(first, first + count)]
@@ -94,7 +84,7 @@ def _recipe(index: int, surfaces: list[str]) -> Recipe:
     some = rng.random(8)
     return Recipe(
         index=index,
-        # In turn, so that few scenes hold all surfaces and tools; 3 shares no factor with 7.
+        # In turn, so that few videos contain all surfaces and tools; 3 and 7 are coprime.
         surface=surfaces[number % len(surfaces)],
         tool=["", *_TOOLS][(3 * number + number // 7) % 7],
         tool_at_rest=bool(some[0] < 0.25),
@@ -106,13 +96,13 @@ def _recipe(index: int, surfaces: list[str]) -> Recipe:
         mono=bool(some[3] < 0.2),
         quality=int(rng.choice([0, 95, 75, 40])),
         noise=float(rng.choice([0.5, 1.5, 4.0])),
-        mishaps=tuple(name for name in _MISHAPS if rng.random() < 0.22),
+        faults=tuple(name for name in _FAULTS if rng.random() < 0.22),
     )
 
 
 def _surface(name: str, size: int, rng: np.random.Generator) -> Floats:
-    """Cubic-spline coefficients (3, N, N), `_FINE` samples a pixel, of a picture without what pixels can't
-    show, (size + 2 margins) px a side."""
+    """Cubic-spline coefficients (3, N, N) of a low-pass filtered image, `_FINE` samples a pixel, of
+    (size + 2 margins) px a side."""
     fine = _FINE * (size + 2 * _MARGIN)
     picture = _drawn(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.55 * _FINE)
@@ -131,7 +121,7 @@ def _photograph(name: str, fine: int) -> Floats:
 
 
 def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
-    """A phantom: (fine, fine, 3) in 0..1."""
+    """Image of a phantom, (fine, fine, 3) in 0..1."""
     shape = (fine, fine)
     paper = 1 + 0.02 * noise_field(shape, 60, rng)
     if name == "dots":  # dark dots on a light silicone membrane, or white ones on a dark one
@@ -158,7 +148,7 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
 
 
 def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Floats:
-    """Cover in 0..1 by discs on a shaken grid, (fine, fine)."""
+    """Coverage in 0..1 by discs on a jittered grid, (fine, fine)."""
     cover = np.zeros((fine, fine), np.uint8)
     line = np.arange(0, fine, apart)
     for corner in np.stack(np.meshgrid(line, line), -1).reshape(-1, 2):
@@ -176,27 +166,24 @@ class Field:
     """A motion in closed form whose largest displacement is 1 px."""
 
     motion: str
-    centre: NDArray[np.float64]
-    """(2,) px."""
-    radius: float
-    """px."""
-    way: NDArray[np.float64]
-    """(2,) unit vector."""
+    centre: NDArray[np.float64]  # (2,) px
+    radius: float  # px
+    way: NDArray[np.float64]  # (2,) unit vector
 
     @classmethod
     def draw(cls, motion: str, size: int, rng: np.random.Generator) -> Field:
-        """One of the kind, somewhere near the middle of the picture."""
+        """A random field of a kind, near the centre of the image."""
         centre = size * np.array([rng.uniform(0.38, 0.62), rng.uniform(0.38, 0.62)])
         radius, turn = size * rng.uniform(0.16, 0.26), rng.uniform(0, 2 * np.pi)
         return cls(motion, centre, radius, np.array([np.cos(turn), np.sin(turn)]))
 
     def at(self, place: Floats) -> Floats:
-        """(..., 2) px → displacement, (..., 2)."""
+        """Displacement (..., 2) px at places (..., 2) px."""
         away = place - self.centre
         square = (away**2).sum(-1, keepdims=True) / self.radius**2
         if self.motion == "shift":
             return np.asarray(np.broadcast_to(self.way, place.shape), np.float32)
-        if self.motion == "pull":  # as a point load on a half space, level within the contact
+        if self.motion == "pull":  # as under a point load on a half-space, level within the contact
             return np.asarray(self.way * np.exp(-square / 16) / np.sqrt(1 + square), np.float32)
         # r exp(-r²/2R²) is largest at R, where it is R exp(-1/2).
         radial = away / self.radius * np.exp(0.5 - 0.5 * square)
@@ -205,26 +192,26 @@ class Field:
         return np.asarray(radial if self.motion == "press from behind" else -radial, np.float32)
 
     def steepest(self, size: int) -> float:
-        """Largest derivative [1/px], at least a millionth."""
+        """Largest derivative of the displacement, at least 1e-6."""
         slopes = np.gradient(self.at(pixels(size, size)), axis=(0, 1))
         return max(1e-6, *(float(np.abs(slope).max()) for slope in slopes))
 
 
-def film(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Shown]:
-    """The frames, the rest frame first."""
+def video(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Frame]:
+    """Frames of a recipe, the rest frame first."""
     rng = np.random.default_rng([1805, recipe.index])
     stage = _Stage(recipe, size, rng)
-    for amplitude, mishap in _plan(recipe, frames, rng):
-        yield stage.shoot(amplitude, mishap, rng)
+    for amplitude, fault in _plan(recipe, frames, rng):
+        yield stage.shoot(amplitude, fault, rng)
 
 
 def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[float, str]]:
-    """Amplitude and mishap of each frame: a press and a weaker one, the first and one between at rest."""
+    """Amplitude and fault of each frame: a press and a weaker one, at rest before and between them."""
     t = np.linspace(0, 1, frames)
     curve = np.where(t < 0.55, np.sin(np.pi * t / 0.55) ** 2, 0.7 * np.sin(np.pi * (t - 0.55) / 0.45) ** 2)
     plan = [(a, "") for a in curve.tolist()]
-    places = rng.permutation(np.arange(2, frames))[: len(recipe.mishaps)]
-    for place, name in zip(places.tolist(), recipe.mishaps, strict=False):
+    places = rng.permutation(np.arange(2, frames))[: len(recipe.faults)]
+    for place, name in zip(places.tolist(), recipe.faults, strict=False):
         if name == "dropped":
             plan[place:-1] = plan[place + 1 :]
             plan[-1] = (float(curve[-1]), "")
@@ -234,31 +221,31 @@ def _plan(recipe: Recipe, frames: int, rng: np.random.Generator) -> list[tuple[f
 
 
 class _Stage:
-    """What doesn't change from frame to frame."""
+    """The constant part of a video."""
 
     def __init__(self, recipe: Recipe, size: int, rng: np.random.Generator) -> None:
         self.recipe, self.size, shape = recipe, size, (size, size)
         self.skin = _surface(recipe.surface, size, rng)
         self.field = Field.draw(recipe.motion, size, rng)
         self.peak_px = min(recipe.peak_px, 0.5 / self.field.steepest(size)) * size / 192
-        # High values shine; `drift` is how they change with the surface's tilt.
+        # High values of `wet` are highlights; `drift` is their change with the surface's tilt.
         self.wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
         self.drift, self.angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
         blank = np.zeros((*shape, 3), np.float32)
         glare, tool = self._shine(blank, 0.0)[1], self._tool(blank, 0.0, blank[..., :2])[1]
         self.rest_blocked = _near(glare | tool)
 
-    def shoot(self, amplitude: float, mishap: str, rng: np.random.Generator) -> Shown:
+    def shoot(self, amplitude: float, fault: str, rng: np.random.Generator) -> Frame:
         """One frame."""
         size, recipe, lamp = self.size, self.recipe, np.array(_LAMPS[self.recipe.lamp])
         grid = pixels(size, size)
-        jump = np.array([18.0, -11.0]) * size / 192 if mishap == "jump" else np.zeros(2)
+        jump = np.array([18.0, -11.0]) * size / 192 if fault == "jump" else np.zeros(2)
 
         def moved(at: Floats) -> Floats:
             return np.asarray(amplitude * self.peak_px * self.field.at(at) + jump, np.float32)
 
         source = grid
-        for _ in range(40):  # s = y - u(s): a contraction, for |grad u| is at most 1/2
+        for _ in range(40):  # s = y - u(s): a contraction, as |grad u| is at most 1/2
             source = grid - moved(source)
         flow = moved(grid)
         where = [(source[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
@@ -270,21 +257,21 @@ class _Stage:
         if recipe.scope:
             scope = np.linalg.norm(grid - size / 2, axis=-1) < 0.48 * size
             picture = np.where(scope[..., None], picture, 0.01)
-        if mishap == "covered":
+        if fault == "covered":
             cover[:, : int(0.9 * size)] = True
             picture = np.where(cover[..., None], (0.7, 0.68, 0.66), picture)
-        if mishap == "black":
+        if fault == "black":
             picture = np.zeros_like(picture)
-        if mishap == "defocus":
+        if fault == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
         rgb = self._sense(np.asarray(picture, np.float32), rng)
         free = scope & ~_near(glare | tool) & ~cover
         at = grid + flow
-        seen = cv2.remap(free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
-        return Shown(rgb, flow, seen & scope & ~self.rest_blocked, free, amplitude, mishap)
+        visible = cv2.remap(free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
+        return Frame(rgb, flow, visible & scope & ~self.rest_blocked, free, amplitude, fault)
 
     def _shine(self, picture: Floats, amplitude: float) -> tuple[Floats, Flags]:
-        """Highlights that stay with the light."""
+        """The image with highlights, which stay with the light, and their mask."""
         if self.recipe.glare <= 0:
             return picture, np.zeros(picture.shape[:2], bool)
         level = np.quantile(self.wet, 1 - self.recipe.glare)
@@ -294,7 +281,7 @@ class _Stage:
         return np.asarray(lit, np.float32), strength[..., 0] > 0.1
 
     def _tool(self, picture: Floats, amplitude: float, flow: Floats) -> tuple[Floats, Flags]:
-        """A shaft from the border to the contact, which it follows; away at rest unless it starts there."""
+        """The image with a shaft from the border to the moving contact, and its mask; retracted at rest."""
         recipe, size = self.recipe, self.size
         mask = np.zeros((size, size), np.uint8)
         if not recipe.tool or (recipe.motion == "press from behind" and not recipe.tool_at_rest):
@@ -304,7 +291,7 @@ class _Stage:
         row, column = np.clip(centre[::-1].round().astype(int), 0, size - 1)
         back = 0.0 if near else (0.12 if recipe.tool_at_rest else 1.2) * size
         if recipe.motion == "press from behind":
-            back = 0.15 * size  # rests beside, at the same place all the time
+            back = 0.15 * size  # stays in one place next to the contact
         tip = centre + (flow[row, column] if near else 0) + back * shaft
         finger = recipe.tool == "gloved finger"
         width = size * (0.22 if finger else 0.09)
@@ -343,5 +330,5 @@ class _Stage:
 
 
 def _near(mask: Flags) -> Flags:
-    """(H, W) grown by 4 px: soft rims and the shadow's edge are neither."""
+    """Mask (H, W) dilated by 4 px, so that soft rims and shadow edges are left out."""
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, bool)

@@ -1,4 +1,4 @@
-"""How wrong a flow is: endpoint error, magnitude, divergence."""
+"""Errors of a flow: endpoint error, magnitude, divergence."""
 
 from __future__ import annotations
 
@@ -18,27 +18,18 @@ _SIGMA = 1.0  # px: divergence is compared after this Gaussian, on both sides
 
 @dataclass(frozen=True)
 class Error:
-    """One flow against the truth, or the mean over many. Lengths in px; NaN where there is no such pixel."""
+    """Errors of one flow, or means over several. Lengths in px; NaN without such pixels."""
 
-    mean: float
-    """Endpoint error over what is seen."""
+    mean: float  # endpoint error over visible pixels
     p95: float
-    contact: float
-    """Endpoint error within the contact, hidden points included."""
-    contact_seen: float
-    """The same where it is seen."""
-    hidden: float
-    """Endpoint error under the tool."""
-    glare: float
-    """Endpoint error over what is seen but masked in the rest frame."""
-    magnitude: float
-    """Mean error of |flow| as a share of the mean |flow|, over what is seen."""
-    divergence: float
-    """RMS error of the divergence relative to its RMS, over what is seen."""
-    divergence_r: float
-    """Correlation of found and true divergence."""
-    cpu_s: float
-    """Processor time."""
+    contact: float  # endpoint error within the contact, hidden points included
+    contact_visible: float  # the same without hidden points
+    hidden: float  # endpoint error under the tool
+    glare: float  # endpoint error over visible pixels that are highlights in the rest frame
+    magnitude: float  # mean error of |flow| relative to the mean |flow|, over visible pixels
+    divergence: float  # RMS error of the divergence relative to its RMS, over visible pixels
+    divergence_r: float  # correlation of estimated and true divergence
+    cpu_s: float  # processor time
 
 
 def epe(flow: Floats, truth: Floats) -> Floats:
@@ -54,17 +45,17 @@ def divergence(flow: Floats) -> Floats:
 
 def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
     """Errors of one flow, (H, W, 2) px."""
-    error, seen = epe(flow, pair.flow), pair.inside & ~pair.hidden
-    size, real = np.linalg.norm(flow, axis=-1)[seen], np.linalg.norm(pair.flow, axis=-1)[seen]
-    found, true = divergence(flow)[seen], divergence(pair.flow)[seen]
+    error, visible = epe(flow, pair.flow), pair.inside & ~pair.hidden
+    size, real = np.linalg.norm(flow, axis=-1)[visible], np.linalg.norm(pair.flow, axis=-1)[visible]
+    found, true = divergence(flow)[visible], divergence(pair.flow)[visible]
     spread = float(np.sqrt(np.mean(true**2)))
     return Error(
-        mean=float(error[seen].mean()),
-        p95=float(np.percentile(error[seen], 95)),
+        mean=float(error[visible].mean()),
+        p95=float(np.percentile(error[visible], 95)),
         contact=_mean(error[pair.contact]),
-        contact_seen=_mean(error[pair.contact & seen]),
+        contact_visible=_mean(error[pair.contact & visible]),
         hidden=_mean(error[pair.hidden]),
-        glare=_mean(error[seen & ~pair.rest_usable]),
+        glare=_mean(error[visible & ~pair.rest_usable]),
         magnitude=float(np.abs(size - real).mean() / max(float(real.mean()), 1e-9)),
         divergence=float(np.sqrt(np.mean((found - true) ** 2)) / max(spread, 1e-9)),
         divergence_r=float(np.corrcoef(found, true)[0, 1]) if spread > 0 and found.std() > 0 else 0.0,
@@ -72,8 +63,7 @@ def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
     )
 
 
-Masks = Callable[[Rgb, Flags], Flags]
-"""(picture, exact mask of what is usable) → the mask to use."""
+Masks = Callable[[Rgb, Flags], Flags]  # (image, exact mask of usable pixels) → the mask to use
 
 
 def measure(
@@ -82,10 +72,10 @@ def measure(
     """Mean errors over pairs.
 
     Args:
-        estimator: under test.
-        pairs: with truth.
-        masks: what stands for the exact masks.
-        warm: start from this share of the true flow, as the frame before would give; None: cold.
+        estimator: to be measured.
+        pairs: with ground truth.
+        masks: replaces the exact masks.
+        warm: start from this share of the true flow, as from the previous frame; None: cold start.
     """
     errors = []
     for pair in pairs:
@@ -97,7 +87,7 @@ def measure(
         flow, _ = estimator.flow(pair.rest, pair.now, rest, now, initial)
         errors.append(against(flow, pair, time.process_time() - begin))
     table = {name: [asdict(error)[name] for error in errors] for name in asdict(errors[0])}
-    # Of the time, the median, which other work on the machine disturbs least.
+    # The median of the times is least disturbed by other processes.
     return Error(**{n: float(np.median(v)) if n == "cpu_s" else _mean(v) for n, v in table.items()})
 
 
@@ -108,7 +98,7 @@ def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
 
 
 def inpainted(pair: Pair) -> Pair:
-    """The pair with the mean intensity in masked pixels, as the paper has it, and all of it usable."""
+    """The pair with masked pixels set to the mean intensity, as in the paper, and all pixels usable."""
     every = np.ones_like(pair.rest_usable)
     rest, now = _filled(pair.rest, pair.rest_usable), _filled(pair.now, pair.now_usable)
     return replace(pair, rest=rest, now=now, rest_usable=every, now_usable=every)

@@ -46,8 +46,7 @@ def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int =
         "opencv": cv2.__version__,
         "rows": rows,
     }
-    report.save(out, "pareto.json", found, page(found))
-    report.show(found)
+    report.publish(out, "pareto.json", found, page)
 
 
 def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
@@ -106,7 +105,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
     best = min(rows, key=lambda row: float(row["mean"]))
     words = [
         f"**Least endpoint error: {best['family']}, {best['setting']}, {best['mean']:.3f} px in "
-        f"{best['cpu_s']:.3f} CPU-s.** Errors in px, of the divergence relative; {found['on']}."
+        f"{best['cpu_s']:.3f} CPU-s.** Errors in px, of the divergence relative to its RMS; {found['on']}."
     ]
     return report.Page("Flow: error against time", found, panels, [report.Section("", rows)], words)
 

@@ -1,4 +1,4 @@
-"""Pairs and sequences with known flow: cortex-like texture, warped, lit, covered by a tool, sensed."""
+"""Image pairs and sequences with known flow: warped cortex-like texture with light, tool and sensor noise."""
 
 from __future__ import annotations
 
@@ -14,63 +14,43 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Rgb = NDArray[np.uint8]
 
-_FINE = 2  # texture samples a pixel, so that sampling it anywhere loses nothing the sensor could see
+_FINE = 2  # texture samples a pixel, so that resampling loses no detail that the sensor resolves
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What happens between the rest frame and the frame looked at. Lengths in px of the picture."""
+    """Changes between the rest frame and the current frame. Lengths in px of the image."""
 
-    size: int = 224
-    """Width and height [px]."""
-    pull: float = 10.0
-    """Largest displacement [px]."""
-    reach: float = 0.14
-    """Radius of the contact's dimple, as a share of the width."""
-    direction: float = 0.6
-    """Direction of the pull in the picture [rad]; x right, y down."""
-    tool: float = 22.0
-    """Width of one branch of the forceps [px]; 0 is no tool."""
-    highlights: float = 0.06
-    """Share of the picture in glare."""
+    size: int = 224  # width and height [px]
+    pull: float = 10.0  # largest displacement [px]
+    reach: float = 0.14  # radius of the contact's dimple, as a share of the width
+    direction: float = 0.6  # direction of the pull in the image [rad]; x right, y down
+    tool: float = 22.0  # width of one branch of the forceps [px]; 0: no tool
+    highlights: float = 0.06  # share of the image in specular highlights
     illumination: float = 0.10
-    """Largest relative change of brightness, with an equal gradient over the picture."""
-    contrast: float = 1.0
-    """Factor on the texture's contrast."""
-    noise: float = 1.5
-    """Standard deviation of the sensor's noise [grey levels]."""
-    blur: float = 0.0
-    """Gaussian defocus of the frame looked at, standard deviation [px]."""
+    """Largest relative change of brightness, with an equal gradient over the image."""
+    contrast: float = 1.0  # factor on the texture's contrast
+    noise: float = 1.5  # standard deviation of the sensor's noise [grey levels]
+    blur: float = 0.0  # Gaussian defocus of the current frame, standard deviation [px]
 
 
-CLEAN = Recipe(tool=0.0, highlights=0.0, illumination=0.0, noise=0.0)
-"""Nothing but motion."""
+CLEAN = Recipe(tool=0.0, highlights=0.0, illumination=0.0, noise=0.0)  # nothing but motion
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two pictures and everything true about them, on the rest frame's pixels unless said otherwise."""
+    """Two images and their ground truth, on the rest frame's pixels unless stated otherwise."""
 
-    rest: Rgb
-    """(H, W, 3) uint8, without tool."""
-    now: Rgb
-    """(H, W, 3) uint8."""
-    flow: Floats
-    """(H, W, 2) px, rest to now."""
-    rest_usable: Flags
-    """(H, W): no glare in the rest frame."""
-    now_usable: Flags
-    """(H, W), on the *now* frame's pixels: neither tool nor glare."""
-    tool: Flags
-    """(H, W), on the *now* frame's pixels."""
-    glare: Flags
-    """(H, W), on the *now* frame's pixels."""
-    hidden: Flags
-    """(H, W): material points that the tool covers in the now frame, inside the picture."""
-    contact: Flags
-    """(H, W): within the dimple's radius of the contact."""
-    inside: Flags
-    """(H, W): material points that the now frame's picture still holds."""
+    rest: Rgb  # (H, W, 3) uint8, without tool
+    now: Rgb  # (H, W, 3) uint8
+    flow: Floats  # (H, W, 2) px, rest to now
+    rest_usable: Flags  # (H, W): no highlight in the rest frame
+    now_usable: Flags  # (H, W), on the current frame's pixels: neither tool nor highlight
+    tool: Flags  # (H, W), on the current frame's pixels
+    glare: Flags  # (H, W), on the current frame's pixels
+    hidden: Flags  # (H, W): material points under the tool in the current frame, inside the image
+    contact: Flags  # (H, W): within the dimple's radius of the contact
+    inside: Flags  # (H, W): material points inside the current image
 
 
 def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator) -> Floats:
@@ -86,8 +66,8 @@ def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator)
 def cortex(size: int, rng: np.random.Generator) -> Floats:
     """Albedo like an exposed cortex: parenchyma, arteries, fine vessels and a vein; (size, size, 3) in 0..1.
 
-    Vessels are the zero lines of smooth noise, which wander as pial vessels do; that isn't anatomy, but the
-    picture has the gradients, the empty patches and the aperture problems that matter to flow.
+    Vessels are the zero lines of smooth noise. They are not anatomical, but the image has the gradients, the
+    textureless patches and the aperture problems that matter to flow.
     """
     shape = (size, size)
     unit = size / 448.0
@@ -111,10 +91,10 @@ def cortex(size: int, rng: np.random.Generator) -> Floats:
 
 
 def pull_field(recipe: Recipe) -> Floats:
-    """Displacement of a surface pulled at its middle, (H, W, 2) px at the rest frame's pixels.
+    """Displacement of a surface pulled at its centre, (H, W, 2) px at the rest frame's pixels.
 
-    Falls off as a point load's does on an elastic half space (1/r, Boussinesq) outside the contact, levels
-    off inside, is drawn together towards the contact, and is held at the rim.
+    Outside the contact it decreases as under a point load on an elastic half-space (1/r, Boussinesq), inside
+    it is level; it contracts towards the contact and vanishes at the rim.
     """
     y, x = np.mgrid[: recipe.size, : recipe.size].astype(np.float64)
     centre = 0.5 * (recipe.size - 1) + 0.06 * recipe.size * np.array([-1.0, 0.5])
@@ -136,7 +116,7 @@ def pixels(height: int, width: int) -> Floats:
 
 
 def inverse(flow: Floats) -> Floats:
-    """Where each now pixel came from: x with x + u(x) = y, by fixed-point steps. (H, W, 2) px."""
+    """Position x in the rest frame of each pixel y, x + u(x) = y, by fixed-point iteration. (H, W, 2) px."""
     grid = source = pixels(*flow.shape[:2])
     for _ in range(60):
         before = source
@@ -147,8 +127,11 @@ def inverse(flow: Floats) -> Floats:
 
 
 def sample(field: Floats, where: Floats, order: int = 3) -> Floats:
-    """(H, W) field at (..., 2) points (x, y), by cubic splines: OpenCV's remap rounds to 1/32 px and its
-    bicubic kernel misplaces a ramp by up to 0.05 px, both too much for a truth."""
+    """Field (H, W) at points (x, y), (..., 2), by cubic splines.
+
+    OpenCV's remap rounds to 1/32 px and its bicubic kernel displaces a ramp by up to 0.05 px: too much for a
+    ground truth.
+    """
     return np.asarray(
         map_coordinates(field, (where[..., 1], where[..., 0]), order=order, mode="mirror"), np.float32
     )
@@ -156,17 +139,13 @@ def sample(field: Floats, where: Floats, order: int = 3) -> Floats:
 
 @dataclass(frozen=True)
 class Stage:
-    """One surface under one light, from which any frame of a pull can be taken."""
+    """One surface under one light, which yields any frame of a pull."""
 
     recipe: Recipe
-    albedo: Floats
-    """(2H, 2W, 3) or finer, in 0..1."""
-    wet: Floats
-    """(H, W) field whose high values glare."""
-    drift: Floats
-    """(H, W) field the wet highlights change by as the surface tilts."""
-    field: Floats = field(repr=False)
-    """(H, W, 2) px: displacement at full pull."""
+    albedo: Floats  # (2H, 2W, 3) or finer, in 0..1
+    wet: Floats  # (H, W) field whose high values are highlights
+    drift: Floats  # (H, W) change of `wet` as the surface tilts
+    field: Floats = field(repr=False)  # (H, W, 2) px: displacement at full pull
 
     @classmethod
     def set(cls, recipe: Recipe, rng: np.random.Generator) -> Stage:
@@ -183,17 +162,17 @@ class Stage:
         return self.against(self.rest(rng), share, rng)
 
     def rest(self, rng: np.random.Generator) -> tuple[Rgb, Flags]:
-        """The rest frame and its glare: (H, W, 3) uint8, (H, W) bool."""
+        """The rest frame and its highlights: (H, W, 3) uint8, (H, W) bool."""
         grid = pixels(self.recipe.size, self.recipe.size)
         picture, glare = self._light(self._sample(grid), self.wet, 0.0)
         return self._sense(picture, rng), glare
 
     def against(self, rest: tuple[Rgb, Flags], share: float, rng: np.random.Generator) -> Pair:
-        """As `pair`, with a rest frame already taken (a sequence has one)."""
+        """As `pair`, with an existing rest frame (a sequence has one)."""
         recipe = self.recipe
         flow = np.asarray(share * self.field, np.float32)
         source = inverse(flow)
-        # Highlights belong to the light and the slope: they stay about where they were as the surface moves.
+        # Highlights depend on light and slope: they stay nearly in place as the surface moves.
         picture, glare = self._light(self._sample(source), self.wet + 0.5 * share * self.drift, share)
         if recipe.blur > 0:
             picture = cv2.GaussianBlur(picture, (0, 0), recipe.blur)
@@ -235,7 +214,7 @@ class Stage:
         return np.asarray(picture + strength * (1.05 - picture), np.float32), strength[..., 0] > 0.12
 
     def _tool(self, share: float) -> Flags:
-        """Two branches from the lower right to the contact, which they follow."""
+        """Mask of two branches from the lower right to the contact, which they follow."""
         recipe = self.recipe
         mask = np.zeros((recipe.size, recipe.size), np.uint8)
         if recipe.tool <= 0:
@@ -258,14 +237,14 @@ class Stage:
 
 
 def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:
-    """`count` independent pairs: other surfaces, other directions of pull."""
+    """`count` independent pairs with different surfaces and directions of pull."""
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)):
         turned = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
         yield Stage.set(turned, rng).pair(1.0, rng)
 
 
 def _metal(shape: tuple[int, int]) -> Floats:
-    """Brushed steel, (H, W, 3) in 0..1: bright lines along the branches would be easy; this is dull grey."""
+    """Dull grey steel, (H, W, 3) in 0..1; bright lines along the branches would be easier to detect."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     sheen = 0.32 + 0.12 * np.sin(0.35 * (y - 0.6 * x)) + 0.05 * np.sin(0.11 * (x + y))
     return np.asarray(sheen[..., None] * np.array([0.95, 1.0, 1.05]), np.float32)

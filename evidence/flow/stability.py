@@ -1,4 +1,4 @@
-"""One thing made worse at a time, until flow breaks; does its confidence flag that?
+"""Error of the flow under single disturbances of increasing size, and whether its confidence flags that.
 
 Run: python -m evidence.flow.stability
 """
@@ -21,8 +21,8 @@ from evidence.flow.scenes import Floats, Pair, Recipe, pairs
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Tracker
 
-_LOST_PX = 1.0  # a frame whose mean is off by more is lost
-_TROUBLES: dict[str, tuple[str, tuple[float, ...]]] = {
+_LOST_PX = 1.0  # mean endpoint error above which a frame is lost
+_DISTURBANCES: dict[str, tuple[str, tuple[float, ...]]] = {
     "displacement [px]": ("pull", (0.05, 0.5, 2, 5, 10, 20, 30, 40, 60)),
     "contrast": ("contrast", (0.05, 0.1, 0.2, 0.5, 1)),
     "noise [grey levels]": ("noise", (0, 2, 5, 10, 20)),
@@ -40,28 +40,27 @@ def main(
     seed: int = 2615,
     methods: str = "tvl1,opencv-tvl1,dis",
 ) -> None:
-    """`count` pairs a point; seed 8 was tuned on."""
+    """Errors and flags of `count` pairs a point; seed 8 was tuned on."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     rows = []
-    for trouble, value, made in _troubles(size, count, seed):
+    for disturbance, value, made in _pairs(size, count, seed):
         for name in methods.split(","):
             points = [_point(create(name), pair, start) for pair, start in made]
             means = {key: float(np.mean([point[key] for point in points])) for key in points[0]}
-            rows.append({"trouble": trouble, "value": value, "estimator": name} | means)
+            rows.append({"disturbance": disturbance, "value": value, "estimator": name} | means)
     found = {"flags": [_flags(name, rows) for name in methods.split(",")], "points": rows}
-    report.save(out, "stability.json", found, page(found))
-    report.show(found)
+    report.publish(out, "stability.json", found, page)
 
 
-def _troubles(
+def _pairs(
     size: int, count: int, seed: int
 ) -> Iterator[tuple[str, float, Sequence[tuple[Pair, Floats | None]]]]:
-    """Pairs with what flow starts from."""
-    for trouble, (field, values) in _TROUBLES.items():
+    """Disturbance, its size, and pairs with the initial flow (None: zero)."""
+    for disturbance, (field, values) in _DISTURBANCES.items():
         for value in values:
             changes: dict[str, Any] = {"size": size, field: value}
-            yield trouble, value, [(pair, None) for pair in pairs(Recipe(**changes), count, seed)]
+            yield disturbance, value, [(pair, None) for pair in pairs(Recipe(**changes), count, seed)]
     made = list(pairs(Recipe(size=size), count, seed))
     for value in (0.0, 2.0, 5.0, 10.0, 20.0, 40.0):
         wrong = [(p, np.asarray(p.flow + value / np.sqrt(2), np.float32)) for p in made]
@@ -70,17 +69,17 @@ def _troubles(
 
 
 def _point(estimator: Estimator, pair: Pair, start: Floats | None) -> dict[str, float]:
-    """Errors [px]; whether the frame is lost, flagged, and both ("hits")."""
+    """Errors [px], and whether the frame is lost, flagged, and both ("hits")."""
     tracker = Tracker(estimator, pair.rest, ~pair.rest_usable, np.ones_like(pair.inside))
     tracker.initial = start
     flow, trust = tracker.step(pair.now, ~pair.now_usable)
-    # Judged where the picture shows the point: what is masked is no question of tracking.
-    seen = pair.inside & ~pair.hidden & pair.rest_usable
+    # Masked pixels are left out: they are not tracked.
+    visible = pair.inside & ~pair.hidden & pair.rest_usable
     error = epe(flow, pair.flow)
-    frame = bool(error[seen].mean() > _LOST_PX), not tracker.trusted
+    frame = bool(error[visible].mean() > _LOST_PX), not tracker.trusted
     return {
-        "epe": float(error[seen].mean()),
-        "p95": float(np.percentile(error[seen], 95)),
+        "epe": float(error[visible].mean()),
+        "p95": float(np.percentile(error[visible], 95)),
         "frame_lost": float(frame[0]),
         "frame_flagged": float(frame[1]),
         "frame_hits": float(all(frame)),
@@ -89,7 +88,7 @@ def _point(estimator: Estimator, pair: Pair, start: Floats | None) -> dict[str, 
 
 
 def _flags(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Precision and recall of an estimator's flags of frames over all troubles."""
+    """Precision and recall of an estimator's flags of frames over all disturbances."""
     points = [p for p in rows if p["estimator"] == name]
     lost, flagged, hits = (sum(p[f"frame_{key}"] for p in points) for key in ("lost", "flagged", "hits"))
     return {
@@ -101,19 +100,18 @@ def _flags(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Draws `stability.json`: error over each trouble."""
+    """Draws `stability.json`: error against the size of each disturbance."""
     panels = []
-    for trouble in dict.fromkeys(p["trouble"] for p in found["points"]):
+    for disturbance in dict.fromkeys(p["disturbance"] for p in found["points"]):
         curves = []
         for name in dict.fromkeys(p["estimator"] for p in found["points"]):
-            own = [p for p in found["points"] if (p["trouble"], p["estimator"]) == (trouble, name)]
+            own = [p for p in found["points"] if (p["disturbance"], p["estimator"]) == (disturbance, name)]
             x, y = tuple(p["value"] for p in own), tuple(max(p["epe"], 1e-3) for p in own)
             curves.append(report.Curve(name, x, y))
-        panels.append(report.Panel(trouble, trouble, "EPE mean [px]", tuple(curves), log_y=True))
-    words = ["A frame is lost if it is off by more than 1 px in the mean; what is masked is left out."]
-    return report.Page(
-        "Flow: where it breaks", found, panels, [report.Section("Flags", found["flags"])], words
-    )
+        panels.append(report.Panel(disturbance, disturbance, "EPE mean [px]", tuple(curves), log_y=True))
+    words = ["A frame is lost if its mean endpoint error exceeds 1 px, without masked pixels."]
+    sections = [report.Section("Flags of lost frames", found["flags"])]
+    return report.Page("Flow: limits", found, panels, sections, words)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Motion in three dimensions from two eyes: error, bias, z-scores and cost.
+"""Motion in three dimensions from stereo: error, bias, z-scores and cost.
 
 Run: python -m evidence.flow.stereo data-640 data-320
 """
@@ -27,20 +27,20 @@ from synth.flow.track import track
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
 
-_EVERY = 7  # of the seen pixels one in so many is measured
-_CONTACT, _DEEP_MM = 0.05, 0.1  # pressed: load above this share of its peak, and moved so far in depth
+_EVERY = 7  # one in so many visible pixels is measured
+_CONTACT, _DEEP_MM = 0.05, 0.1  # pressed: load above this share of its peak, and moved this far in depth
 
 
 Sample = tuple[Floats, Floats, Floats, Flags]
-"""Seen tissue of one frame: true and found motion and its deviation, (n, 3) mm; (n,) under the contact."""
+"""Visible tissue of one frame: true and recovered motion, deviation, (n, 3) mm; whether in contact (n,)."""
 
 
 def main(
-    data: Annotated[list[Path], typer.Argument(help="Stereo datasets, of seeds that nothing was chosen on.")],
+    data: Annotated[list[Path], typer.Argument(help="Stereo datasets, of seeds that were not tuned on.")],
     count: Annotated[int, typer.Option(help="Sequences of each dataset.")] = 100,
     out: Path = report.RESULTS / "flow/stereo",
 ) -> None:
-    """Depth motion from two eyes by resolution."""
+    """Depth motion from stereo by resolution."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     rows = []
@@ -55,12 +55,11 @@ def main(
             | {"cost_ratio": ratio, "epipolar_px": float(np.median([one[3] for one in measured]))}
         )
     found = {"data": status.data(*data), "rows": rows}
-    report.save(out, "stereo.json", found, page(found))
-    report.show(found)
+    report.publish(out, "stereo.json", found, page)
 
 
 def figures(samples: list[Sample]) -> dict[str, float]:
-    """Errors in mm, bias as a share, quantiles of |error| / deviation in depth and across it."""
+    """Errors in mm, bias as a share, quantiles of |error| / deviation in depth and across the view."""
     true, found, deviation, pressed = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     z = np.abs(found - true) / deviation
     here = pressed & (np.abs(true[:, 2]) > _DEEP_MM)
@@ -81,20 +80,20 @@ def _rms(values: Floats) -> float:
 
 
 def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
-    """Samples of all frames; CPU time [s] with the second eye and of the left eye's flow alone; how far the
-    rest pair is off its rows [px]."""
+    """Samples of all frames; CPU time [s] of stereo and of the left camera's flow alone; epipolar error [px]
+    of the rest frames."""
     left, right = sequence["rgb"][:], sequence["rgb_right"][:]
     tissue, tools = sequence["tissue"][:], sequence["tool"][:]
-    # Under the tool nothing is known of the right eye but its picture: masks as the picture gives them.
+    # The store has no tool mask of the right camera: it is detected in the image.
     blocked = mask_detection.hidden(left, tools)
     other = mask_detection.hidden(right, np.stack([mask_detection.tool(picture) for picture in right]))
     begun = time.process_time()
-    seen = track("tvl1", left, blocked, tissue)
+    tracked = track("tvl1", left, blocked, tissue)
     flow_s = time.process_time() - begun
-    still = still_frames(seen.flow, tissue)
+    still = still_frames(tracked.flow, tissue)
     tracker = StereoTracker(_rig(sequence), left[:still], right[:still], blocked[0], other[0], tissue)
     moved = [
-        tracker.step(left[t], right[t], blocked[t], other[t], seen.flow[t], seen.confidence[t])
+        tracker.step(left[t], right[t], blocked[t], other[t], tracked.flow[t], tracked.confidence[t])
         for t in range(1, sequence.frames)
     ]
     both_s = time.process_time() - begun
@@ -109,35 +108,37 @@ def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
 
 
 def _rig(sequence: Sequence) -> StereoRig:
-    """The pair of lenses that took a stereo sequence."""
+    """Calibration of the cameras of a stereo sequence."""
     left, right = optics.camera_of(sequence), stereo.right_of(sequence)
-    eyes = Intrinsics(left.K, left.distortion), Intrinsics(right.K, right.distortion)
-    return StereoRig(*eyes, np.eye(3), right.translation - left.translation, left.size)
+    cameras = Intrinsics(left.K, left.distortion), Intrinsics(right.K, right.distortion)
+    return StereoRig(*cameras, np.eye(3), right.translation - left.translation, left.size)
 
 
-_ASKED = (
-    ("depth_rms_mm", "Depth motion, rms over seen tissue [mm]", {"640 x 480": 0.04, "320 x 240": 0.10}),
-    ("pressed_bias", "Its bias under pressed contact (size)", {"640 x 480": 0.05}),
-    ("cost_ratio", "Cost to the monocular one", {"640 x 480": 2.2, "320 x 240": 2.2}),
+_TARGETS = (
+    ("depth_rms_mm", "depth motion, RMS error over visible tissue", {"640 x 480": 0.04, "320 x 240": 0.10}),
+    ("pressed_bias", "its bias at the contact", {"640 x 480": 0.05}),
+    ("cost_ratio", "CPU time relative to monocular flow", {"640 x 480": 2.2, "320 x 240": 2.2}),
 )
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Draws `stereo.json`: what was asked as a part of what was allowed, z-scores, every row."""
+    """Draws `stereo.json`: values relative to their targets, z-scores, every row."""
     shares, scores = {}, {}
     for row in found["rows"]:
-        for key, words, limits in _ASKED:
+        for key, what, limits in _TARGETS:
             if row["size"] in limits:
-                shares[f"{words}: {row['data']}"] = abs(row[key]) / limits[row["size"]]
+                shares[f"{what}: {row['data']}"] = abs(row[key]) / limits[row["size"]]
         for part in ("depth", "across"):
             scores[f"{part}, 68%: {row['data']}"] = row[f"{part}_z68"]
             scores[f"{part}, 95%: {row['data']}"] = row[f"{part}_z95"] / 2
     charts = [
-        report.Chart("Reached where at most 1", "measured / asked", report.bars(shares)),
+        report.Chart("Target reached if at most 1", "measured / target", report.bars(shares)),
         report.Chart("Calibrated at 1", "quantile of |error| / deviation, over 1 and 2", report.bars(scores)),
     ]
-    sections = [report.Section("By dataset", found["rows"])]
-    return report.Page("Two eyes: motion in three dimensions", found, charts, sections)
+    met = sum(value <= 1 for value in shares.values())
+    words = [f"**{met} of {len(shares)} targets are reached.** *z*: quantiles of |error| / deviation."]
+    sections = [report.Section("", found["rows"])]
+    return report.Page("Stereo: motion in three dimensions", found, charts, sections, words)
 
 
 if __name__ == "__main__":

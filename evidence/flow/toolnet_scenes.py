@@ -1,7 +1,7 @@
 """Frames with an instrument in view and its exact mask, rendered to train and to test the tool mask.
 
-Only what the mask depends on is made: the renderer's looks, views and instruments, posed at random. Tissue at
-rest, no physics: a frame costs a fifth of a sequence's.
+Appearance, view, instruments and their poses are random; the tissue is at rest, without physics, which takes
+a fifth of the time of a sequence's frame.
 """
 
 from __future__ import annotations
@@ -17,26 +17,23 @@ from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 
-FRAMES = 6
-"""Frames a scene; the last shows no instrument."""
+FRAMES = 6  # frames a scene; the last shows no instrument
 _FAMILIES = ("healthy", "pale", "hyperaemic", "oedematous", "calf")
-_GESTURES = ("pull", "push", "slide", "retract")  # between them they take every instrument
-_AWAY_MM = 300.0  # out of every view
+_GESTURES = ("pull", "push", "slide", "retract")  # together they use every instrument
+_AWAY_MM = 300.0  # outside every view
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture and where the instrument is in it."""
+    """One image and its instrument mask."""
 
     scene: int
-    rgb: NDArray[np.uint8]
-    """(H, W, 3) sRGB."""
-    tool: NDArray[np.bool_]
-    """(H, W)."""
+    rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
+    tool: NDArray[np.bool_]  # (H, W)
 
 
 def frames(scenes: range, seed: int) -> Iterator[Frame]:
-    """`FRAMES` frames of each scene: other anatomy, look, view, instrument and poses in each."""
+    """`FRAMES` frames of each scene; scenes differ in anatomy, appearance, view, instrument and poses."""
     job = Job.model_validate(
         {
             "seed": seed,
@@ -69,7 +66,7 @@ def _scene(job: Job, index: int) -> Iterator[Frame]:
 def _pose(
     vertices: NDArray[np.float64], radius_mm: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """An instrument's two tips (2, 3) mm over the opening, and its shafts (2, 3) from anywhere above."""
+    """An instrument's two tips (2, 3) mm over the opening, and directions of its shafts (2, 3)."""
     around, far = rng.uniform(0, 2 * np.pi), 0.95 * radius_mm * np.sqrt(rng.uniform())
     over = far * np.array([np.cos(around), np.sin(around)])
     near = vertices[np.argmin(np.linalg.norm(vertices[:, :2] - over, axis=1))]

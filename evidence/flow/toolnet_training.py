@@ -2,8 +2,8 @@
 
 Run: python -m evidence.flow.toolnet_training
 
-Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, overlap on scenes held
-out, beside that of the rule without weights).
+Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, and the overlap on held-out
+scenes of the network and of the rule without weights).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(out: Path = toolnet.WEIGHTS.parent, scenes: int = 39, steps: int = 700,
 
 
 def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
-    """A net trained from nothing; one-cycle rate, one thread."""
+    """A network trained from random weights; one-cycle learning rate, one thread."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     batches = _batches(training, np.random.default_rng(seed))
@@ -71,7 +71,7 @@ def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
 
 
 def overlap(frames: Sequence[Frame], find: Callable[[Picture], Flags]) -> float:
-    """Intersection over union of all that is found and all that is tool, over all frames together."""
+    """Intersection over union of detected and true tool pixels, pooled over all frames."""
     both = either = 0
     for frame in frames:
         found = find(frame.rgb)
@@ -91,7 +91,7 @@ def _batches(frames: Sequence[Frame], rng: np.random.Generator) -> Iterator[tupl
 
 
 def _vary(picture: Picture, mask: Flags, rng: np.random.Generator) -> tuple[Picture, Flags]:
-    """Turned, mirrored, zoomed and cropped square; other light, other steel, other colour of the field."""
+    """Random rotation, zoom and square crop, and changes of light, steel and colour."""
     side = min(mask.shape)
     turn, zoom = rng.uniform(0, 360), rng.uniform(0.55, 1.3)
     middle = np.array([mask.shape[1], mask.shape[0]]) / 2

@@ -1,1 +1,1 @@
-"""Recordings that other programs make: mechanics by felupe, pictures by Blender, each in its own Python."""
+"""Recordings made by other programs: mechanics by felupe, images by Blender, each in its own Python."""

@@ -1,9 +1,9 @@
-"""Recordings with a force sensor, of two eyes, that no code of ours has moved or drawn.
+"""Stereo recordings with a force sensor, simulated and rendered by other programs.
 
 Mechanics by felupe (triquadratic bricks, compressible neo-Hookean, Hertz's pressure; a membrane as a net of
-trusses; a pulse from the ground), pictures by Blender's Cycles, texture and tool of this module's own. What
-is ours is the tool's motion in time, the sensor and the folder's layout. `bench score` and `bench pool` then
-answer for docs/results/learn/foreign; without `right.mp4` a recording is of one eye.
+trusses; a pulse applied to the ground), images by Blender's Cycles. This module contributes texture, the
+tool's shape and motion, the sensor and the folder's layout. docs/results/learn/foreign is then made by
+`bench score` and `bench pool`; without `right.mp4` a recording is monocular.
 
 Run: python -m evidence.foreign.recordings OUT --mechanics-python A/bin/python --pictures-python B/bin/python
 """
@@ -36,9 +36,8 @@ _WORKER = Path(__file__).with_name("worker.py")
 _FIELD_MM, _SIDE, _TEXELS, _SIZE = 46.0, 220, 1200, (320, 240)
 _DISTANCE_MM, _BASE_MM, _SENSOR_HZ = 300.0, 24.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
-_FILMS = {"": "video.mp4", "right-": "right.mp4"}
-"""What the pictures of either camera begin with, and its film."""
-_BEAT_HZ, _BREATH_HZ = 1.2, 0.25
+_VIDEOS = {"": "video.mp4", "right-": "right.mp4"}  # prefix of a camera's images, and its video
+_HEART_HZ, _BREATH_HZ = 1.2, 0.25
 
 
 def main(
@@ -51,7 +50,7 @@ def main(
     fps: float = 3.0,
     spp: Annotated[int, typer.Option(help="Light paths a pixel.")] = 24,
     seed: int = 500,
-    left: Annotated[Path | None, typer.Option(help="Also gets each of them with its left eye alone.")] = None,
+    left: Annotated[Path | None, typer.Option(help="Folder that gets monocular copies.")] = None,
 ) -> None:
     """Makes recordings by felupe and Blender: plain, with a membrane, with a pulse."""
     for kind in kinds.split(","):
@@ -64,12 +63,12 @@ def main(
                     record(part, folder.name, kind, rng, (seconds, fps, spp), pythons)
             if left is not None and not (left / folder.name).exists():
                 with writer.write_whole_folder(left / folder.name) as part:
-                    copy_left_eye(folder, part)
+                    copy_left_camera(folder, part)
             print(folder)
 
 
-def copy_left_eye(recording: Path, part: Path) -> None:
-    """What the left eye of a recording saw, into a folder."""
+def copy_left_camera(recording: Path, part: Path) -> None:
+    """Copies a recording without its right camera into a folder."""
     shutil.copytree(
         recording, part, ignore=shutil.ignore_patterns("right.mp4", "pair.yaml"), dirs_exist_ok=True
     )
@@ -82,16 +81,20 @@ def record(
     name: str,
     kind: str,
     rng: np.random.Generator,
-    film: tuple[float, float, int],
+    video: tuple[float, float, int],
     pythons: tuple[Path, Path],
 ) -> None:
-    """One recording into the folder `part`.
+    """Writes one recording into the folder `part`.
 
     Args:
-        film: length [s], frames a second, light paths a pixel.
-        pythons: those of mechanics and of pictures.
+        part: folder of the recording.
+        name: of the specimen.
+        kind: one of `KINDS`.
+        rng: source of all random numbers.
+        video: length [s], frames a second, light paths a pixel.
+        pythons: interpreters of mechanics and of images.
     """
-    seconds, fps, spp = film
+    seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
     young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
     contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
@@ -111,26 +114,26 @@ def record(
         sensor_s, level, away = tool_motion(seconds, rng)
         arrays = _scene(surface, level, away, times, contacts, rng)
         camera, focal = first_camera(rng)
-        pair = camera, beside(camera)
-        given = {
+        pair = camera, right_camera(camera)
+        drawn = {
             "size": _SIZE,
             "focal_px": focal,
-            "cameras": {eye: matrix.tolist() for eye, matrix in zip(_FILMS, pair, strict=True)},
+            "cameras": {prefix: matrix.tolist() for prefix, matrix in zip(_VIDEOS, pair, strict=True)},
             "spp": spp,
             "threads": 1,
             "tool_mm": 0.6 * min(one["radius_mm"] for one in contacts),
             "lamps_mm": [[70.0, 40.0, 260.0], [-60.0, 20.0, 280.0]],
             "watts": 2.6e5,
         }
-        run(pythons[1], folder, "pictures", given, arrays)
+        run(pythons[1], folder, "pictures", drawn, arrays)
         noise = np.random.default_rng(rng.integers(2**31))
-        for eye, file in _FILMS.items():
-            pictures = (_sensed(folder / f"{eye}{k:05d}.png", noise) for k in range(len(times)))
+        for prefix, file in _VIDEOS.items():
+            pictures = (_sensed(folder / f"{prefix}{k:05d}.png", noise) for k in range(len(times)))
             writer.write_video(part / file, pictures, times, crf=18)
     whole = level @ np.array([one["force_mn"] for one in contacts])
-    seen = whole @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    seen = seen + 0.02 * rng.normal(size=(len(sensor_s), 3))
-    writer.write_force(part, sensor_s, seen / 1000)
+    measured = whole @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    measured = measured + 0.02 * rng.normal(size=(len(sensor_s), 3))
+    writer.write_force(part, sensor_s, measured / 1000)
     write_pair(part / "pair.yaml", *pair, focal)
     about = {
         "stereo": {"calibration": "pair.yaml"},
@@ -144,21 +147,21 @@ def record(
 
 
 def run(
-    python: Path, folder: Path, work: str, given: dict[str, Any], arrays: dict[str, Any] | None = None
+    python: Path, folder: Path, work: str, settings: dict[str, Any], arrays: dict[str, Any] | None = None
 ) -> Path:
-    """The worker in its own Python; gives back what it wrote. Raises UserError with its last line."""
-    (folder / f"{work}.json").write_text(json.dumps(given))
+    """Runs the worker in its own Python; returns the file it wrote. Raises UserError with its last line."""
+    (folder / f"{work}.json").write_text(json.dumps(settings))
     if arrays is not None:
         np.savez(folder / f"{work}.npz", **arrays)
     done = subprocess.run([python, _WORKER, work, folder], capture_output=True, text=True, check=False)
     if done.returncode:
-        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        last = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
         raise UserError(f"{python}: {work}: {last}")
     return folder / f"{work}.npz"
 
 
 def _contact(young: float, rng: np.random.Generator) -> dict[str, Any]:
-    """A press, a push aside or a pull at a place in the middle of the field; P = F/(E a²) of 0.06 to 0.25."""
+    """A press, a lateral push or a pull near the centre of the field; P = F/(E a²) of 0.06 to 0.25."""
     radius = float(rng.uniform(3, 5))
     size = float(rng.uniform(0.06, 0.25)) * young * radius**2
     tilt, turn = np.deg2rad(rng.uniform(0, 55)), rng.uniform(0, 2 * np.pi)
@@ -172,8 +175,8 @@ def tool_motion(seconds: float, rng: np.random.Generator) -> tuple[Floats, Float
     """One contact after the other, each with a rise, a hold and a fall; still at both ends.
 
     Returns:
-        The sensor's times [s] (N,), shares of each contact's force (N, contacts), and how far its tip is off
-        the tissue, 0 to 1 (N, contacts).
+        The sensor's times [s] (N,), shares of each contact's force (N, contacts), and the distance of its tip
+        from the tissue, 0 to 1 (N, contacts).
     """
     time = np.arange(0, seconds, 1 / _SENSOR_HZ)
     level, away = np.zeros((len(time), _CONTACTS)), np.ones((len(time), _CONTACTS))
@@ -195,18 +198,15 @@ def _ramp(s: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Surface:
-    """The specimen's surface on a fine square grid, y rising by rows, and how felupe moved it."""
+    """The specimen's surface on a fine square grid, y rising by rows, and its displacement by felupe."""
 
-    rest: Floats
-    """(N, N, 3) mm."""
-    moved: Floats
-    """(contacts, levels, N, N, 3) mm."""
-    pulse: Floats
-    """(N, N, 3) mm."""
+    rest: Floats  # (N, N, 3) mm
+    moved: Floats  # (contacts, levels, N, N, 3) mm
+    pulse: Floats  # (N, N, 3) mm
 
     @staticmethod
     def of(solved: Any, rng: np.random.Generator) -> Surface:
-        """Between felupe's nodes by cubic splines, with a relief of a tenth of a millimetre."""
+        """Felupe's result interpolated by cubic splines, with a relief of a tenth of a millimetre."""
         at = solved["at"]
         side = round(len(at) ** 0.5)
         x, y = at[:side, 0], at[::side, 1]
@@ -221,11 +221,11 @@ class Surface:
         moved = np.array([[finer(level) for level in contact] for contact in solved["moved"]])
         return Surface(rest, moved, finer(solved["pulse"]))
 
-    def at(self, levels: Floats, beat: float) -> Floats:
-        """(N, N, 3) mm moved, at shares (contacts,) of the forces: between felupe's levels by a cubic through
-        them, and with so much of the pulse."""
+    def at(self, levels: Floats, pulse: float) -> Floats:
+        """Displacement (N, N, 3) mm at shares (contacts,) of the forces and a share of the pulse, by a cubic
+        through felupe's load levels."""
         known = np.linspace(0, 1, self.moved.shape[1] + 1)
-        out = beat * self.pulse
+        out = pulse * self.pulse
         for contact, level in zip(self.moved, levels, strict=True):
             if level > 0:
                 weights = [
@@ -244,18 +244,18 @@ def _scene(
     contacts: list[dict[str, Any]],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """What is drawn: rest, motion (T, N, N, 3), the tool's tip and shaft (T, 3), texture and bumps."""
+    """Renderer input: rest, motion (T, N, N, 3), the tool's tip and shaft (T, 3), texture and bumps."""
     phase = rng.uniform(0, 2 * np.pi, 2)
 
-    def beat(time: float) -> float:
-        angle = 2 * np.pi * time * np.array([_BEAT_HZ, _BREATH_HZ]) + phase
+    def pulse(time: float) -> float:
+        angle = 2 * np.pi * time * np.array([_HEART_HZ, _BREATH_HZ]) + phase
         return float(np.array([0.7, 0.3]) @ np.sin(angle))
 
     moved, tips = [], []
     shaft = np.array([0.5, -0.6, 1.0]) / np.linalg.norm([0.5, -0.6, 1.0])
     for time in times:
         at = min(int(time * _SENSOR_HZ), len(level) - 1)
-        now = surface.at(level[at], beat(time) - beat(0.0))
+        now = surface.at(level[at], pulse(time) - pulse(0.0))
         k = int(np.argmin(away[at]))
         here = np.array(contacts[k]["at_mm"])
         row, column = np.rint((here[::-1] / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
@@ -290,7 +290,7 @@ def texture(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.f
 def _grow(
     cover: NDArray[np.uint8], start: Floats, heading: float, width: float, rng: np.random.Generator
 ) -> None:
-    """Draws a vessel that wanders, thins and branches."""
+    """Draws a winding vessel that becomes thinner and branches."""
     at = np.array(start, float)
     while width > 1.0 and (at > -50).all() and (at < _TEXELS + 50).all():
         heading += rng.normal(0, 0.18)
@@ -303,20 +303,20 @@ def _grow(
 
 
 def first_camera(rng: np.random.Generator) -> tuple[Floats, float]:
-    """Blender's matrix of a camera above the middle, tilted up to 12 degrees, and its focal length [px]."""
+    """Blender's matrix of a camera above the centre, tilted up to 12 degrees, and its focal length [px]."""
     tilt, turn = np.deg2rad(rng.uniform(0, 12)), rng.uniform(0, 2 * np.pi)
     back = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     matrix = _looking(_DISTANCE_MM * back, np.cross([0.0, 1.0, 0.0], back))
     return matrix, float(_SIZE[0] * _DISTANCE_MM / rng.uniform(31, 36))
 
 
-def beside(camera: Floats) -> Floats:
-    """Blender's matrix of a second camera to the right of the first, turned to look at the same middle."""
+def right_camera(camera: Floats) -> Floats:
+    """Blender's matrix of a second camera to the right of the first, directed at the same centre."""
     return _looking(camera[:3, 3] + _BASE_MM * camera[:3, 0], camera[:3, 0])
 
 
 def _looking(at: Floats, right: Floats) -> Floats:
-    """Matrix of a camera at a place [mm] that looks at the middle, its right near a direction."""
+    """Matrix of a camera at a place [mm] directed at the centre, its x axis near the direction `right`."""
     back = at / np.linalg.norm(at)
     right = right - (right @ back) * back
     right = right / np.linalg.norm(right)
@@ -327,20 +327,17 @@ def _looking(at: Floats, right: Floats) -> Floats:
 
 
 def write_pair(file: Path, left: Floats, right: Floats, focal_px: float) -> None:
-    """Writes the two cameras, matrices of Blender, as OpenCV's `stereoCalibrate` would: K, D, R, T [mm]."""
-    # Blender looks along -z with y up, OpenCV along z with y down.
+    """Writes the two cameras, matrices of Blender, as OpenCV's `stereoCalibrate` does: K, D, R, T [mm]."""
+    # The optical axis is -z in Blender with y up, z in OpenCV with y down.
     first, second = (np.diag([1.0, -1.0, -1.0]) @ one[:3, :3].T for one in (left, right))
     K = np.array([[focal_px, 0, _SIZE[0] / 2 - 0.5], [0, focal_px, _SIZE[1] / 2 - 0.5], [0, 0, 1]])
     values = {"K1": K, "D1": np.zeros((1, 5)), "K2": K, "D2": np.zeros((1, 5))}
     values |= {"R": second @ first.T, "T": (second @ (left[:3, 3] - right[:3, 3]))[:, None]}
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for name, value in values.items():
-        storage.write(name, value)
-    storage.release()
+    writer.write_storage(file, values)
 
 
 def _sensed(picture: Path, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture with a sensor's noise."""
+    """The image with a sensor's noise."""
     rgb = read_picture(picture)[..., ::-1].astype(np.float32)
     noise = np.sqrt(0.6 + 0.012 * rgb) * rng.normal(size=rgb.shape)
     return np.asarray(np.clip(rgb + noise, 0, 255), np.uint8)

@@ -1,11 +1,12 @@
-"""Mechanics by felupe and pictures by Blender's Cycles, for `evidence.foreign.recordings`.
+"""Mechanics by felupe and images by Blender's Cycles, for `evidence.foreign.recordings`.
 
     worker.py mechanics FOLDER   in a Python that has felupe and pypardiso
     worker.py pictures FOLDER    in a Python that has bpy
 
-It imports nothing of ours. `mechanics` reads `mechanics.json` and writes `mechanics.npz`: where the surface's
-nodes are, how they move under every contact at rising shares of its force, and with the pulse at its largest.
-`pictures` reads `pictures.npz` and `pictures.json` and writes `NNNNN.png` and `right-NNNNN.png`, 8 bits sRGB.
+It imports nothing of this project. `mechanics` reads `mechanics.json` and writes `mechanics.npz`: positions
+of the surface's nodes, and their displacement under every contact at rising shares of its force and at the
+peak of the pulse. `pictures` reads `pictures.npz` and `pictures.json` and writes `NNNNN.png` and
+`right-NNNNN.png`, 8 bits sRGB.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ else:
     import bpy  # type: ignore[import-not-found]
     import mathutils  # type: ignore[import-not-found]
 
-_GROWTH = 2.5  # elements of the block's middle and top are so much finer
+_GROWTH = 2.5  # factor by which elements at the block's centre and top are finer
 
 
 def mechanics(folder: Path) -> None:
-    """One specimen."""
+    """Solves one specimen."""
     given = json.loads((folder / "mechanics.json").read_text("utf-8"))
     wide, deep = given["block_mm"]
     x, z = _lines(wide, deep, *given["elements"])
@@ -50,7 +51,7 @@ def mechanics(folder: Path) -> None:
 
 
 def _lines(wide: float, deep: float, across: int, down: int) -> tuple[Any, Any]:
-    """Where element borders are: finer in the middle and at the top, z = 0."""
+    """Coordinates x and z of element borders: finer at the centre and at the top, z = 0."""
     edge, depth = np.linspace(-1, 1, across + 1), np.linspace(0, 1, down + 1)
     x = wide / 2 * np.sign(edge) * (np.abs(edge) + (_GROWTH - 1) * np.abs(edge) ** 3) / _GROWTH
     z = -deep * (depth + (_GROWTH - 1) * depth**3) / _GROWTH
@@ -58,7 +59,7 @@ def _lines(wide: float, deep: float, across: int, down: int) -> tuple[Any, Any]:
 
 
 def _held(field: Any, wide: float, deep: float) -> tuple[Any, Any]:
-    """Degrees of freedom of the sides and the ground, which don't move, and those that are free."""
+    """Degrees of freedom of the fixed sides and ground, and the free ones."""
     walls = {"fx": (-wide / 2, wide / 2), "fy": (-wide / 2, wide / 2), "fz": (-deep,)}
     bounds = {
         f"{axis} {at}": fem.Boundary(field[0], **{axis: at}) for axis, ends in walls.items() for at in ends
@@ -68,7 +69,7 @@ def _held(field: Any, wide: float, deep: float) -> tuple[Any, Any]:
 
 
 def _membrane(mesh: Any, field: Any, top: Any, stiffness: float) -> Any:
-    """A net of trusses over the surface's nodes: stiffness of a strip times the strip's width."""
+    """A net of trusses over the surface's nodes; a truss has the stiffness of a strip of the membrane."""
     side = round(len(top) ** 0.5)
     net = top.reshape(side, side)
     gap = np.diff(mesh.points[net[0], 0])
@@ -84,7 +85,7 @@ def _membrane(mesh: Any, field: Any, top: Any, stiffness: float) -> Any:
 
 
 def _pressed(mesh: Any, field: Any, items: list[Any], top: Any, held: Any, contact: Any, levels: int) -> Any:
-    """(levels, nodes, 3) mm at equal steps of a contact's force, by Hertz's pressure."""
+    """Displacement (levels, nodes, 3) mm at equal steps of a contact's force, by Hertz's pressure."""
     field[0].values[:] = 0
     at = mesh.points[top, :2]
     away = np.linalg.norm(at - contact["at_mm"], axis=1) / contact["radius_mm"]
@@ -100,7 +101,7 @@ def _pressed(mesh: Any, field: Any, items: list[Any], top: Any, held: Any, conta
 
 
 def _simpson(x: Any) -> Any:
-    """Weights of an integral over a line of nodes, two to an element and one in its middle."""
+    """Simpson's weights over a line of nodes, two at the ends of an element and one at its centre."""
     weight = np.zeros(len(x))
     for start in range(0, len(x) - 2, 2):
         weight[start : start + 3] += (x[start + 2] - x[start]) / 6 * np.array([1, 4, 1])
@@ -110,7 +111,7 @@ def _simpson(x: Any) -> Any:
 def _lifted(
     mesh: Any, field: Any, items: list[Any], top: Any, held: Any, lift_mm: float, wide: float, deep: float
 ) -> Any:
-    """(nodes, 3) mm of the surface when the ground's middle is lifted until the surface rises so far."""
+    """Displacement (nodes, 3) mm when the ground's centre is lifted until the surface rises by `lift_mm`."""
     if not lift_mm:
         return np.zeros((len(top), 3))
     field[0].values[:] = 0
@@ -124,12 +125,12 @@ def _lifted(
 
 
 def _solve(items: list[Any], held: tuple[Any, Any], fixed: Any) -> None:
-    """Newton's method with so much displacement of what is held."""
+    """Newton's method with displacement `fixed` at the held degrees of freedom."""
     fem.newtonraphson(items=items, dof0=held[0], dof1=held[1], ext0=fixed, solver=spsolve, verbose=0)
 
 
 def pictures(folder: Path) -> None:
-    """One film."""
+    """Renders one video."""
     arrays = np.load(folder / "pictures.npz")
     given = json.loads((folder / "pictures.json").read_text("utf-8"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -159,15 +160,15 @@ def pictures(folder: Path) -> None:
             arrays["tip"][k].tolist(),
             shaft.to_track_quat("Z", "Y").to_euler(),
         )
-        for eye, (name, camera) in enumerate(cameras.items()):
+        for number, (name, camera) in enumerate(cameras.items()):
             scene.camera = camera
-            scene.cycles.seed = 2 * k + eye  # noise that eyes shared would be followed
+            scene.cycles.seed = 2 * k + number  # noise common to both cameras would be matched
             scene.render.filepath = str(folder / f"{name}{k:05d}.png")
             bpy.ops.render.render(write_still=True)
 
 
 def _linked(name: str, what: Any) -> Any:
-    """An object in the scene."""
+    """A new object, linked to the scene."""
     made = bpy.data.objects.new(name, what)
     bpy.context.scene.collection.objects.link(made)
     return made
@@ -230,7 +231,7 @@ def _rod(radius_mm: float) -> Any:
 
 
 def _settings(scene: Any, given: dict[str, Any]) -> None:
-    scene.world = bpy.data.worlds.new("room")
+    scene.world = bpy.data.worlds.new("surroundings")
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs[1].default_value = 0.05
     scene.render.engine = "CYCLES"

@@ -1,8 +1,8 @@
-"""How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone.
+"""Share of the sim-to-real gap closed by training on recovered flow, and by training with fitted noise.
 
 Four trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the recovered
-flow's error (N), and a mixture. Each is tested on ideal and on recovered flow, of the world it was trained in
-and of one that no training saw (').
+flow's error (N), and a mixture. Each is tested on ideal and on recovered flow, in distribution and out of
+distribution (').
 
 Run: python -m evidence.gap.experiment DATASET --unseen OTHER --work runs/gap
 """
@@ -36,34 +36,34 @@ KINDS = ("R", "N", "mixed")
 _TESTS = {
     "I": "ideal flow",
     "R": "recovered flow",
-    "I'": "ideal flow, unseen world",
-    "R'": "recovered flow, unseen world",
+    "I'": "ideal flow, out of distribution",
+    "R'": "recovered flow, out of distribution",
 }
 _UNIT = "mean error of the total force [mN]"
 
 
 def main(
     dataset: Annotated[Path, typer.Argument(help="Dataset with recovered flow of the back end tvl1.")],
-    unseen: Annotated[Path, typer.Option(help="Dataset of another world, that no training sees.")],
+    unseen: Annotated[Path, typer.Option(help="Dataset out of distribution, only tested on.")],
     work: Annotated[Path, typer.Option(help="Folder for packed sequences, networks and errors.")],
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "gap",
-    fit: Annotated[int | None, typer.Option(min=20, help="Take so many sequences of `dataset` only.")] = None,
+    fit: Annotated[int | None, typer.Option(min=20, help="Use only so many sequences of `dataset`.")] = None,
     flow: Annotated[list[str] | None, typer.Option(help="Back ends of the recovered flow.")] = None,
     named: Annotated[str, typer.Option("--preset", help="Preset of `learn train`.")] = "tiny",
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; the preset's if not given.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Networks a training.")] = 2,
 ) -> None:
-    """How much of the sim-to-real gap training on recovered flow closes, and fitted noise alone."""
+    """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise."""
     set_threads(1)
     settings = preset(named)
     settings = replace(
         settings,
-        arch=replace(settings.arch, output="magnitude"),  # all are scored alike
+        arch=replace(settings.arch, output="magnitude"),  # the same metrics for all
         epochs=epochs or settings.epochs,
     )
     known = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=work)[:fit]
     others = load_clips(unseen, settings.grid, ("ideal", "recovered"), cache=work)
-    split, seen = parts(known, others)
+    split, own_test = parts(known, others)
     stored, clips = [*list(Dataset(dataset))[:fit], *Dataset(unseen)], [*known, *others]
     runs: dict[Training, dict[str, Any]] = {}
     for backend in flow or ["tvl1", "opencv-tvl1"]:
@@ -71,7 +71,7 @@ def main(
         if backend != "tvl1":
             pairs = zip(stored, clips, strict=True)
             used = [with_flow(s, c, backend, settings.grid, work) for s, c in pairs]
-        ours, theirs = [used[i] for i in seen], [used[i] for i in split.test]
+        ours, theirs = [used[i] for i in own_test], [used[i] for i in split.test]
         tests = {
             "I": (ours, "ideal"),
             "R": (ours, "recovered"),
@@ -83,7 +83,7 @@ def main(
                 one = Training(kind, backend, seed)
                 typer.echo(f"{kind}, {backend}, seed {seed}", err=True)
                 runs[one] = carry_out(one, used, split, settings, tests, work)
-    sizes = (split.fit, split.select, seen, split.test)
+    sizes = (split.fit, split.select, own_test, split.test)
     found: dict[str, Any] = {
         "data": status.data(dataset, unseen),
         "settings": settings.model_dump(),
@@ -92,12 +92,12 @@ def main(
         "seeds": seeds,
         "flows": compared(runs),
     }
-    report.save(out, "results.json", found, page(found))
-    report.show({flow: _verdict(one) for flow, one in found["flows"].items()})
+    shown = {flow: _verdict(one) for flow, one in found["flows"].items()}
+    report.publish(out, "results.json", found, page, shown)
 
 
 def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
-    """What the trainings come to, by flow."""
+    """Errors and shares of the gap of all trainings, by flow estimator."""
     by: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
     for training, run in runs.items():
         by.setdefault(training.flow, {}).setdefault(training.kind, []).append(run)
@@ -105,10 +105,10 @@ def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[int, ...]]:
-    """Fit and select from `clips`, with all of `unseen`, which follow them, as test; and a test of `clips`.
+    """Split with fit and select from `clips` and `unseen`, which follow them, as test; and a test of `clips`.
 
     Raises:
-        UserError: a sequence or an anatomy is on both sides, or too few are left.
+        UserError: an anatomy is in both datasets, or too few sequences are left.
     """
     aside = folds(clips, 5, 1)[0]
     rest = [i for i in range(len(clips)) if i not in set(aside)]
@@ -121,7 +121,7 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
 
 
 def summary(trained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """Errors with intervals, and the share of the gap each training closes, for every measure."""
+    """Errors with intervals, and the share of the gap closed by each training, for every metric."""
     out: dict[str, Any] = {
         "noise": trained["N"][0]["noise"],
         "errors": {},
@@ -145,13 +145,13 @@ def summary(trained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any
 
 
 def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
-    """(S,) errors by sequence, the mean over seeds."""
+    """Errors by sequence (S,), means over seeds."""
     rows = [[math.nan if v is None else v for v in run["errors"][test][key]] for run in runs]
     return np.asarray(np.mean(rows, axis=0), np.float64)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """What the trainings err by on flow that a recording would show, and the tables."""
+    """Errors of the trainings on the flow of recordings, and the tables."""
     bars, sections = [], []
     for group, (flow, one) in enumerate(found["flows"].items()):
         for kind, test in (("I", "I'"), *((kind, "R'") for kind in ("I", *KINDS))):
@@ -160,32 +160,37 @@ def page(found: Mapping[str, Any]) -> report.Page:
             bars.append(report.Row(name, value["mean"], (value["low"], value["high"]), group))
         rows = [
             {"trained on": kind}
-            | {_TESTS[test]: _text((v["low"], v["high"]), v["mean"]) for test, v in tests.items()}
+            | {
+                _TESTS[test]: report.mean_cell([v[key] for key in ("mean", "low", "high")])
+                for test, v in tests.items()
+            }
             | {"share of the gap closed": _closed(one["closed"][KEYS[0]].get(kind))}
             for kind, tests in one["errors"][KEYS[0]].items()
         ]
         sections.append(report.Section(f"{flow}: {_UNIT}", rows))
     return report.Page(
-        "Does training on recovered flow close the sim-to-real gap?",
+        "Sim-to-real gap: training on recovered flow",
         found,
-        [report.Chart(f"Unseen ({found['held_out']})", _UNIT, tuple(bars))],
+        [report.Chart(f"Out of distribution ({found['held_out']})", _UNIT, tuple(bars))],
         sections,
         (
-            *(f"**Flow by {flow}**: {_verdict(one)}" for flow, one in found["flows"].items()),
-            "I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered "
-            "flow's error, mixed: ideal first, recovered later. Presets of two eyes train on mixed. "
+            *(f"**Flow by {flow}: {_verdict(one)}**" for flow, one in found["flows"].items()),
+            "Gap: error on recovered flow less error on ideal flow, out of distribution, after training on "
+            "ideal flow. I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to the "
+            "recovered flow's error, mixed: ideal first, recovered later (as stereo presets are). "
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
-            f"{found['seeds']} networks a training, errors averaged over them; 95% BCa intervals.",
+            f"networks a training: {found['seeds']}; 95% BCa intervals.",
         ),
     )
 
 
 def _verdict(found: Mapping[str, Any]) -> str:
-    """What the first measure says of one flow."""
+    """Result of the first metric, for one flow estimator."""
     closed, (low, high) = found["closed"][KEYS[0]], found["noise_less_real"][KEYS[0]]
     return (
-        f"training on recovered flow closes {_closed(closed['R'])} of the gap, on fitted noise "
-        f"{_closed(closed['N'])}; noise errs by {low:.3g} to {high:.3g} mN more."
+        f"training on recovered flow closes {_closed(closed['R'])} of the gap, with fitted noise "
+        f"{_closed(closed['N'])}; the error with noise less that with recovered flow is {low:.3g} to "
+        f"{high:.3g} mN."
     )
 
 
@@ -194,16 +199,11 @@ def _closed(found: Mapping[str, Any] | None) -> str | None:
         return None
     if found["undefined"]:
         return "undefined"
-    low, high = found["interval"]
-    return f"{100 * found['share']:.0f}% [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def _text(ends: Sequence[float], mean: float) -> str:
-    return f"{mean:.3g} [{ends[0]:.3g}, {ends[1]:.3g}]"
+    return report.percent([found["share"], *found["interval"]])
 
 
 def _plain(value: Any) -> Any:
-    """None for what is no number: strict readers of JSON refuse it."""
+    """The value with None for NaN, which strict JSON parsers reject."""
     if isinstance(value, dict):
         return {key: _plain(part) for key, part in value.items()}
     if isinstance(value, list | tuple):

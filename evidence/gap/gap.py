@@ -1,4 +1,4 @@
-"""The share of a gap that a training closes, and the noise fitted to an estimator's error."""
+"""Share of a gap closed by a training, and noise fitted to an estimator's error."""
 
 from __future__ import annotations
 
@@ -18,25 +18,22 @@ _RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Gap:
-    """The share of the gap that training on recovered flow closes."""
+    """Share of the gap closed by a training."""
 
-    share: float
-    """G = [e(I to R') - e(R to R')] / [e(I to R') - e(I to I)]; NaN when undefined."""
-    interval: Interval
-    """95%, sequences being resampled in pairs."""
-    undefined: str
-    """Why there is no share; empty when there is one."""
+    share: float  # G = [e(I to R') - e(R to R')] / [e(I to R') - e(I to I)]; NaN when undefined
+    interval: Interval  # 95%, by resampling sequences in pairs
+    undefined: str  # why there is no share; empty if there is one
 
 
 def closed(
     ideal_on_unseen: Curve, trained_on_unseen: Curve, ideal_on_ideal: Curve, rng: np.random.Generator
 ) -> Gap:
-    """The share of the gap closed, from errors by sequence: the same sequences in all three.
+    """Share of the gap closed, from errors on the same sequences, out of distribution.
 
     Args:
-        ideal_on_unseen: (S,) error of the ideally trained network on recovered flow of an unseen family.
-        trained_on_unseen: (S,) the same of the network trained otherwise.
-        ideal_on_ideal: (S,) error of the ideally trained network on those sequences' ideal flow.
+        ideal_on_unseen: (S,) error on recovered flow after training on ideal flow.
+        trained_on_unseen: (S,) the same after the training in question.
+        ideal_on_ideal: (S,) error on ideal flow after training on ideal flow.
         rng: source of the resamples.
     """
     gap = float(ideal_on_unseen.mean() - ideal_on_ideal.mean())
@@ -55,19 +52,17 @@ def closed(
 
 @dataclass(frozen=True)
 class Noise:
-    """Error of recovered displacement, as the simplest model of it: a gain, and smooth Gaussian noise."""
+    """The simplest model of the error of recovered displacement: a gain, and smooth Gaussian noise."""
 
-    gain: float
-    """Recovered over ideal displacement."""
-    sigma_mm: float
-    """Standard deviation of a component."""
+    gain: float  # recovered over ideal displacement
+    sigma_mm: float  # standard deviation of a component
     reach_cells: float
-    """Standard deviation of the Gaussian that gives the noise the error's correlation in space."""
+    """Standard deviation of the Gaussian filter that reproduces the error's spatial correlation."""
 
     def add(
         self, displacement: NDArray[np.float32], mask: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """(T, 2, N, N) mm with noise in all frames but the first, the rest frame."""
+        """Displacement (T, 2, N, N) mm with noise in all frames except the first, the rest frame."""
         out = self.gain * displacement
         for t in range(1, len(out)):
             for axis in range(2):
@@ -81,7 +76,7 @@ def fit_noise(
     recovered: Sequence[NDArray[np.float32]],
     masks: Sequence[NDArray[np.float32]],
 ) -> Noise:
-    """Fits the noise to training sequences: gain by least squares, then spread and reach of what is left.
+    """Noise fitted to training sequences: gain by least squares, then spread and reach of the residual.
 
     Args:
         ideal: each (T, 2, N, N) mm.

@@ -1,4 +1,4 @@
-"""Trainings of the gap experiment and what they are asked: clips in, errors by sequence out."""
+"""Trainings of the gap experiment: clips in, errors by sequence out."""
 
 from __future__ import annotations
 
@@ -22,32 +22,30 @@ from learn.split import Split
 from learn.training.train import train
 from synth.dataset.store import Sequence as Stored
 
-KEYS = ("force_mae", "map_rmse")
-"""Errors by sequence: total force [mN], density [mN/mm²]; the first decides."""
-Tests = Mapping[str, tuple[Sequence[Clip], str]]
-"""By name: the clips asked and the displacement they are asked with."""
+KEYS = ("force_mae", "map_rmse")  # errors by sequence: total force [mN], density [mN/mm²]; the first decides
+Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
 
 
 @dataclass(frozen=True)
 class Training:
     """One network of the experiment."""
 
-    kind: str
-    """I: ideal flow; R: recovered; N: ideal with fitted noise; mixed: both."""
-    flow: str
-    """Back end of the recovered flow it is trained or, for I, only tested on."""
+    kind: str  # I: ideal flow; R: recovered; N: ideal with fitted noise; mixed: both
+    flow: str  # back end of the recovered flow for training and testing; for I only for testing
     seed: int
 
 
 def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path) -> Clip:
-    """The clip with the flow that another back end recovers, as the paper's pipeline would run it.
+    """The clip with the flow recovered by another back end, as in the paper's pipeline.
 
-    Only the instrument is masked, not glare: whoever draws masks by hand draws the tool's.
+    Only the instrument is masked, not highlights, as in masks drawn by hand.
 
     Args:
         sequence: rendered, with `rgb`, `tool` and `tissue`.
         clip: of the sequence on `grid`, with ideal and any recovered flow.
-        work: folder that keeps packed clips.
+        backend: name of the flow estimator.
+        grid: of the clip.
+        work: folder for packed clips.
     """
 
     def make() -> Clip:
@@ -58,7 +56,7 @@ def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path
 
 
 def with_fitted_noise(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> tuple[list[Clip], gap.Noise]:
-    """The clips with recovered flow replaced by ideal flow plus noise fitted on the `fit` ones."""
+    """Clips with recovered flow replaced by ideal flow plus noise, which is fitted on the clips `fit`."""
     chosen = [clips[i] for i in fit]
     noise = gap.fit_noise(
         [np.asarray(c.displacement["ideal"]) for c in chosen],
@@ -68,8 +66,8 @@ def with_fitted_noise(clips: Sequence[Clip], fit: Sequence[int], seed: int) -> t
     made = []
     for k, clip in enumerate(clips):
         rng = np.random.default_rng([seed, k])
-        spoilt = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
-        made.append(replace(clip, displacement={**clip.displacement, "recovered": spoilt}))
+        noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
+        made.append(replace(clip, displacement={**clip.displacement, "recovered": noisy}))
     return made, noise
 
 
@@ -81,17 +79,19 @@ def carry_out(
     tests: Tests,
     work: Path,
 ) -> dict[str, Any]:
-    """The training's errors in every test, from `work` if the same was done before on the same data.
+    """The training's errors in every test, from `work` if it has those of the same training and data.
 
     Args:
-        clips: with ideal and recovered displacement; only fit and select of `split` are looked at.
+        training: to carry out.
+        clips: with ideal and recovered displacement; only fit and select of `split` are used.
+        split: of the clips.
         settings: `input` and `seed` are set by the training.
-        tests: what the network is asked.
-        work: gets results and trained networks; an unfinished one is continued.
+        tests: for the trained network.
+        work: folder for results and networks; an interrupted training is continued.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
     chosen = changed(settings, input=kind, seed=training.seed)
-    # Training on ideal flow is the same whatever flow the test recovers.
+    # Training on ideal flow doesn't depend on the tested flow estimator.
     flow = "" if training.kind == "I" else f"-{training.flow}"
     used = [clips[i].content_hash for i in (*split.fit, *split.select)]
     trained = [training.kind, flow, chosen.model_dump(), len(split.fit), used]
@@ -110,7 +110,7 @@ def carry_out(
         }
         return {"noise": noise and vars(noise), "errors": errors}
 
-    asked = {test: [c.content_hash for c in part] for test, (part, _) in tests.items()}
-    key = cache.key(*trained, training.flow, asked)
+    tested = {test: [c.content_hash for c in part] for test, (part, _) in tests.items()}
+    key = cache.key(*trained, training.flow, tested)
     done: dict[str, Any] = cache.result(work / "runs", name, key, compute)
     return done

@@ -1,7 +1,7 @@
-"""Sequences for learning without a picture: physics and projection only, straight onto the network's grid.
+"""Training sequences without images: physics and projection only, directly on the network's grid.
 
-Whatever asks only for ideal flow needs no light. The motion, camera and label are those of the pipeline
-(same functions, same draws), a core-second a sequence; nothing here can stand in for recovered flow.
+Ideal flow needs no rendering. Motion, camera and label are those of the pipeline (same functions, same random
+numbers), a core-second a sequence. Recovered flow is not available.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evidence import cache as kept
+from evidence import cache as stored
 from learn.data.clips import Clip
 from learn.data.grid import Grid, Resampler, centre, settled
 from synth.geometry.triangles import Shape
@@ -22,8 +22,7 @@ from synth.render.anatomy import rim
 from synth.render.camera import camera
 from synth.sequence import mechanics, scenario
 
-FINE = 128
-"""Cells along the edge of the grid that labels are made on, at least."""
+FINE = 128  # least cells along the edge of the grid on which labels are made
 
 
 def clips(job: Job, grid: Grid, cache: Path) -> list[Clip]:
@@ -42,13 +41,13 @@ def _one(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     def make() -> Clip:
         return coarser(whole(job, index, fine, cache), fine, fine.size // grid.size)
 
-    return kept.clip(cache / f"{key(job, index, fine)}-{grid.size}", make)
+    return stored.clip(cache / f"{key(job, index, fine)}-{grid.size}", make)
 
 
 def whole(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     """One sequence with ideal flow on a grid, cached."""
     name = key(job, index, grid)
-    return kept.clip(cache / name, lambda: clip(job, index, grid, name))
+    return stored.clip(cache / name, lambda: clip(job, index, grid, name))
 
 
 def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
@@ -75,13 +74,13 @@ def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
 
 
 def key(job: Job, index: int, grid: Grid) -> str:
-    """One word for all that labels depend on, the code that makes them too; flow estimators aren't asked."""
+    """Key of everything that labels depend on, including code, and not of flow estimators."""
     parts = job.model_dump(mode="json", include={"seed", "frames", "fps", "anatomy", "fem", "render"})
-    return kept.key(parts, index, grid.size, grid.extent_mm)
+    return stored.key(parts, index, grid.size, grid.extent_mm)
 
 
 def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
-    """One sequence of a job: deformed, projected, put on the grid."""
+    """One sequence of a job: deformed, projected, resampled on the grid."""
     case = scenario.draw_scenario(job, index)
     view = camera.place(case.view, job.render)
     surface, tets = mechanics.build(job, case)
@@ -97,9 +96,9 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     rest = None
     for t in range(job.frames):
         place = truth.at_rest_pixels(still, surface.faces, motion.rest + motion.displacement[t])
-        seen = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
-        rest = seen if rest is None else rest
-        flow = np.where(still.tissue[..., None], seen - rest, 0.0).transpose(2, 0, 1)
+        pixel = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
+        rest = pixel if rest is None else rest
+        flow = np.where(still.tissue[..., None], pixel - rest, 0.0).transpose(2, 0, 1)
         moved[t] = resample.mean(flow * still.scale_mm_per_px, still.tissue) * mask
         load = truth.at_rest_pixels(still, surface.faces, motion.traction[t] @ view.rotation.T)
         amount = load.transpose(2, 0, 1) * still.area

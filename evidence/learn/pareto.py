@@ -1,6 +1,6 @@
-"""What a network costs a frame and what it gets wrong: each preset's beside others on its grid.
+"""Time and error of networks: each preset's and others on the same grid.
 
-Run: python -m evidence.learn.pareto --cache CACHE (an hour on a core); without a cache only times are taken.
+Run: python -m evidence.learn.pareto --cache CACHE (an hour on a core); without a cache only times.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from evidence import report, status
 from evidence.learn import labels
-from evidence.learn.runs import JOB, Run, by_sequence, carry_out, cell, ends, pictured, study
+from evidence.learn.runs import JOB, Run, by_sequence, carry_out, ends, pictured, study
 from learn.data.grid import Grid, Scales, channels
 from learn.evaluation.statistics import interval, paired
 from learn.network.d2fnet import Architecture, D2FNet, fused
@@ -27,20 +27,18 @@ from learn.settings import PRESETS, replace
 from learn.training.threads import set_threads
 from synth.job import reader
 
-BESIDE: Mapping[str, tuple[tuple[int, int, int], ...]] = {
+OTHERS: Mapping[str, tuple[tuple[int, int, int], ...]] = {
     "live": ((16, 4, 3), (8, 4, 4), (12, 4, 4), (16, 4, 4)),
     "cpu": ((16, 2, 4), (16, 4, 4), (16, 4, 3), (8, 2, 4), (8, 4, 4)),
     "tiny": ((16, 2, 3), (8, 2, 3), (16, 4, 2)),
 }
-"""Width, stem and levels of each preset's network and of those beside it that cost about as much or less."""
+"""Width, stem and levels of networks that cost about as much as a preset's or less, and of the preset's."""
 HEAVY: tuple[tuple[int, int, int, int], ...] = (
     (256, 32, 4, 4), (256, 16, 2, 4), (256, 16, 1, 4), (256, 32, 1, 4), (128, 32, 4, 4), (128, 32, 1, 4),
 )  # fmt: skip
-"""Grid, width, stem and levels of networks that are only timed, the published one among them."""
-TURNS = 4
-"""Times that all networks are gone through."""
-LIGHT = 5e9
-"""FLOP a frame up to which a network is timed `repeats` times."""
+"""Grid, width, stem and levels of networks that are only timed, including the published one."""
+ROUNDS = 4  # of timing all networks in turn
+LIGHT = 5e9  # FLOP a frame up to which a network is timed `repeats` times
 
 
 def main(
@@ -52,29 +50,28 @@ def main(
 ) -> None:
     """Errors of networks trained in equal steps, and the time of one frame on one core or a GPU."""
     set_threads(1)
-    shapes = [(PRESETS[name].size, *shape) for name, group in BESIDE.items() for shape in group]
+    shapes = [(PRESETS[name].size, *shape) for name, group in OTHERS.items() for shape in group]
     known = {} if cache is None else errors(cache, seeds)
     rows = measure([*shapes, *HEAVY], repeats, device)
     found = {
         "device": device if device == "cpu" else torch.cuda.get_device_name(),
         "torch": torch.__version__,
         "data": status.data(JOB),
-        "trained": {name: PRESETS[name].loss for name in BESIDE if known},
+        "trained": {name: PRESETS[name].loss for name in OTHERS if known},
         "rows": [row | known.get(key(row), {}) for row in rows],
     }
-    report.save(out, f"pareto-{device}.json", found, page(found))
-    report.show(found)
+    report.publish(out, f"pareto-{device}.json", found, page)
 
 
 def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
-    """Errors of `BESIDE`, trained with their preset's loss and dropout, all else as the study's, fold 0.
+    """Errors of `OTHERS`, trained with their preset's loss and dropout and otherwise as `study`, fold 0.
 
     Returns:
         By grid, width, stem and levels: `map_rmse` [mN/mm²] and `force_mae` [mN], means over sequences with
-        intervals; `against`, the map's error more than the preset's, paired, as a share of that; `seeds`.
+        intervals; `against`, the difference of the map's error from the preset's, relative; `seeds`.
     """
     job, found = reader.load_job(str(JOB)), {}
-    for name, group in BESIDE.items():
+    for name, group in OTHERS.items():
         preset = PRESETS[name]
         clips = labels.clips(pictured(job, preset.size), Grid(preset.size), cache)
         runs: dict[tuple[int, int, int], list[dict[str, Any]]] = {}
@@ -103,14 +100,14 @@ def _run(name: str, shape: tuple[int, int, int], seed: int) -> Run:
 
 
 def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:
-    """What names a network."""
+    """Grid, width, stem and levels of a row's network."""
     return row["size"], row["width"], row["stem"], row["levels"]
 
 
 def preset_of(row: Mapping[str, Any]) -> str:
-    """Presets of one eye whose network it is."""
-    one_eye = {name: one for name, one in PRESETS.items() if not one.arch.depth}
-    return ", ".join(name for name, one in one_eye.items() if key(row) == (one.size, *_shape(one.arch)))
+    """Names of the monocular presets with a row's network."""
+    monocular = {name: one for name, one in PRESETS.items() if not one.arch.depth}
+    return ", ".join(name for name, one in monocular.items() if key(row) == (one.size, *_shape(one.arch)))
 
 
 def _shape(arch: Architecture) -> tuple[int, int, int]:
@@ -120,17 +117,17 @@ def _shape(arch: Architecture) -> tuple[int, int, int]:
 def measure(shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str) -> list[dict[str, Any]]:
     """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
 
-    CPU time on the CPU (other processes take turns, they don't count), wall time on a GPU. Heavy networks are
-    timed at least five times, light ones `repeats` times, all of them in turns: a machine that is faster at
-    one time than at another then is so to all.
+    CPU time on the CPU (without other processes), wall time on a GPU. Heavy networks are timed at least five
+    times, light ones `repeats` times, all of them in turn, so that variations of the machine's speed affect
+    all alike.
     """
     archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]  # type: ignore[arg-type]
     frames = [_frame(arch, size, device) for size, arch in archs]
     costs = [flops(arch, size) for size, arch in archs]
     times: list[list[float]] = [[] for _ in shapes]
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         for frame, cost, own in zip(frames, costs, times, strict=True):
-            own += _timed(frame, -(-(repeats if cost < LIGHT else 5) // TURNS), device)
+            own += _timed(frame, -(-(repeats if cost < LIGHT else 5) // ROUNDS), device)
     return [
         {
             "size": size,
@@ -147,7 +144,7 @@ def measure(shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: s
 
 
 def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
-    """What answers one frame as live use does, made ready."""
+    """A function that processes one frame as in live use, prepared."""
     torch.manual_seed(0)
     model = D2FNet(arch).eval()
     net: Callable[[Tensor], Any] = Quick(model, arch, size) if device == "cpu" else fused(model).to(device)
@@ -163,7 +160,7 @@ def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
 
 
 def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[float]:
-    """Milliseconds of every frame."""
+    """Milliseconds of every frame after three for warm-up."""
     clock = time.process_time if device == "cpu" else time.perf_counter
     for k in range(3 + repeats):
         start = clock()
@@ -200,30 +197,30 @@ def flops(arch: Architecture, size: int) -> float:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Fronts, a grid each, and the table."""
+    """Pareto fronts, one for each grid, and the table."""
     rows = found["rows"]
-    panels = [panel for name in BESIDE if (panel := _panel(rows, name)) is not None]
+    panels = [panel for name in OTHERS if (panel := _panel(rows, name)) is not None]
     table = [
         {"network": f"w{one['width']} stem{one['stem']} depth{one['levels']} {one['size']}²"}
         | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6}
         | {"p50 [ms]": one["ms_p50"]}
-        | {"map RMSE [mN/mm²]": cell(one["map_rmse"]) if "map_rmse" in one else None}
-        | {"more than the preset": cell(one["against"]) if "against" in one else None}
+        | {"map RMSE [mN/mm²]": report.mean_cell(one["map_rmse"]) if "map_rmse" in one else None}
+        | {"difference from the preset": report.mean_cell(one["against"]) if "against" in one else None}
         for one in sorted(rows, key=lambda one: float(one["ms_p50"]))
     ]
     words = (
         "From displacement to the force map, a frame at a time; CPU time of one thread (GPU: wall time).",
-        "In equal steps on the same batches; mean over tested sequences with BCa interval, and the "
-        "difference from the grid's preset as a share of its error. Compare within a grid only: a coarser "
-        "one averages over more of a contact's rim. The published network (32, no stem, 256²) can't be "
-        "trained on a CPU.",
+        "Trained for equal steps on the same batches; mean over tested sequences with BCa interval, and the "
+        "difference from the grid's preset relative to its error. Compare within a grid only: a coarser one "
+        "averages over more of a contact's rim. The published network (32, no stem, 256²) can't be trained "
+        "on a CPU.",
     )
     sections = [report.Section(found["device"], table)]
     return report.Page("Networks: time and error", found, panels, sections, words)
 
 
 def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
-    """Differences from a preset, paired: what sequences have in common would hide them."""
+    """Paired differences from a preset, which are smaller than the spread over sequences."""
     own = [one for one in rows if one["size"] == PRESETS[name].size and "against" in one]
     curves = []
     for stem in sorted({one["stem"] for one in own}):
@@ -238,8 +235,8 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
                 ends=tuple((100 * one["against"][1], 100 * one["against"][2]) for one in part),
             )
         )
-    title = f"Networks on {PRESETS[name].size}² beside the preset {name}"
-    error = "map RMSE, more than the preset's [%]"
+    title = f"Networks on {PRESETS[name].size}² and the preset {name}"
+    error = "map RMSE, difference from the preset's [%]"
     return (
         report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True) if curves else None
     )

@@ -1,4 +1,4 @@
-"""Which loss: networks trained with each on labels-only sequences, over seeds and folds, paired by sequences.
+"""Comparison of losses: networks trained on labels without images, over seeds and folds, paired by sequence.
 
 Run: python -m evidence.learn.runs CACHE (9 trainings of 80 to 100 core-seconds on 300 sequences);
 with --sequences 1500 --folds 3 --seeds 1 each anatomy is tested once (350 core-seconds a training).
@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from evidence import cache as kept
+from evidence import cache as stored
 from evidence import report, status
 from evidence.folds import nested
 from evidence.learn import labels
@@ -44,11 +44,11 @@ SCORES = (
     "low_over_mn",
     "localisation_mm",
 )
-"""Of a tested sequence; `learn.evaluation.metrics` says what they are."""
+"""Metrics of a tested sequence; see `learn.evaluation.metrics`."""
 
 
 def study() -> TrainingSettings:
-    """About a core-minute of training, the same for every choice that is compared."""
+    """Training settings common to all comparisons, about a core-minute."""
     base = preset("tiny", epochs=8, loss="mse")
     return replace(base, arch=replace(base.arch, output="magnitude"))
 
@@ -59,8 +59,7 @@ class Run:
 
     name: str
     settings: TrainingSettings
-    fold: int = 0
-    """Of three."""
+    fold: int = 0  # of three
 
 
 def main(
@@ -71,7 +70,7 @@ def main(
     seeds: int = 3,
     epochs: int = 8,
 ) -> None:
-    """Trains with every loss; `cache` gets packed sequences and networks, and done runs are not made anew."""
+    """Trains with every loss; `cache` gets packed sequences and networks, and completed runs are reused."""
     set_threads(1)
     job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences})
     clips = labels.clips(job, study().grid, cache)
@@ -83,19 +82,19 @@ def main(
                 one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings, fold), clips, cache)
                 runs.setdefault(loss, []).append(one)
     found = {"data": status.data(JOB), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
-    report.save(out, "losses.json", found, page(found))
-    report.show(found)
+    report.publish(out, "losses.json", found, page)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Means over sequences, and differences from squared error."""
     table = [
         {"loss": one["loss"], "runs": one["runs"], "pooled map R²": one["map_r2_pooled"]}
-        | {METRICS[key].column: cell(one[key]) for key in SCORES}
+        | {METRICS[key].column: report.mean_cell(one[key]) for key in SCORES}
         for one in found["rows"]
     ]
     less = [
-        {"loss": one["loss"]} | {METRICS[key].column: cell(one["against_mse"][key]) for key in SCORES}
+        {"loss": one["loss"]}
+        | {METRICS[key].column: report.mean_cell(one["against_mse"][key]) for key in SCORES}
         for one in found["rows"]
         if one["against_mse"]
     ]
@@ -107,14 +106,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Losses", found, (), sections, words)
 
 
-def cell(value: Sequence[float]) -> str:
-    """A mean with its interval."""
-    mean, low, high = value
-    return f"{mean:.3g} [{low:.3g}, {high:.3g}]"
-
-
 def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means of a loss's runs over tested sequences, and the differences from another's of the same seeds."""
+    """Means of a loss's runs over tested sequences, and their differences from those of another loss."""
     pooled = float(np.mean([run["map_r2_pooled"] for run in runs]))
     found: dict[str, Any] = {"loss": name, "runs": len(runs), "map_r2_pooled": pooled, "against_mse": {}}
     for key in SCORES:
@@ -126,12 +119,12 @@ def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str
 
 
 def ends(value: Interval) -> list[float]:
-    """Mean and interval as JSON has them."""
+    """Mean and interval as a list for JSON."""
     return [value.mean, value.low, value.high]
 
 
 def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
-    """A score of every tested sequence, in order of their names; the mean over runs that tested it."""
+    """A score of every tested sequence, sorted by name; means over the runs that tested it."""
     values: dict[str, list[float]] = {}
     for run in runs:
         for one in run["sequences"]:
@@ -142,7 +135,7 @@ def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float
 def carry_out(run: Run, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
     """Scores of a run on its test fold: `sequences`, `map_r2_pooled`, `train_cpu_s`.
 
-    From `cache` if the same was done before on the same data; a training that was stopped goes on.
+    From `cache` if it has those of the same run and data; an interrupted training continues.
     """
 
     def compute() -> dict[str, Any]:
@@ -155,20 +148,20 @@ def carry_out(run: Run, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
         rows = [{"name": c.name} | one for c, one in zip(found.clips, found.per_clip(), strict=True)]
         return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": spent}
 
-    done: dict[str, Any] = kept.result(cache / "runs", run.name, _key(run, clips), compute)
+    done: dict[str, Any] = stored.result(cache / "runs", run.name, _key(run, clips), compute)
     return done
 
 
 def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
-    """The run's network, trained if it isn't in `cache`."""
+    """The run's network, trained unless it is in `cache`."""
     model = cache / "models" / f"{run.name}-{_key(run, clips)}"
     train(clips, _split(run, clips), run.settings, model)
     return load_model(model)
 
 
 def pictured(job: Job, size: int) -> Job:
-    """The job with pictures of at least a pixel a cell of a grid of `size`: else a fine grid learns nothing
-    that a coarse one doesn't have."""
+    """The job with images of at least one pixel a cell of a grid of `size`, so that a fine grid has more
+    information than a coarse one."""
     times = -(-size // job.render.size[0])
     wider = job.render.model_copy(update={"size": tuple(times * edge for edge in job.render.size)})
     return job.model_copy(update={"render": wider})
@@ -179,7 +172,7 @@ def _split(run: Run, clips: Sequence[Clip]) -> Split:
 
 
 def _key(run: Run, clips: Sequence[Clip]) -> str:
-    return kept.key(run.settings.model_dump(), run.fold, [clip.content_hash for clip in clips])
+    return stored.key(run.settings.model_dump(), run.fold, [clip.content_hash for clip in clips])
 
 
 if __name__ == "__main__":

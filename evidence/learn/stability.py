@@ -1,4 +1,4 @@
-"""Where training diverges, and what wrong motion, stiffness and scale cost a trained network.
+"""Divergence of trainings, and errors of a trained network with wrong motion, stiffness and scale.
 
 Run: python -m evidence.learn.stability CACHE
 """
@@ -35,39 +35,36 @@ NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))
 
 
 def main(cache: Path, out: Path = report.RESULTS / "learn/stability", seeds: int = 5) -> None:
-    """Learning rates by losses by seeds, and disturbed inputs."""
+    """Divergence by learning rate and loss, and errors with disturbed inputs."""
     set_threads(1)
     clips = labels.clips(reader.load_job(str(JOB)), study().grid, cache)
     split = nested(clips, 3, 0, 0)
     found = {
         "data": status.data(JOB),
         "rates": rates(clips, cache, seeds),
-        "shown": [row for name in LOSSES[::2] for row in shown(clips, split, name, cache)],
+        "disturbed": [row for name in LOSSES[::2] for row in disturbed(clips, split, name, cache)],
     }
-    report.save(out, "stability.json", found, page(found))
-    report.show(found)
+    report.publish(out, "stability.json", found, page)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """R² of the map that each disturbance leaves."""
-    lines = {f"{row['trained with']}, {row['shown']}": row["map R²"] for row in found["shown"]}
+    """Pooled R² of the map under each disturbance."""
+    lines = {f"{row['trained with']}, {row['input']}": row["map R²"] for row in found["disturbed"]}
     known = {name: value for name, value in lines.items() if value is not None}
-    chart = report.Chart("What a network is shown", "pooled R² of the map", report.bars(known))
-    columns = ("trained with", "shown", "map R²", "force R²", "off contact [mN]")
-    table = [{name: row[name] for name in columns} for row in found["shown"]]
+    chart = report.Chart("Disturbed input", "pooled R² of the map", report.bars(known))
+    columns = ("trained with", "input", "map R²", "force R²", "off-target force [mN]")
+    table = [{name: row[name] for name in columns} for row in found["disturbed"]]
     rates = found["rates"]
     words = (
         f"**{sum(row['diverged'] for row in rates)} of {sum(row['seeds'] for row in rates)} trainings "
         f"diverged** ({len(RATES)} learning rates, {len(LOSSES)} losses). Sequences of "
         "`../data/labels.yaml`, fold 0 of 3, 64² grid.",
     )
-    return report.Page(
-        "Networks: where they break", found, [chart], [report.Section("Disturbed input", table)], words
-    )
+    return report.Page("Networks: limits", found, [chart], [report.Section("Disturbed input", table)], words)
 
 
 def rates(clips: Sequence[Clip], cache: Path, seeds: int) -> list[dict[str, Any]]:
-    """A run diverges where training stops itself, or ends no better than answering with the mean."""
+    """Rows by learning rate and loss; a run diverges if it stops with an error, or ends with R² below 0."""
     rows = []
     base = replace(study(), epochs=2, arch=replace(study().arch, width=8, stem=4, levels=2))
     for rate in RATES:
@@ -87,42 +84,42 @@ def rates(clips: Sequence[Clip], cache: Path, seeds: int) -> list[dict[str, Any]
     return rows
 
 
-def shown(clips: Sequence[Clip], split: Split, name: Loss, cache: Path) -> list[dict[str, Any]]:
-    """The tested sequences with a wrong E, noise on the motion, a wrong scale, no motion."""
+def disturbed(clips: Sequence[Clip], split: Split, name: Loss, cache: Path) -> list[dict[str, Any]]:
+    """Rows of the tested sequences with a wrong E, noise on the motion, a wrong scale, no motion."""
     predictor = fit(Run(f"{name}-fold0-seed0", replace(study(), loss=name)), clips, cache)
     test, rng = [clips[i] for i in split.test], np.random.default_rng(3)
     plain = evaluate(predictor, test, "ideal")
-    rows = {"as it is": numbers(plain)}
+    rows = {"undisturbed": numbers(plain)}
     rows |= {f"E {young}": numbers(plain, young) for young in ("half", "double", "unknown")}
     for sigma, patch in NOISE:
-        asked = [noisy(clip, sigma, patch, predictor.grid, rng) for clip in test]
-        rows[f"noise {sigma:g} mm, blobs {patch:g} mm"] = numbers(evaluate(predictor, asked, "ideal"))
+        changed_clips = [noisy(clip, sigma, patch, predictor.grid, rng) for clip in test]
+        rows[f"noise {sigma:g} mm, blobs {patch:g} mm"] = numbers(evaluate(predictor, changed_clips, "ideal"))
     for factor in (0.8, 1.2):
         found = numbers(evaluate(predictor, [scaled(clip, factor) for clip in test], "ideal"))
-        # The map has moved against its truth: only the total can be compared.
-        rows[f"mm/px ×{factor:g}"] = found | {"map R²": None, "off contact [mN]": None}
-    # R² has no meaning where the truth is nothing.
+        # The map is displaced against the true one: only the total force can be compared.
+        rows[f"mm/px ×{factor:g}"] = found | {"map R²": None, "off-target force [mN]": None}
+    # R² is undefined for a true force of zero.
     nothing = numbers(evaluate(predictor, [still(clip) for clip in test], "ideal"))
-    rows["nothing moves"] = nothing | {"map R²": None, "force R²": None}
-    return [{"trained with": name, "shown": what} | row for what, row in rows.items()]
+    rows["no motion"] = nothing | {"map R²": None, "force R²": None}
+    return [{"trained with": name, "input": what} | row for what, row in rows.items()]
 
 
 def numbers(found: EvaluationReport, young: str = "known") -> dict[str, float | None]:
-    """What a row holds of a report."""
+    """Metrics of a report for a row."""
     one = found.summary(young)
     return {
         "map R²": one["map_r2_pooled"],
         "force R²": one["force_r2_pooled"],
         "force MAE [mN]": one["force_mae"],
-        "off contact [mN]": one["off_target_mn"],
-        "ghost area": one["false_positive_relative"],
+        "off-target force [mN]": one["off_target_mn"],
+        "false positives": one["false_positive_relative"],
     }
 
 
 def noisy(clip: Clip, sigma_mm: float, patch_mm: float, grid: Grid, rng: np.random.Generator) -> Clip:
-    """Gaussian noise on the displacement of every frame but the rest, `sigma_mm` a component.
+    """The clip with Gaussian noise of `sigma_mm` a component on the displacement after the rest frame.
 
-    `patch_mm` is the noise's own scale (standard deviation of the blur that makes it); 0 is cell by cell.
+    `patch_mm` is the noise's spatial scale (standard deviation of its Gaussian filter); 0: independent cells.
     """
     noise = rng.normal(size=clip.displacement["ideal"].shape).astype(np.float32)
     if patch_mm > 0:
@@ -134,7 +131,7 @@ def noisy(clip: Clip, sigma_mm: float, patch_mm: float, grid: Grid, rng: np.rand
 
 
 def scaled(clip: Clip, factor: float) -> Clip:
-    """Seen through a wrong scale: with `factor` times the true mm a pixel all lengths are that much more."""
+    """The clip with a wrong scale: all lengths are multiplied by `factor`."""
     n = clip.mask.shape[0]
     node = (np.arange(n) - (n - 1) / 2) / factor + (n - 1) / 2
     at = np.meshgrid(node, node, indexing="ij")
@@ -149,7 +146,7 @@ def scaled(clip: Clip, factor: float) -> Clip:
 
 
 def still(clip: Clip) -> Clip:
-    """Nothing moves and nothing is loaded."""
+    """The clip without motion and load."""
     nothing = 0 * np.asarray(clip.displacement["ideal"])
     empty = changed(clip, density=0 * np.asarray(clip.density), force=0 * clip.force)
     return changed(empty, displacement={"ideal": nothing})

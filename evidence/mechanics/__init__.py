@@ -1,1 +1,1 @@
-"""What of a living brain's mechanics a force estimator must have been fitted on, and what that costs."""
+"""Mechanical conditions (membrane, pulse, slip) that a force estimator must have been fitted on."""

@@ -1,7 +1,7 @@
-"""The worlds of the mechanics experiment: the same anatomy, contact, load and look, other mechanics.
+"""Conditions of the mechanics experiment: the same anatomy, contact, load and appearance, other mechanics.
 
-Two sequences of one seed and index differ by their world alone: what is drawn for the one is drawn for the
-other, and a number that a world doesn't need is drawn nevertheless (`synth.fem.material`).
+Two sequences of one seed and index differ by their condition alone: they use the same random numbers, of
+which some have no effect in some conditions (`synth.fem.material`).
 """
 
 from __future__ import annotations
@@ -27,23 +27,19 @@ from synth.job import identity
 from synth.job.schema import Job
 from synth.sequence import pipeline
 
-FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000
-"""A second, as a sequence of the default job: a heart beats once or twice in it."""
+FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000  # 1 s, one or two periods of the heart
 
 PLAIN = "plain"
-_UNTOUCHED = 1e-6  # load of a tool that does nothing
+_UNTOUCHED = 1e-6  # load of a tool without effect
 
 
 @dataclass(frozen=True)
-class World:
-    """Mechanics that tissue may have."""
+class Condition:
+    """Mechanical properties of tissue."""
 
-    fem: Mapping[str, Any] = field(default_factory=dict)
-    """What a job says of it, beside what all say."""
-    without: str = ""
-    """The world whose motion is taken off every frame, as a perfect pulse removal would."""
-    mixed: bool = True
-    """Whether it is in the mixture."""
+    fem: Mapping[str, Any] = field(default_factory=dict)  # job keys in addition to the common ones
+    without: str = ""  # the condition whose motion is subtracted, as by a perfect pulse removal
+    mixed: bool = True  # whether it is in the mixture
 
 
 def _membrane(young_kpa: float, thickness_mm: float) -> dict[str, Any]:
@@ -53,28 +49,28 @@ def _membrane(young_kpa: float, thickness_mm: float) -> dict[str, Any]:
 _PULSE = {"heart_mm": [0.1, 0.5], "breath_mm": [0.1, 1.0]}
 _ALIVE = {"pulse": _PULSE, "membrane": {"probability": 1.0}}
 
-WORLDS: dict[str, World] = {
-    PLAIN: World(),
-    "membrane, 5 mN/mm": World({"membrane": _membrane(100.0, 0.05)}),
-    "membrane, 200 mN/mm": World({"membrane": _membrane(1000.0, 0.2)}),
-    "pulse": World({"pulse": _PULSE}),
-    "pulse, taken off": World({"pulse": _PULSE}, without="pulse alone", mixed=False),
-    "Poisson 0.49": World({"poisson": 0.49}),
-    "slip at the skull": World({"skull": "slip"}),
-    "in vivo": World(_ALIVE, mixed=False),
-    "in vivo, taken off": World(_ALIVE, without="in vivo, alone", mixed=False),
+CONDITIONS: dict[str, Condition] = {
+    PLAIN: Condition(),
+    "membrane, 5 mN/mm": Condition({"membrane": _membrane(100.0, 0.05)}),
+    "membrane, 200 mN/mm": Condition({"membrane": _membrane(1000.0, 0.2)}),
+    "pulse": Condition({"pulse": _PULSE}),
+    "pulse, removed": Condition({"pulse": _PULSE}, without="pulse alone", mixed=False),
+    "Poisson 0.49": Condition({"poisson": 0.49}),
+    "slip at the skull": Condition({"skull": "slip"}),
+    "in vivo": Condition(_ALIVE, mixed=False),
+    "in vivo, removed": Condition(_ALIVE, without="in vivo, alone", mixed=False),
 }
-"""All that are asked about. The membranes are the ends of the job's range of thickness times modulus;
-`in vivo` is the job of that name, membrane and pulse together, which the mixture doesn't hold."""
+"""All tested conditions. The membranes are the ends of the job's range of thickness times modulus; `in vivo`
+is membrane and pulse together, as in the job of that name, and not in the mixture."""
 
 _ALONE: dict[str, dict[str, Any]] = {"pulse alone": {"pulse": _PULSE}, "in vivo, alone": _ALIVE}
-MIXTURE = [name for name, world in WORLDS.items() if world.mixed]
+MIXTURE = [name for name, one in CONDITIONS.items() if one.mixed]
 
 
 def job(name: str, seed: int, count: int) -> Job:
-    """The job of a world's sequences; of one that is alone, no tool does anything and none of it is seen."""
+    """The job of a condition's sequences; in conditions of `_ALONE` the tool has no effect."""
     alone = name in _ALONE
-    fem = _ALONE[name] | {"load": _UNTOUCHED} if alone else dict(WORLDS[name].fem)
+    fem = _ALONE[name] | {"load": _UNTOUCHED} if alone else dict(CONDITIONS[name].fem)
     return Job.model_validate(
         {
             "seed": seed,
@@ -82,7 +78,7 @@ def job(name: str, seed: int, count: int) -> Job:
             "frames": FRAMES,
             "fps": FPS,
             "anatomy": {"vertices": VERTICES},
-            # The law that the default job chooses, whatever the load.
+            # The law of the default job, for every load.
             "fem": {"gestures": ["pull", "push"], "law": "neo-hookean", **fem},
             "render": {"size": SIZE, "spp": 1 if alone else 4},
             "flow": {"backend": "ideal" if alone else "tvl1"},
@@ -92,20 +88,18 @@ def job(name: str, seed: int, count: int) -> Job:
 
 @dataclass(frozen=True)
 class Scenes:
-    """Sequences of one seed in every world, packed as they are made."""
+    """Sequences of one seed in every condition, packed as they are made."""
 
     seed: int
     count: int
     work: Path
 
     def make(self, name: str, index: int) -> str:
-        """Renders a sequence that isn't there yet; gives back why it was refused, empty if it was not.
+        """Renders sequence `index` of a condition of `rendered`, if it is missing.
 
-        Args:
-            name: of `rendered`.
-            index: which sequence.
+        Returns the reason why it was refused, empty if it was not.
         """
-        asked, folder = job(name, self.seed, self.count), self._folder(name)
+        folder = self._folder(name)
         packed = folder / f"{index:06d}"
         if _refusal(packed).is_file():
             return _refusal(packed).read_text("utf-8")
@@ -116,7 +110,8 @@ class Scenes:
         for left in (store, store.with_suffix(".zarr.part")):
             shutil.rmtree(left, ignore_errors=True)
         try:
-            pipeline.render_sequence(asked, index, folder, lambda stage, done, of: None)
+            wanted = job(name, self.seed, self.count)
+            pipeline.render_sequence(wanted, index, folder, lambda stage, done, of: None)
         except UserError as refusal:
             write_whole(_refusal(packed), str(refusal), durable=False)
             return str(refusal)
@@ -126,7 +121,7 @@ class Scenes:
         return ""
 
     def clip(self, name: str, index: int) -> Clip | None:
-        """A sequence of a world, with ideal and recovered displacement; None if it was refused.
+        """A sequence of a condition, with ideal and recovered displacement; None if it was refused.
 
         Raises:
             UserError: it was not made.
@@ -135,7 +130,7 @@ class Scenes:
         if any(clip is None for clip in found):
             return None
         clip, *own = (clip for clip in found if clip is not None)
-        return taken_off(clip, own[0]) if own else clip
+        return subtracted(clip, own[0]) if own else clip
 
     def _packed(self, name: str, index: int) -> Clip | None:
         folder = self._folder(name) / f"{index:06d}"
@@ -147,34 +142,34 @@ class Scenes:
 
 
 def rendered(name: str) -> tuple[str, ...]:
-    """The worlds that must be rendered for one: itself, or another and what is taken off it."""
-    world = WORLDS[name]
-    if not world.without:
+    """Conditions to render for one: itself, or another and the one that is subtracted from it."""
+    one = CONDITIONS[name]
+    if not one.without:
         return (name,)
-    whole = next(n for n, other in WORLDS.items() if other.fem == world.fem and not other.without)
-    return whole, world.without
+    whole = next(n for n, other in CONDITIONS.items() if other.fem == one.fem and not other.without)
+    return whole, one.without
 
 
 def _refusal(packed: Path) -> Path:
     return packed.with_suffix(".refused")
 
 
-def taken_off(clip: Clip, own: Clip) -> Clip:
-    """A clip without the motion that the tissue has of its own: `own`'s ideal displacement, of every frame.
+def subtracted(clip: Clip, own: Clip) -> Clip:
+    """A clip less the tissue's own motion, the ideal displacement of `own`, in every frame.
 
-    What a removal of heart and breath would do that knows both exactly; it forgets that a tool's load and a
-    pulse don't simply add in large strains.
+    This is the exact removal of pulse and respiration, except that displacements don't add linearly in large
+    strains.
     """
-    beats = own.displacement["ideal"]
+    pulse = own.displacement["ideal"]
     return replace(
         clip,
         content_hash=f"{clip.content_hash}-{own.content_hash}",
-        displacement={name: moved - beats for name, moved in clip.displacement.items()},
+        displacement={name: moved - pulse for name, moved in clip.displacement.items()},
     )
 
 
 def coarse(clip: Clip) -> Clip:
-    """A clip on half as many cells each way: means over the tissue of four."""
+    """A clip on half as many cells along each axis: means over the tissue of four cells."""
     share = _quarter(np.asarray(clip.mask))
     mask = (share > 0.5).astype(np.float32)
 

@@ -1,8 +1,7 @@
-"""Which of a living brain's mechanics must a force estimator have been fitted on?
+"""Generalisation of a force estimator over the mechanics of living tissue: membrane, pulse, slip.
 
-Ridge is fitted on the plain world and asked for the force in every other, of scenes with anatomies that were
-never fitted; then fitted on the mixture of all and asked again. A world is compared with the plain one on the
-same scenes, so that what differs is the world.
+Ridge is fitted on plain tissue and tested in every other condition, on scenes with other anatomies; then the
+same after fitting on the mixture of all. Each condition is compared with the plain one on the same scenes.
 
 Run: python -m evidence.mechanics.experiment --fit 14 --test 4 --out runs/mechanics
 """
@@ -19,30 +18,29 @@ from joblib import Parallel, delayed
 
 from evidence import report
 from evidence.end_to_end import models
-from evidence.end_to_end.models import RIDGE, Answer
-from evidence.mechanics.conditions import MIXTURE, PLAIN, WORLDS, Scenes, coarse, rendered
+from evidence.end_to_end.models import RIDGE, Estimate
+from evidence.mechanics.conditions import CONDITIONS, MIXTURE, PLAIN, Scenes, coarse, rendered
 from learn.data.clips import Clip
 from learn.evaluation.statistics import Interval, interval, paired
 
 ON_PLAIN, ON_MIXTURE = "plain", "mixture"
 PARTS = {"across": "the force across the line of sight", "whole": "the force"}
-Errors = list[float | None]
-"""Of every sequence [%]; None: it was refused."""
+Errors = list[float | None]  # of every sequence [%]; None: refused
 
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "mechanics",
-    work: Annotated[Path, typer.Option(help="Folder for sequences, to go on from.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder of sequences; a later run continues.")] = Path(
         "runs/mechanics-work"
     ),
-    fit: Annotated[int, typer.Option(min=14, help="Sequences to fit on, of each of the two.")] = 35,
-    test: Annotated[int, typer.Option(min=3, help="Sequences that are asked in every world.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Root of every draw.")] = 41,
+    fit: Annotated[int, typer.Option(min=14, help="Sequences to fit on, plain and mixture each.")] = 35,
+    test: Annotated[int, typer.Option(min=3, help="Sequences to test on, in every condition.")] = 12,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 41,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
 ) -> None:
-    """What a force estimator fitted on plain tissue errs in other mechanics."""
-    fitted, asked = Scenes(seed, fit, work), Scenes(seed + 1, test, work)
-    wanted = [(asked, one, k) for name in WORLDS for one in rendered(name) for k in range(test)]
+    """Error of a force estimator fitted on plain tissue, with other mechanics."""
+    fitted, tested = Scenes(seed, fit, work), Scenes(seed + 1, test, work)
+    wanted = [(tested, one, k) for name in CONDITIONS for one in rendered(name) for k in range(test)]
     wanted += [(fitted, name, k) for k in range(fit) for name in (PLAIN, mixed(k))]
     wanted = list(dict.fromkeys(wanted))
     made = Parallel(workers, verbose=5)(delayed(scenes.make)(name, k) for scenes, name, k in wanted)
@@ -54,41 +52,41 @@ def main(
             for (scenes, name, k), why in zip(wanted, made, strict=True)
             if why
         ),
-        "rows": ask(fitted, asked),
+        "rows": measure(fitted, tested),
     }
-    report.save(out, "results.json", found, page(found))
-    report.show({one.heading: one.rows for one in page(found).sections if one.rows})
+    shown = {one.heading: one.rows for one in page(found).sections if one.rows}
+    report.publish(out, "results.json", found, page, shown)
 
 
 def mixed(index: int) -> str:
-    """The world of a sequence of the mixture: each in turn."""
+    """The condition of a sequence of the mixture: each in turn."""
     return MIXTURE[index % len(MIXTURE)]
 
 
-def ask(fitted: Scenes, asked: Scenes) -> list[dict[str, Any]]:
-    """A row a fit of ridge and world: errors by sequence, as a part of the force [%]."""
-    tests = {name: [asked.clip(name, k) for k in range(asked.count)] for name in WORLDS}
+def measure(fitted: Scenes, tested: Scenes) -> list[dict[str, Any]]:
+    """A row for each fit and condition: errors by sequence, relative to the force [%]."""
+    tests = {name: [tested.clip(name, k) for k in range(tested.count)] for name in CONDITIONS}
     rows = []
     for fit in (ON_PLAIN, ON_MIXTURE):
         clips = [fitted.clip(mixed(k) if fit == ON_MIXTURE else PLAIN, k) for k in range(fitted.count)]
-        answer = build([clip for clip in clips if clip is not None])
+        estimate = build([clip for clip in clips if clip is not None])
         rows += [
-            {"model": RIDGE, "fit": fit, "world": name} | _errors(answer, some)
+            {"model": RIDGE, "fit": fit, "condition": name} | _errors(estimate, some)
             for name, some in tests.items()
         ]
     return rows
 
 
-def build(fit: Sequence[Clip]) -> Answer:
-    """Ridge; it reads cells of twice the size, enough for a linear rule."""
+def build(fit: Sequence[Clip]) -> Estimate:
+    """Ridge on cells of twice the size, which suffice for a linear rule."""
     ridge = models.build(RIDGE, [coarse(clip) for clip in fit])
     return lambda clip: ridge(coarse(clip))
 
 
-def _errors(answer: Answer, clips: Sequence[Clip | None]) -> dict[str, Errors]:
+def _errors(estimate: Estimate, clips: Sequence[Clip | None]) -> dict[str, Errors]:
     found: dict[str, Errors] = {part: [] for part in PARTS}
     for clip in clips:
-        off = None if clip is None else models.errors([answer(clip)], [clip.force])
+        off = None if clip is None else models.errors([estimate(clip)], [clip.force])
         for part, values in found.items():
             name = "errors" if part == "whole" else part
             values.append(None if off is None else round(100 * off[name][0], 1))
@@ -96,52 +94,51 @@ def _errors(answer: Answer, clips: Sequence[Clip | None]) -> dict[str, Errors]:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """What each world costs ridge that never met it, and ridge fitted on the mixture."""
-    rows = {(row["model"], row["fit"], row["world"]): row for row in found["rows"]}
+    """Errors of ridge fitted on plain tissue and fitted on the mixture, in each condition."""
+    rows = {(row["model"], row["fit"], row["condition"]): row for row in found["rows"]}
     bars, sections, hurt = [], [], []
     for part, what in PARTS.items():
         plain, table = rows[RIDGE, ON_PLAIN, PLAIN][part], []
-        for world in WORLDS:
-            own, mixture = (rows[RIDGE, on, world][part] for on in (ON_PLAIN, ON_MIXTURE))
+        for name in CONDITIONS:
+            own, mixture = (rows[RIDGE, on, name][part] for on in (ON_PLAIN, ON_MIXTURE))
             table.append(
                 {
-                    "world": world,
-                    "fitted on plain [%]": _cell(_mean(own)),
-                    "more than in plain": None if world == PLAIN else _cell(_more(plain, own), "+"),
-                    "mixture less plain": _cell(_more(own, mixture), "+"),
+                    "condition": name,
+                    "fitted on plain [%]": _cell(interval(_array(own), np.random.default_rng(0))),
+                    "difference from plain": None if name == PLAIN else _cell(_more(plain, own), "+"),
+                    "fitted on mixture, difference": _cell(_more(own, mixture), "+"),
                 }
             )
             for group, values in enumerate((own, mixture) if part == "across" else ()):
                 more, on = _more(plain, values), ("plain", "the mixture")[group]
-                bars.append(report.Row(f"{world}, fitted on {on}", more.mean, (more.low, more.high), group))
+                bars.append(report.Row(f"{name}, fitted on {on}", more.mean, (more.low, more.high), group))
                 if more.low > 0 and group == 0:
-                    hurt.append(f"{world} ({more.mean:+.0f} points)")
+                    hurt.append(f"{name} ({more.mean:+.0f} points)")
         sections.append(report.Section(f"Error of {what}", table))
     refused = [f"- {line}" for line in found["refused"]]
     return report.Page(
-        "Which mechanics must a force estimator have seen?",
+        "Mechanics: generalisation of a force estimator",
         found,
-        [report.Chart("Error across the line of sight", "more than in plain [% of the force]", tuple(bars))],
+        [
+            report.Chart(
+                "Error across the line of sight", "difference from plain [% of the force]", tuple(bars)
+            )
+        ],
         [*sections, *([report.Section("Refused", words=refused)] if refused else [])],
         (
-            "**Fitted on plain tissue, a reader errs more across the line of sight with "
-            f"{'; '.join(hurt) or 'none'}.**",
-            "A sequence of every world shows the same anatomy, contact, load and look as the plain one of "
-            "its number, with other mechanics. Error of ridge on recovered flow: root mean square over "
-            "frames as a part of the force's own, mean over sequences; differences are paired, intervals "
-            "BCa over sequences. *Taken off*: the tissue's own motion is subtracted as it was, which no "
-            "removal does better. Default jobs are plain; `mission` mixes membrane, slip and ν.",
+            "**After fitting on plain tissue the error across the line of sight is larger with "
+            f"{'; '.join(hurt) or 'none of the conditions'}.**",
+            "Conditions differ in mechanics alone: anatomy, contact, load and appearance are the same. Error "
+            "of ridge on recovered flow: root mean square relative to that of the force, mean over "
+            "sequences; differences are paired, intervals BCa. *Removed*: the tissue's own motion is "
+            "subtracted exactly. Default jobs are plain; `mission` mixes membrane, slip and ν.",
         ),
     )
 
 
 def _array(values: Errors) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """NaN for a sequence that was refused."""
+    """Errors as an array, NaN for a refused sequence."""
     return np.array([np.nan if value is None else value for value in values])
-
-
-def _mean(values: Errors) -> Interval:
-    return interval(_array(values), np.random.default_rng(0))
 
 
 def _more(usual: Errors, other: Errors) -> Interval:
@@ -149,8 +146,7 @@ def _more(usual: Errors, other: Errors) -> Interval:
 
 
 def _cell(one: Interval, sign: str = "") -> str:
-    mean, low, high = (f"{value:{sign}.0f}" for value in (one.mean, one.low, one.high))
-    return mean if np.isnan(one.low) else f"{mean} [{low}, {high}]"
+    return report.mean_cell([one.mean, one.low, one.high], f"{sign}.0f")
 
 
 if __name__ == "__main__":

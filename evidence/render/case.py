@@ -1,4 +1,4 @@
-"""One drawn sequence for measuring the renderer alone: its renderer and a plain pull, without the physics."""
+"""A sequence for measurements of the renderer alone: its renderer and a plain pull, without the physics."""
 
 from __future__ import annotations
 
@@ -17,37 +17,33 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Case:
-    """A renderer and how its surface and instrument move."""
+    """A renderer and the motion of its surface and instrument."""
 
     renderer: Renderer
-    vertices: Floats
-    """(V, 3) mm at rest."""
-    tips: Floats
-    """(2, 3) mm."""
-    shafts: Floats
-    """(2, 3)."""
-    centre: Floats
-    """(2,) mm: where the tissue is held."""
+    vertices: Floats  # (V, 3) mm at rest
+    tips: Floats  # (2, 3) mm
+    shafts: Floats  # (2, 3)
+    centre: Floats  # (2,) mm: where the tissue is held
 
     def moved(self, lift_mm: float) -> Floats:
-        """The surface pulled up by a Gaussian of 3 mm width, with a third of that sideways."""
+        """The surface pulled up by a Gaussian of 3 mm width, and laterally by a third of that."""
         r2 = ((self.vertices[:, :2] - self.centre) ** 2).sum(axis=1)
         pull = lift_mm * np.exp(-r2 / 18.0)
         return np.asarray(self.vertices + pull[:, None] * np.array([0.3, 0.15, 1.0]))
 
     def held(self, lift_mm: float) -> Floats:
-        """The tips, moving with the tissue they hold."""
+        """The tips, which move with the tissue."""
         return self.tips + lift_mm * np.array([0.3, 0.15, 1.0])
 
     def state(self, lift_mm: float = 0.0) -> SceneState:
-        """Both."""
+        """Surface and instrument, pulled up by `lift_mm`."""
         return SceneState(self.moved(lift_mm), self.held(lift_mm), self.shafts)
 
 
 def case(job: Job, index: int) -> Case:
-    """Sequence `index` of a job, its load replaced by a plain pull at the gesture's own point."""
+    """Sequence `index` of a job with a plain pull as its load."""
     scene = at_rest(job, index, ["pull"])
-    surface = replace(scene.surface, uv=scene.surface.uv.copy())  # `stability` writes into it
+    surface = replace(scene.surface, uv=scene.surface.uv.copy())  # `stability` modifies it
     scene = replace(scene, surface=surface)
     rng = np.random.default_rng([job.seed, index])
     centre = rng.uniform(-4, 4, 2)

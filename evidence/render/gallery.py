@@ -1,4 +1,4 @@
-"""The gallery: families, instruments, lights, cameras and scenery side by side.
+"""Images of the gallery: families, instruments, lights, cameras and scenery side by side.
 
 Run: python -m evidence.render.gallery
 """
@@ -56,12 +56,12 @@ _CAPTION_PX = 15
 
 
 def main(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, quality: int = 46) -> None:
-    """Draws families x instruments and lights x cameras as the pictures of docs/gallery.md.
+    """Draws families x instruments and lights x cameras as the images of docs/gallery.md.
 
     `width`: of a tile [px]; `quality`: of WebP.
     """
     size = (width, width * 3 // 4)
-    looks = [
+    families = [
         [_tile({"appearance": {"families": (family,)}}, kind, size, seed + row, f"{family}, {kind}")
          for kind in get_args(Kind)]
         for row, family in enumerate(get_args(Family))
@@ -77,13 +77,13 @@ def main(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, 
         _tile({"render": {"scenery": (part,)}}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
     ]
     out.mkdir(parents=True, exist_ok=True)
-    for name, rows in (("gallery-looks", looks), ("gallery-views", [*views, around])):
+    for name, rows in (("gallery-appearances", families), ("gallery-views", [*views, around])):
         picture = np.vstack([np.hstack(row) for row in rows])
         cv2.imwrite(str(out / f"{name}.webp"), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
 def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Picture:
-    """One frame before its load, under its caption."""
+    """One frame before its load, below its caption."""
     job = Job.model_validate(
         _merged(
             {
@@ -109,13 +109,13 @@ def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, capt
 
 
 def _seed_of(kind: Kind, gesture: str) -> int:
-    """The first seed of a rim whose hand takes that instrument for a gesture."""
+    """The first rim seed for which a gesture uses that instrument."""
     taken = (instrument.choose([gesture], np.random.default_rng([seed, 2])) for seed in itertools.count())
     return next(seed for seed, kinds in enumerate(taken) if kinds == (kind,))
 
 
 def _merged(*parts: Settings) -> Settings:
-    """Sections of a job, later ones over earlier ones."""
+    """Merged sections of a job; later ones override earlier ones."""
     whole: Settings = {}
     for name, value in itertools.chain.from_iterable(part.items() for part in parts):
         whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value

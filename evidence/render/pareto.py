@@ -1,5 +1,4 @@
-"""Noise and recovered flow against cost, over light paths, integrator, vertices and size; what a
-whole frame takes.
+"""Noise and error of recovered flow against cost, by light paths, integrator, vertices and size.
 
 Run: python -m evidence.render.pareto
 """
@@ -45,8 +44,8 @@ def main(
 ) -> None:
     """Flow error and noise of rendered frames against the CPU time that they took.
 
-    `spp`: light paths a pixel; `width`: of the picture, 4:3; `vertices`: of the surface, beside as many as
-    that size has by default; `frames`: that a whole frame's time is of.
+    `spp`: light paths a pixel; `width`: of the image, 4:3; `vertices`: of the surface, in addition to the
+    default of that size; `frames`: over which the time of a whole frame is measured.
     """
     rows: list[dict[str, Any]] = []
     for wide in (int(part) for part in width.split(",")):
@@ -65,15 +64,14 @@ def main(
             rows.append(row | measure(other, *_DEFAULT[:2]))
     cost = frame_cost(case(Job(seed=seed), 0), frames)
     found = {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
-    report.save(out, "pareto.json", found, page(found))
-    report.show(found)
+    report.publish(out, "pareto.json", found, page)
 
 
 def measure(ours: Case, spp: int, kind: str) -> dict[str, float]:
-    """Seconds of CPU a picture, its noise, and what DIS flow makes of a pull of 1.5 mm.
+    """CPU seconds an image, its noise, and the error of DIS flow for a pull of 1.5 mm.
 
-    Noise is that of two pictures over tissue (`noises`). Flow error is against the truth, over
-    visible tissue away from the instrument.
+    Noise is measured on two images of the tissue (`noises`), flow error over visible tissue away from the
+    instrument.
     """
     renderer = ours.renderer
     stage = renderer.stage(ours.state(), spp=spp, integrator=kind)
@@ -102,9 +100,8 @@ def measure(ours: Case, spp: int, kind: str) -> dict[str, float]:
 
 
 def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_], white: float = 1.0) -> dict[str, float]:
-    """Root mean square of a picture's noise over a mask, as a share of the mean: of all its light, where
-    mirrored lamps weigh most, and of what a camera keeps of it, whose full scale is a white surface's light.
-    """
+    """Root mean square noise of an image over a mask, relative to the mean: of its radiance, where reflected
+    lamps dominate, and after clipping at the radiance of a white surface, as in a camera."""
     kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, white), np.minimum(two, white))}
     return {
         kind: float(np.sqrt(((a - b)[inside] ** 2).mean() / 2) / a[inside].mean())
@@ -113,7 +110,7 @@ def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_], white: float = 1.0
 
 
 def frame_cost(ours: Case, frames: int) -> dict[str, float]:
-    """CPU-seconds of a frame: update, picture, sensor and truth; the first one is warm-up."""
+    """CPU-seconds of a frame: update, image, sensor and ground truth; the first one is warm-up."""
     spent = []
     for k in range(frames + 1):
         start = time.process_time()
@@ -128,7 +125,7 @@ def _curve_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """What flow makes of the pictures, and their noise, against time."""
+    """Flow error and noise against time."""
     panels = []
     for key, unit in (
         ("flow_median_px", "flow error, median [px]"),

@@ -1,4 +1,4 @@
-"""Statistics of a picture of cortex that tell a rendering from a photograph, and that move optical flow."""
+"""Statistics of an image of cortex that distinguish a rendering from a photograph and affect optical flow."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.stats import wasserstein_distance
 
 Picture = npt.NDArray[np.uint8]
 
-# What a highlight is: this much lighter than what lies around it, and nearly white.
+# A highlight is lighter than its surroundings by this much, and nearly white.
 _BRIGHTER_L = 12.0
 _WHITE_L = 88.0
 
 
 def statistics(rgb: Picture) -> dict[str, float]:
-    """Figures of one crop (N, N, 3) sRGB.
+    """Statistics of one crop (N, N, 3) sRGB.
 
     Lab means and standard deviations (CIE 1976, D65), the slope of the radial power spectrum of L from 1/64
     to 1/4 cycles a pixel (natural scenes: about -2; D. J. Field 1987), the kurtosis of its horizontal and
@@ -36,7 +36,7 @@ def statistics(rgb: Picture) -> dict[str, float]:
 
 
 def distances(rgb: Picture, pooled: Picture) -> dict[str, float]:
-    """How far a crop's Lab histograms are from those of pixels (M, 3): earth mover's distance, in Lab."""
+    """Earth mover's distance, in Lab, of a crop's histograms from those of pixels (M, 3)."""
     found = {}
     for k, name in enumerate("Lab"):
         ours, theirs = (_lab(picture)[..., k].ravel() for picture in (rgb[::2, ::2], pooled[None]))
@@ -45,7 +45,7 @@ def distances(rgb: Picture, pooled: Picture) -> dict[str, float]:
 
 
 def pool(crops: list[Picture], count: int = 4000) -> Picture:
-    """Pixels (count, 3) spread evenly over crops."""
+    """Pixels (count, 3) at equal distances over crops."""
     pixels = np.concatenate([crop.reshape(-1, 3) for crop in crops])
     return pixels[np.linspace(0, len(pixels) - 1, count).astype(np.int64)]
 
@@ -60,12 +60,12 @@ def spread(crops: list[Picture], pooled: Picture) -> dict[str, tuple[float, floa
 
 
 def tiles(rgb: Picture, inside: npt.NDArray[np.bool_], side: int, step: int) -> list[Picture]:
-    """Square crops of `side` px that lie wholly inside a mask, every `step` px."""
+    """Square crops of `side` px wholly inside a mask, every `step` px."""
     return [rgb[y : y + side, x : x + side] for x, y in corners(inside, side, step)]
 
 
 def corners(inside: npt.NDArray[np.bool_], side: int, step: int) -> list[tuple[int, int]]:
-    """Where such crops begin, x and y."""
+    """Upper left corners (x, y) of the crops of `tiles`."""
     summed = cv2.integral(inside.astype(np.uint8))
     covered = summed[side:, side:] - summed[:-side, side:] - summed[side:, :-side] + summed[:-side, :-side]
     return [(int(x * step), int(y * step)) for y, x in np.argwhere(covered[::step, ::step] == side * side)]
@@ -106,11 +106,11 @@ def _highlights(light: npt.NDArray[np.float32]) -> dict[str, float]:
 
 
 def _elongation(label: npt.NDArray[np.int32], chosen: npt.NDArray[np.int64]) -> float:
-    """Median ratio of the axes of the ellipses that have the second moments of some labels' pixels."""
+    """Median ratio of axes of the ellipses with the second moments of the chosen labels' pixels."""
     found = [1.0]
     for k in chosen:
         away = np.argwhere(label == k).astype(float)
-        # A pixel is a square, not a point.
+        # The second moment of a square pixel is 1/12.
         spread = np.linalg.eigvalsh(np.cov(away.T, bias=True) + np.eye(2) / 12)
         found.append(float(np.sqrt(spread[1] / spread[0])))
     return float(np.median(found[1:] or found))

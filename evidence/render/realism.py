@@ -1,4 +1,4 @@
-"""How far a rendering is from a photograph, in figures; the photograph itself stays where it is.
+"""Image statistics of renderings against a photograph, which is not stored.
 
 Run: python -m evidence.render.realism cortex.jpg
 """
@@ -25,7 +25,7 @@ OUTLINE = (
     "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
     " 0.37,0.86 0.28,0.76"
 )
-"""Of the cortex in the photograph that the figures here are of."""
+"""Of the cortex in the photograph of the stored results."""
 
 
 def main(
@@ -39,8 +39,8 @@ def main(
 ) -> None:
     """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph.
 
-    `outline`: polygon of the cortex in it, as shares "x,y x,y ..."; `width_mm`: what its width spans in the
-    field; `frames`: one of each rendered sequence.
+    `outline`: polygon of the cortex in it, as shares "x,y x,y ..."; `width_mm`: width of the photograph in
+    the field; `frames`: number of rendered sequences, one frame each.
     """
     crops, pixel = _rendered(frames, family, seed)
     photograph = scaled_photograph(photo, width_mm / pixel)
@@ -66,8 +66,7 @@ def main(
         "mm_per_px": pixel,
         "statistics": rows,
     }
-    report.save(out, "realism.json", found, page(found))
-    report.show(found)
+    report.publish(out, "realism.json", found, page)
 
 
 def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float]:
@@ -84,7 +83,7 @@ def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float
 
 
 def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Pixels (H, W) inside a polygon given as shares of the picture, "x,y x,y ..."."""
+    """Pixels (H, W) inside a polygon in shares of the image, "x,y x,y ..."."""
     corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
     inside = np.zeros(shape, np.uint8)
     cv2.fillPoly(inside, [np.rint(corners * np.array(shape[::-1])).astype(np.int32)], 1)
@@ -95,23 +94,25 @@ def scaled_photograph(photo: Path, width_px: float) -> Picture:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:
-        raise UserError(f"{photo}: not a picture that can be read")
+        raise UserError(f"{photo}: not an image that can be read")
     scale = width_px / image.shape[1]
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(small[..., ::-1])
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Statistics of renders in units of the photograph's spread."""
+    """Statistics of renderings in units of the photograph's spread."""
     rows = []
     for one in found["statistics"]:
         (low, middle, high), rendered = one["photograph"], one["rendered"]
         a, b, c = ((value - middle) / max(high - low, 1e-12) for value in rendered)
         rows.append(report.Row(one["statistic"], b, (a, c)))
-    unit = "quantiles of renders less the photograph's median, over its own spread"
-    chart = report.Chart("Within half a unit or so: as the photograph's own crops differ", unit, tuple(rows))
-    sections = [report.Section("Statistics", found["statistics"])]
-    return report.Page("Against a photograph", found, [chart], sections)
+    unit = "quantiles of renderings less the photograph's median, over its spread"
+    chart = report.Chart("Within half a unit: as crops of the photograph differ", unit, tuple(rows))
+    within = sum(one["median_within_spread"] for one in found["statistics"])
+    words = [f"**The medians of {within} of {len(rows)} statistics lie within the photograph's spread.**"]
+    sections = [report.Section("", found["statistics"])]
+    return report.Page("Renderings against a photograph", found, [chart], sections, words)
 
 
 if __name__ == "__main__":

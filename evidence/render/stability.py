@@ -1,11 +1,11 @@
-"""Where the renderer breaks: every case must give a correct frame or a clear error, never a wrong label.
+"""Limits of the renderer: every case must yield a correct frame or a clear error, never a wrong label.
 
 Run: python -m evidence.render.stability
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +34,20 @@ def main(out: Path = report.RESULTS / "render/stability", seed: int = 11) -> Non
             row = {"outcome": "clear error", "error": str(error)}
         rows.append({"case": name, "passed": row.get("worst_px", 0.0) < 1e-2, **row})
     found = {"seed": seed, "cases": rows}
-    title = "Rendering: a correct frame or a clear error"
-    report.save(out, "stability.json", found, report.Page(title, found, (), [report.Section("Cases", rows)]))
-    report.show(found)
+    report.publish(out, "stability.json", found, page)
     if not all(row["passed"] for row in rows):
         raise typer.Exit(1)
 
 
+def page(found: Mapping[str, Any]) -> report.Page:
+    """A table of all cases."""
+    rows = found["cases"]
+    words = [f"**{sum(row['passed'] for row in rows)} of {len(rows)} cases passed.**"]
+    return report.Page("Rendering: limits", found, (), [report.Section("", rows)], words)
+
+
 def checked(ours: Case, changes: Changes) -> dict[str, Any]:
-    """Renders one frame and holds its labels against OpenCV's projection of the same material points."""
+    """Error of a frame's flow against OpenCV's projection of the same material points, and visibility."""
     posed = {"vertices": ours.moved(2.0), "tips": ours.held(2.0), "shafts": ours.shafts} | changes
     rest, lens = ours.renderer.rest, ours.renderer.camera
     shot = ours.renderer.render(SceneState(posed["vertices"], posed["tips"], posed["shafts"]), seed=3)
@@ -63,13 +68,13 @@ def checked(ours: Case, changes: Changes) -> dict[str, Any]:
 
 
 def _steep(ours: Case) -> Changes:
-    """A wall steeper than the line of sight: the surface folds over itself in the picture."""
+    """A wall steeper than the line of sight: the surface folds over itself in the image."""
     wall = np.where(np.abs(ours.vertices[:, 0]) < 2, 6.0, 0.0)
     return {"vertices": ours.vertices + wall[:, None] * np.array([0.0, 0.0, 1.0])}
 
 
 def _degenerate(ours: Case) -> Changes:
-    """Faces of no area, and all vertices in one place of the maps."""
+    """Faces of zero area, and all vertices at one place of the texture."""
     ours.renderer.surface.uv[:] = 0.5
     vertices = ours.vertices.copy()
     vertices[5000:5400] = vertices[5000]
@@ -77,7 +82,7 @@ def _degenerate(ours: Case) -> Changes:
 
 
 def _filled_view(ours: Case) -> Changes:
-    """An instrument right before the lens."""
+    """An instrument directly in front of the lens."""
     towards = ours.renderer.camera.centre / np.linalg.norm(ours.renderer.camera.centre)
     close = 240 * towards + np.array([[0.5, 0, 0], [-0.5, 0, 0]])
     return {"tips": close, "shafts": np.array([[1.0, 0, 0.05], [-1.0, 0, 0.05]])}

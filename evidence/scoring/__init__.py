@@ -1,1 +1,1 @@
-"""Scoring measured: pseudo ex vivo recordings, cost, physics alone."""
+"""Scoring measured: ex vivo stand-ins, cost, fusion, pulse removal, degraded recordings."""

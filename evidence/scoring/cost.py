@@ -1,4 +1,4 @@
-"""What scoring costs: a minute of video made for it, the command's time and memory.
+"""Time and memory of `bench score` on a synthetic recording of a minute.
 
 Run: python -m evidence.scoring.cost MODEL
 """
@@ -54,12 +54,11 @@ def main(
         "wall_s": wall,
         "timings": scored["timings"],
     }
-    report.save(out, "results.json", found, page(found))
-    report.show(found)
+    report.publish(out, "results.json", found, page)
 
 
 def record(folder: Path, seconds: float) -> None:
-    """Writes a recording: a texture that a bump moves to and fro, without masks, force in proportion."""
+    """Writes a recording of a texture moved by a bump, without masks, with a proportional force."""
     folder.mkdir(parents=True)
     times = np.arange(round(seconds * _FPS)) / _FPS
     rest = texture(_SIZE[1], _SIZE[0], np.random.default_rng(0))
@@ -74,12 +73,12 @@ def record(folder: Path, seconds: float) -> None:
 
 
 def _motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels at the bump's middle: a press a period, the first half second still."""
+    """Displacement of the bump's centre [px]: one press a period after half a second at rest."""
     return _PEAK_PX * np.clip(np.sin(2 * np.pi * (time_s - 0.5) / _PERIOD_S), 0, None) * (time_s > 0.5)
 
 
 def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
-    """Band-passed noise in tissue's colours, (H, W, 3) uint8."""
+    """Band-pass filtered noise in the colours of tissue, (H, W, 3) uint8."""
     noise = rng.normal(size=(height, width)).astype(np.float32)
     fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
     grey = 110 + 45 * fine / fine.std()
@@ -88,7 +87,7 @@ def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
 
 
 def pushed(rest: Rgb, peak_px: float) -> Rgb:
-    """The texture (H, W, 3) moved right by a bump of `peak_px` in the middle."""
+    """The texture (H, W, 3) moved to the right by a bump of `peak_px` at the centre."""
     height, width = rest.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     bump = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / (2 * (0.18 * height) ** 2))
@@ -97,22 +96,22 @@ def pushed(rest: Rgb, peak_px: float) -> Rgb:
 
 
 def page(tree: Mapping[str, Any]) -> report.Page:
-    """Time by stage, and the whole."""
+    """Time by stage and in total."""
     stages = {name: spent for name, spent in tree["timings"].items() if isinstance(spent, Mapping)}
     memory = sum(value for name, value in tree["timings"].items() if name.endswith("peak_rss_mb"))
     bars = report.bars({name: spent["wall_s"] for name, spent in stages.items()})
     width, height = tree["size"]
     return report.Page(
-        "What does scoring cost?",
+        "Scoring: time and memory",
         tree,
-        [report.Chart("By stage, two processes side by side", "wall time [s]", bars)],
+        [report.Chart("By stage, in two parallel processes", "wall time [s]", bars)],
         (report.Section("", [{"stage": name} | dict(spent) for name, spent in stages.items()]),),
         (
             f"**{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the recording's length, "
-            f"and {memory / 1000:.1f} GB** in two processes: a recording of {tree['seconds']:g} s, "
-            f"{width} x {height} at {tree['fps']:g} a second, no masks; {tree['frames']} frames looked at, "
-            "flow on pictures of at least 320 columns. At most twice the length and 2 GB were asked.",
-            "What it says: [network and physics together](together/README.md), [spoilt films]"
+            f"and {memory / 1000:.1f} GB** in two processes (targets: twice the length, 2 GB). Recording: "
+            f"{tree['seconds']:g} s, {width} x {height} at {tree['fps']:g} a second, without masks; "
+            f"{tree['frames']} frames processed, flow on images of at least 320 columns.",
+            "Accuracy: [fusion of network and physics](fusion/README.md), [degraded recordings]"
             "(stability/README.md).",
         ),
     )

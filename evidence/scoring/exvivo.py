@@ -1,8 +1,8 @@
-"""Pseudo ex vivo recordings: rendered, but unlike any training data in every respect at once.
+"""Ex vivo stand-ins: rendered recordings that differ from all training data in every respect.
 
-Another law in time (tissue creeps under load), another appearance family, lens, field and tilt, a compressed
-video, a hand that trembles, several presses at several places, and a sensor with its own axes, clock, zero,
-drift and noise. Written in the layout of a real recording, so that the same code scores both.
+They have creep under load, another appearance family, lens, field and tilt, a compressed video, hand tremor,
+presses at several places, and a sensor with its own axes, clock, zero, drift and noise. The layout is that of
+a real recording.
 
 Run: python -m evidence.scoring.exvivo --out recordings --count 2 --seconds 10
 """
@@ -43,8 +43,7 @@ _STILL_S = 1.5
 _STEREO_MM, _PAIR = 24.0, "pair.yaml"
 _SYNC_S = 9.0
 _PRESS_S = 13.0
-# Creep: the part of the response that comes late, and how late [s].
-_LATE, _LATE_S = 0.2, 0.8
+_LATE, _LATE_S = 0.2, 0.8  # creep: delayed share of the response, and its time constant [s]
 
 
 def main(
@@ -52,14 +51,14 @@ def main(
     count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
     seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
     fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
-    width: Annotated[int, typer.Option(min=64, help="Width of the picture; the height is 3/4 of it.")] = 320,
+    width: Annotated[int, typer.Option(min=64, help="Width of the image; the height is 3/4 of it.")] = 320,
     photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
-    seed: Annotated[int, typer.Option(help="Root of all draws.")] = 100,
-    eyes: Annotated[int, typer.Option(min=1, max=2, help="Cameras that look on.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 100,
+    cameras: Annotated[int, typer.Option(min=1, max=2, help="1: monocular, 2: stereo.")] = 1,
 ) -> None:
-    """Renders pseudo ex vivo recordings, unlike any training data in every respect at once."""
+    """Renders ex vivo stand-ins, which differ from all training data in every respect."""
     texture = photo.resolve() if photo else None
-    plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, eyes=eyes)
+    plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, cameras)
     for index in range(count):
         folder = out / f"{index:03d}"
         if not folder.exists():
@@ -76,29 +75,23 @@ class Plan:
     seconds: float = 30.0
     fps: float = 10.0
     size: tuple[int, int] = (320, 240)
-    photo: Path | None = None
-    """A photograph as texture; else procedural, of the family no other default job draws."""
-    eyes: int = 1
+    photo: Path | None = None  # texture of the surface; None: procedural
+    cameras: int = 1
 
 
 @dataclass(frozen=True)
 class _Course:
-    """What the hand does, on a fine clock."""
+    """Motion of the hand, at the sensor's rate."""
 
-    time_s: Floats
-    """(N,) at the sensor's rate."""
-    level: Floats
-    """(N,) force over its peak."""
-    strain: Floats
-    """(N,) the elastic level that gives the same displacement: what creep makes of `level`."""
-    gesture: NDArray[np.int64]
-    """(N,) which gesture is under way."""
-    away: Floats
-    """(N,) distance of the tips from the tissue over the hover height."""
+    time_s: Floats  # (N,)
+    level: Floats  # (N,) force relative to its peak
+    strain: Floats  # (N,) elastic level of the same displacement: `level` after creep
+    gesture: NDArray[np.int64]  # (N,) index of the gesture
+    away: Floats  # (N,) distance of the tips from the tissue, relative to the hover height
 
 
 def job_of(plan: Plan) -> jobs.Job:
-    """The unusual job behind the recordings."""
+    """The job of the recordings, with unusual settings."""
     return jobs.Job.model_validate(
         {
             "seed": plan.seed,
@@ -117,7 +110,7 @@ def job_of(plan: Plan) -> jobs.Job:
                 "size": plan.size, "spp": 4, "field_mm": [30.0, 40.0], "tilt_deg": [5.0, 25.0],
                 "working_distance_mm": [220.0, 380.0], "aperture_mm": 6.0,
                 "distortion": [-0.12, 0.03, 0.001, -0.001, 0.0],
-                "stereo_mm": _STEREO_MM if plan.eyes == 2 else 0.0,
+                "stereo_mm": _STEREO_MM if plan.cameras == 2 else 0.0,
             },
         }
     )  # fmt: skip
@@ -127,7 +120,7 @@ def make(plan: Plan, index: int, folder: Path, progress: Callable[[int], None] =
     """Renders recording `index` of a plan into `folder`.
 
     Raises:
-        UserError: the folder exists, the recording is shorter than its calibration, or as the rendering.
+        UserError: the folder exists, or the recording is shorter than its calibration; or from the rendering.
     """
     if plan.seconds < _PRESS_S + 5:
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
@@ -149,7 +142,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
     times = _frame_times(plan, rng)
     renderer = scene.renderer
     pictures: list[NDArray[np.uint8]] = []
-    beside: list[NDArray[np.uint8]] = []
+    pictures_right: list[NDArray[np.uint8]] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
@@ -157,13 +150,13 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
         shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
         pictures.append(shot.rgb)
         if shot.rgb_right is not None:
-            beside.append(shot.rgb_right)
+            pictures_right.append(shot.rgb_right)
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
     crf = int(rng.integers(18, 25))
     writer.write_video(part / "video.mp4", iter(pictures), times, crf=crf)
     if renderer.right is not None:
-        writer.write_video(part / "right.mp4", iter(beside), times, crf=crf)
+        writer.write_video(part / "right.mp4", iter(pictures_right), times, crf=crf)
         writer.write_pair(part / _PAIR, scene.view, renderer.right)
     cv2.imwrite(str(part / "tissue.png"), scene.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
@@ -185,7 +178,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
 def _moved(
     job: jobs.Job, case: scenario.Scenario, gesture: tool_gesture.Gesture, surface: CortexSurface
 ) -> Deformation:
-    """The path from no load to full: a gesture that only rises."""
+    """Deformation from no load to full load, by a gesture that only rises."""
     rising = tool_gesture.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
     tets = tetrahedra.block(job.anatomy, job.fem.tets, gesture.focus, height)
@@ -194,7 +187,7 @@ def _moved(
 
 
 def _course(plan: Plan, rng: np.random.Generator) -> _Course:
-    """Presses of random height and pace; the first seconds are still, the last too."""
+    """Presses of random height and duration, at rest during the first and the last seconds."""
     time = np.arange(0, plan.seconds + 1, 1 / _SENSOR_HZ)
     level, gesture, away = np.zeros_like(time), np.zeros(len(time), np.int64), np.ones_like(time)
     start = _STILL_S + 0.3
@@ -219,7 +212,7 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
 
 
 def _crept(time_s: Floats, level: Floats) -> Floats:
-    """Quasi-linear creep with one time (Fung): part of the response comes late, by a first-order lag."""
+    """Quasi-linear creep with one time constant (Fung): part of the response has a first-order lag."""
     late, step = np.zeros_like(level), time_s[1] - time_s[0]
     for k in range(1, len(level)):
         late[k] = late[k - 1] + step / _LATE_S * (level[k] - late[k - 1])
@@ -227,7 +220,7 @@ def _crept(time_s: Floats, level: Floats) -> Floats:
 
 
 def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
-    """A camera whose exposure wanders: intervals vary by a tenth."""
+    """Times of frames whose intervals vary by a tenth."""
     steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
     return np.concatenate([[0.0], np.cumsum(steps)[:-1]])
 
@@ -235,7 +228,7 @@ def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
 def _pose(
     motion: Deformation, gesture: tool_gesture.Gesture, course: _Course, at: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats, Floats]:
-    """Surface and instrument: between two levels of the path; the hand trembles by a tenth of a mm."""
+    """Surface, tips and shafts, interpolated between two levels of the path, with a tremor of 0.1 mm."""
     levels = np.linalg.norm(motion.force, axis=1) / gesture.force_mn
     strain = float(course.strain[at])
     above = int(np.searchsorted(levels, strain).clip(1, len(levels) - 1))
@@ -253,19 +246,19 @@ def _pose(
 
 
 def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Generator) -> float:
-    """Writes force.csv as a sensor of its own would; returns by how much its clock is behind [s]."""
+    """Writes force.csv with the sensor's axes, zero, drift, noise and clock; returns the clock's lag [s]."""
     lag = float(rng.uniform(-0.5, 0.5))
     size = float(np.linalg.norm(force, axis=1).max())
     turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()  # uniform over rotations
     drift = size * rng.normal(size=3) * 0.002 * course.time_s[:, None]
-    seen = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + 0.005 * size * rng.normal(size=force.shape)
-    clock = course.time_s - lag
-    writer.write_force(part, clock, seen / 1000)
+    noise = 0.005 * size
+    measured = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + noise * rng.normal(size=force.shape)
+    writer.write_force(part, course.time_s - lag, measured / 1000)
     return lag
 
 
 def _free_spans(plan: Plan, lag_s: float) -> list[list[float]]:
-    """Contact-free spans on the sensor's clock, as an operator would note them at both ends."""
+    """Contact-free spans at both ends on the sensor's clock, as noted by an operator."""
     return [[0.1 - lag_s, _STILL_S - 0.1 - lag_s], [plan.seconds - 0.2 - lag_s, plan.seconds + 0.8 - lag_s]]
 
 

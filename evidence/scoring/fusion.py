@@ -1,16 +1,16 @@
-"""Network, physics and what both say together, on sequences of a world that the network has not met.
+"""Errors of network, physics and their fusion, on sequences out of distribution.
 
-Every sequence's stored motion is read as a recording's is, by one eye and by two, with the membrane unknown
-and stated. The constants of `bench.methods.fusion`, and what physics' interval grows by under a membrane,
-were set on the half with even numbers; read the other.
+Force is estimated from every sequence's stored motion as from a recording's, monocular and in stereo, with
+the membrane unknown and stated. The constants of `bench.methods.fusion`, and the factor on physics' interval
+under a membrane, were set on sequences with even numbers; odd ones are reported.
 
 Run: python -m evidence.scoring.fusion mission-ood --work work
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,128 +33,121 @@ from synth.job.types import MembraneState
 
 Floats = NDArray[np.float64]
 _NETWORKS = {1: "mono", 2: "stereo"}
-_STRONG = 0.5
-"""Of the sequence's largest force: these frames tell the bias."""
+_STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
 
 
 @dataclass(frozen=True)
 class Case:
-    """How a sequence is read."""
+    """Input of the methods."""
 
-    eyes: int
-    told: bool
-    """Whether the membrane is stated."""
+    cameras: int
+    membrane_stated: bool
 
 
-CASES = tuple(Case(eyes, told) for eyes in (1, 2) for told in (False, True))
+CASES = tuple(Case(cameras, stated) for cameras in (1, 2) for stated in (False, True))
 
 
 def main(
     data: Path,
-    work: Annotated[Path, typer.Option(help="Folder for answers, kept for the next run.")] = Path("work"),
+    work: Annotated[Path, typer.Option(help="Folder of estimates; a later run reuses them.")] = Path("work"),
     every: Annotated[int, typer.Option(help="1: odd numbers, 0: even ones.")] = 1,
     out: Path = report.RESULTS / "scoring/fusion",
 ) -> None:
-    """What each errs by, and what its 90% intervals hold."""
+    """Errors of network, physics and their fusion, and coverage of their 90% intervals."""
     rows = []
     for case in CASES:
-        model = Model(find_model(_NETWORKS[case.eyes]))
-        found = [_kept(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
+        model = Model(find_model(_NETWORKS[case.cameras]))
+        found = [_cached(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
-    result = {"data": status.data(data), "rows": rows}
-    report.save(out, "fusion.json", result, page(result))
-    report.show(result)
+    report.publish(out, "fusion.json", {"data": status.data(data), "rows": rows}, page)
 
 
-def _kept(sequence: Stored, case: Case, model: Model, work: Path) -> dict[str, Any]:
-    key = cache.key(sequence.attrs["content_hash"], case.eyes, case.told, model.identity)
-    return dict(cache.result(work, f"together-{sequence.index}", key, lambda: _read(sequence, case, model)))
+def _cached(sequence: Stored, case: Case, model: Model, work: Path) -> dict[str, Any]:
+    key = cache.key(sequence.attrs["content_hash"], case.cameras, case.membrane_stated, model.identity)
+    return dict(
+        cache.result(work, f"fusion-{sequence.index}", key, lambda: _estimated(sequence, case, model))
+    )
 
 
-def _read(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
-    """Truth, force and interval of every frame by each method, as JSON holds them."""
+def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
+    """True force, and estimate and interval by each method, of every frame, for JSON."""
     covered = sequence.attrs["scenario"]["tissue"].get("membrane")
     membrane: MembraneState = "intact" if covered else "stripped"
     scene = MethodContext(
         sequence["tissue"][:].astype(bool),
         sequence.attrs["scale_mm_per_px"],
         sequence.attrs["young_kpa"],
-        membrane if case.told else "unknown",
+        membrane if case.membrane_stated else "unknown",
     )
     physics, both = Physics(), Fusion(MAIN, PHYSICS)
-    seen: list[dict[str, ForceEstimate]] = []
+    frames: list[dict[str, ForceEstimate]] = []
     for k in range(len(sequence["force"])):
         flow, sure = sequence["flow_recovered"][k], sequence["flow_confidence"][k].astype(np.float32)
-        answers: dict[str, ForceEstimate] = {}
+        estimates: dict[str, ForceEstimate] = {}
         for name, method in ((MAIN, model), (PHYSICS, physics)):
-            if case.eyes == 1:
-                answers[name] = method(flow, sure, scene, False)
+            if case.cameras == 1:
+                estimates[name] = method(flow, sure, scene, False)
             else:
                 moved = Moved(sequence["motion_recovered"][k], sequence["motion_deviation"][k])
-                answers[name] = method.in_space(flow, sure, moved, scene, False)
-        seen.append(answers)
-    for answers, revised in zip(seen, physics.revise(np.zeros(len(seen), bool)), strict=True):
-        answers[PHYSICS] = revised
-    for answers, fused in zip(seen, both.fuse(seen, scene, case.eyes), strict=True):
-        answers[FUSION] = fused
-    told = {
-        name: [[*one[name].force_mn.tolist(), one[name].low_mn, one[name].high_mn] for one in seen]
+                estimates[name] = method.in_space(flow, sure, moved, scene, False)
+        frames.append(estimates)
+    for estimates, revised in zip(frames, physics.revise(np.zeros(len(frames), bool)), strict=True):
+        estimates[PHYSICS] = revised
+    for estimates, fused in zip(frames, both.fuse(frames, scene, case.cameras), strict=True):
+        estimates[FUSION] = fused
+    rows = {
+        name: [[*one[name].force_mn.tolist(), one[name].low_mn, one[name].high_mn] for one in frames]
         for name in (MAIN, PHYSICS, FUSION)
     }
-    return {"membrane": membrane, "true": sequence["force"][:].tolist(), "told": told}
+    return {"membrane": membrane, "true": sequence["force"][:].tolist(), "estimated": rows}
 
 
 def _row(case: Case, tissue: str, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    scores: dict[str, list[float]] = {"whole": [], "size": [], "bias": [], "held": [], "width": []}
+    scores: dict[str, list[float]] = {"whole": [], "size": [], "bias": [], "coverage": [], "width": []}
     for one in found:
-        true, told = np.array(one["true"]), np.array(one["told"][name], np.float64)
-        size, said = np.linalg.norm(true, axis=1), np.linalg.norm(told[:, :3], axis=1)
-        low, high, peak = told[:, 3], told[:, 4], size.max()
-        strong = size > _STRONG * peak
-        scores["whole"].append(float(np.sqrt(np.square(told[:, :3] - true).sum() / np.square(true).sum())))
-        scores["size"].append(float(np.abs(said - size).mean() / peak))
-        scores["bias"].append(float((said - size)[strong].mean() / peak))
-        scores["held"].append(float(((size >= low) & (size <= high)).mean()))
+        true, rows = np.array(one["true"]), np.array(one["estimated"][name], np.float64)
+        force, low, high = rows[:, :3], rows[:, 3], rows[:, 4]
+        size = np.linalg.norm(true, axis=1)
+        off, peak = np.linalg.norm(force, axis=1) - size, size.max()
+        scores["whole"].append(float(np.sqrt(np.square(force - true).sum() / np.square(true).sum())))
+        scores["size"].append(float(np.abs(off).mean() / peak))
+        scores["bias"].append(float(off[size > _STRONG * peak].mean() / peak))
+        scores["coverage"].append(float(((size >= low) & (size <= high)).mean()))
         scores["width"].append(float((high - low).mean() / peak))
-    row: dict[str, Any] = {"eyes": case.eyes, "told": case.told, "tissue": tissue, "method": name}
-    row["sequences"] = len(found)
+    row: dict[str, Any] = asdict(case) | {"tissue": tissue, "method": name, "sequences": len(found)}
     for key, values in scores.items():
         over = interval(np.array(values), np.random.default_rng(0))
         row[key] = [over.mean, over.low, over.high]
     return row
 
 
-def page(found: dict[str, Any]) -> report.Page:
-    """One table."""
-
-    def cell(ends: Sequence[float]) -> str:
-        return f"{ends[0]:.0%} [{ends[1]:.0%}, {ends[2]:.0%}]"
-
+def page(found: Mapping[str, Any]) -> report.Page:
+    """A table of the rows with unknown membrane."""
+    unknown = [row for row in found["rows"] if not row["membrane_stated"]]
     rows = [
         {
-            "eyes": row["eyes"],
+            "cameras": row["cameras"],
             "membrane": row["tissue"],
             "method": row["method"],
-            "force": cell(row["whole"]),
-            "bias of strong presses": cell(row["bias"]),
-            "90% holds": cell(row["held"]),
+            "force": report.mean_cell(row["whole"], ".0%"),
+            "bias of strong presses": report.mean_cell(row["bias"], ".0%"),
+            "coverage": report.mean_cell(row["coverage"], ".0%"),
         }
-        for row in found["rows"]
-        if not row["told"]
+        for row in unknown
     ]
-    whole = (False, FUSION, "all")
-    one, two = (r for r in found["rows"] if (r["told"], r["method"], r["tissue"]) == whole)
+    one, two = (row for row in unknown if (row["method"], row["tissue"]) == (FUSION, "all"))
     words = (
-        f"**Together they err by {two['whole'][0]:.0%} of the force with two eyes and by "
-        f"{one['whole'][0]:.0%} with one. Their 90% intervals hold {two['held'][0]:.0%} and "
-        f"{one['held'][0]:.0%} of frames.**",
-        f"{one['sequences']} sequences of a look that no network was fitted on; others of that look chose "
-        "the methods' constants; the membrane isn't stated (where it is: in the data). *Force*: error as a "
-        "vector, root mean square over that of the force. *Bias*: of the peak. 95% intervals over sequences.",
+        f"**The error of the fused force is {two['whole'][0]:.0%} in stereo and {one['whole'][0]:.0%} "
+        f"monocular; the coverage of its 90% intervals is {two['coverage'][0]:.0%} and "
+        f"{one['coverage'][0]:.0%}.**",
+        f"{one['sequences']} sequences with an appearance that no network was fitted on; the methods' "
+        "constants were set on other sequences of it. The membrane is unknown to the methods (results with "
+        "known membrane: in the data). *Force*: root mean square error of the vector relative to that of the "
+        "force. *Bias*: relative to the peak. 95% intervals over sequences.",
     )
-    return report.Page("Network and physics together", found, [], [report.Section("", rows)], words)
+    return report.Page("Fusion of network and physics", found, [], [report.Section("", rows)], words)
 
 
 if __name__ == "__main__":

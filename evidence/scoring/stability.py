@@ -1,9 +1,9 @@
-"""Films spoilt in one way at a time: what becomes of the answer, and is the cause named?
+"""Recordings degraded in one way at a time: the error of the force, and whether a message names the cause.
 
-Silently wrong: the error, of the peak or over time, more than doubled and above a tenth of the peak, nothing
-new said, and the 90% interval misses. Also what is said of films that nothing is wrong with.
+Silently wrong: the error, of the peak or over time, more than doubled and above a tenth of the peak, no new
+message, and the force is outside the 90% interval. Also the messages on undegraded recordings.
 
-Run: python -m evidence.scoring.stability films
+Run: python -m evidence.scoring.stability degraded
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -30,7 +30,7 @@ from bench.methods.physics import Physics
 from bench.recording import writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
-from evidence import cache as kept
+from evidence import cache as stored
 from evidence import report
 from learn import load_model
 from learn.inference.shipped import require_model
@@ -42,15 +42,15 @@ from synth.system.checked_file import read_picture
 
 _JOBS = {"opening": "mission", "edge to edge": str(Path(__file__).parents[1] / "curves/mission-bench.yaml")}
 _SCENES = (("opening", 1), ("edge to edge", 0))
-_CLEAN = 8  # films of either kind that nothing is wrong with
+_CLEAN = 8  # undegraded recordings of each kind
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
 _NOTES = "out of distribution|again, frozen"
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
-    """A recording in memory: pictures of either eye (T, H, W, 3), masks, sensor (N, 4) in s and newtons."""
+class Video:
+    """A recording in memory: images of both cameras (T, H, W, 3), masks, sensor (N, 4) in s and newtons."""
 
     rgb: NDArray[np.uint8]
     right: Any
@@ -59,49 +59,46 @@ class Film:
     time_s: NDArray[np.float64]
     sensor: NDArray[np.float64]
     meta: dict[str, Any]
-    pair: str
-    """stereo.yaml."""
-    video: tuple[int, str, int] | None = None
-    """Quality (crf), format of the pixels, and their width in thirds of their height; None: PNG."""
-    white: int = 255
-    """Of masks."""
+    pair: str  # stereo.yaml
+    codec: tuple[int, str, int] | None = None
+    """Quality (crf), pixel format, and pixels' width in thirds of their height; None: PNG."""
+    white: int = 255  # value of masked pixels
 
 
-Change = Callable[[Film], Film]
+Change = Callable[[Video], Video]
 
 
 def main(
     work: Path, out: Path = report.RESULTS / "scoring/stability", seed: int = 35, only: str = ""
 ) -> None:
-    """Renders into `work`; `only`: a pattern of films."""
+    """Scores rendered recordings before and after each change; `only`: a pattern of the changes' names."""
     cv2.setNumThreads(1)
     rows = list[dict[str, Any]]()
     for name, index in _SCENES:
         clean = _read(_rendered(work, name, seed, 2)[index])
         peak = 1000 * float(np.linalg.norm(clean.sensor[:, 1:], axis=1).max())
-        for what in filter(re.compile(only).search, FILMS):
-            eyes = 1 if what in ONE_EYE else 2
-            film, (change, cause) = clean if eyes == 2 else replace(clean, right=None), FILMS[what]
-            before = _point(work, film, lambda same: same, peak, name, index, seed, eyes)
-            after = _point(work, film, change, peak, name, index, seed, eyes, what)
-            row = {"film": what, "scene": f"{name} {index}", "eyes": eyes}
+        for what in filter(re.compile(only).search, CHANGES):
+            cameras = 1 if what in MONOCULAR else 2
+            video, (change, cause) = clean if cameras == 2 else replace(clean, right=None), CHANGES[what]
+            before = _point(work, video, lambda same: same, peak, name, index, seed, cameras)
+            after = _point(work, video, change, peak, name, index, seed, cameras, what)
+            row = {"change": what, "scene": f"{name} {index}", "cameras": cameras}
             rows.append(row | _judged(after, before, cause))
-    found: dict[str, Any] = {"seed": seed, "films": _summary(rows), "undegraded": [], "points": rows}
+    found: dict[str, Any] = {"seed": seed, "changes": _summary(rows), "undegraded": [], "points": rows}
     if not only:
         found["undegraded"] = list(_alarms(work, seed + 1000))
-    report.save(out, "stability.json", found, page(found))
-    report.show({key: found[key] for key in ("films", "undegraded")})
+    report.publish(out, "stability.json", found, page, {key: found[key] for key in ("changes", "undegraded")})
 
 
-def _point(work: Path, film: Film, change: Change, peak_mn: float, *key: Any) -> Any:
-    """A film, spoilt and scored; what was found before is kept, and a run that ended goes on."""
-    return kept.result(
-        work / "points", "film", kept.key(*key), lambda: _scored(_written(change(film), work), peak_mn)
+def _point(work: Path, video: Video, change: Change, peak_mn: float, *key: Any) -> Any:
+    """Scores of a changed recording, cached in `work`."""
+    return stored.result(
+        work / "points", "change", stored.key(*key), lambda: _scored(_written(change(video), work), peak_mn)
     )
 
 
 def _rendered(work: Path, name: str, seed: int, count: int) -> list[Path]:
-    """Recordings of both eyes, 24 frames in 3 s."""
+    """Folders of stereo recordings of 24 frames in 3 s."""
     data, folders = work / f"{name} {seed}", [work / f"{name} {seed} {k}" for k in range(count)]
     if not folders[-1].is_dir():
         changed = {"seed": seed, "sequences": count, "frames": 24, "fps": 8.0}
@@ -111,11 +108,13 @@ def _rendered(work: Path, name: str, seed: int, count: int) -> list[Path]:
     return folders
 
 
-def _read(folder: Path) -> Film:
-    """A recording of `export_recording`; its sensor is sampled more often, with noise, free at first."""
+def _read(folder: Path) -> Video:
+    """A recording of `export_recording` with its sensor resampled at a higher rate, with noise."""
     rgb, right = (
-        np.stack([read_picture(p, cv2.IMREAD_COLOR)[..., ::-1] for p in sorted((folder / eye).glob("*.png"))])
-        for eye in ("frames", "right")
+        np.stack(
+            [read_picture(p, cv2.IMREAD_COLOR)[..., ::-1] for p in sorted((folder / name).glob("*.png"))]
+        )
+        for name in ("frames", "right")
     )
     meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
     tool = np.zeros(rgb.shape[:3], bool)
@@ -132,43 +131,43 @@ def _read(folder: Path) -> Film:
         np.asarray(read_picture(folder / "tissue.png", 0)) > 127,
         np.column_stack([clock, values]),
     )
-    return Film(rgb, right, tool, tissue, time_s, sensor, meta, (folder / "stereo.yaml").read_text("utf-8"))
+    return Video(rgb, right, tool, tissue, time_s, sensor, meta, (folder / "stereo.yaml").read_text("utf-8"))
 
 
-def _written(film: Film, work: Path) -> Path:
-    """A film as a recording, in place of the one before."""
-    folder, meta = work / "spoilt", dict(film.meta)
+def _written(video: Video, work: Path) -> Path:
+    """Folder of the recording, in place of the previous one."""
+    folder, meta = work / "degraded", dict(video.meta)
     shutil.rmtree(folder, ignore_errors=True)
-    for name, eye in (("frames", film.rgb), ("right", film.right)):
-        if eye is not None and film.video:
+    for name, images in (("frames", video.rgb), ("right", video.right)):
+        if images is not None and video.codec:
             folder.mkdir(exist_ok=True)
-            _encode(folder / f"{name.replace('frames', 'video')}.mp4", eye, film.video)
-        elif eye is not None:
+            _encode(folder / f"{name.replace('frames', 'video')}.mp4", images, video.codec)
+        elif images is not None:
             (folder / name).mkdir(parents=True)
-            for k, rgb in enumerate(eye):
+            for k, rgb in enumerate(images):
                 cv2.imwrite(str(folder / f"{name}/{k:06d}.png"), np.ascontiguousarray(rgb[..., ::-1]))
     (folder / "masks").mkdir()
-    for k, tool in enumerate(film.tool):
+    for k, tool in enumerate(video.tool):
         if tool.any():
-            cv2.imwrite(str(folder / f"masks/{k:06d}.png"), tool.astype(np.uint8) * film.white)
-    cv2.imwrite(str(folder / "tissue.png"), film.tissue.astype(np.uint8) * 255)
-    writer.write_force(folder, film.sensor[:, 0], film.sensor[:, 1:])
-    writer.write_frames(folder, film.time_s)
-    if film.right is None:
+            cv2.imwrite(str(folder / f"masks/{k:06d}.png"), tool.astype(np.uint8) * video.white)
+    cv2.imwrite(str(folder / "tissue.png"), video.tissue.astype(np.uint8) * 255)
+    writer.write_force(folder, video.sensor[:, 0], video.sensor[:, 1:])
+    writer.write_frames(folder, video.time_s)
+    if video.right is None:
         meta.pop("stereo", None)
     else:
-        (folder / "stereo.yaml").write_text(film.pair, "utf-8")
+        (folder / "stereo.yaml").write_text(video.pair, "utf-8")
     writer.write_meta(folder, meta)
     return folder
 
 
-def _encode(path: Path, film: NDArray[np.uint8], how: tuple[int, str, int]) -> None:
-    """H.264; see `Film.video`."""
+def _encode(path: Path, images: NDArray[np.uint8], codec: tuple[int, str, int]) -> None:
+    """Writes H.264; see `Video.codec`."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=8, options={"crf": str(how[0]), "threads": "1"})
-        stream.height, stream.width, stream.pix_fmt = *film.shape[1:3], how[1]
-        stream.codec_context.sample_aspect_ratio = Fraction(how[2], 3)
-        for rgb in film:
+        stream = container.add_stream("libx264", rate=8, options={"crf": str(codec[0]), "threads": "1"})
+        stream.height, stream.width, stream.pix_fmt = *images.shape[1:3], codec[1]
+        stream.codec_context.sample_aspect_ratio = Fraction(codec[2], 3)
+        for rgb in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24")))
         container.mux(stream.encode())
 
@@ -179,15 +178,15 @@ def _model(stereo: bool) -> Any:
 
 
 def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
-    """Errors over the undegraded film's peak, how often the interval holds, and what is said."""
-    row: dict[str, Any] = dict.fromkeys(("physics", "error", "over_time", "held"))
+    """Errors relative to the undegraded recording's peak, coverage of the interval, and messages."""
+    row: dict[str, Any] = dict.fromkeys(("physics", "error", "over_time", "coverage"))
     stereo = (folder / "stereo.yaml").exists()
     try:
         result = score(folder, _model(stereo), methods={PHYSICS: Physics()}, baselines=False)
     except UserError as error:
-        return {**row, "said": [str(error).replace(f"{folder}: ", "")]}
-    row["said"] = [f"{one.what}: {one.message}" for one in result.findings]
-    row["said"] += [note for note in result.notes if re.search(_NOTES, note)]
+        return {**row, "messages": [str(error).replace(f"{folder}: ", "")]}
+    row["messages"] = [f"{one.what}: {one.message}" for one in result.findings]
+    row["messages"] += [note for note in result.notes if re.search(_NOTES, note)]
     sensor, main = np.asarray(result.sensor_mn), result.methods[result.main]
     for key, method in (("physics", result.methods[PHYSICS]), ("error", main)):
         found = method.size_mn
@@ -199,81 +198,81 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
         if main.low_mn is not None and main.high_mn is not None:
             touched = known & (np.maximum(found, sensor) > _LEAST * peak_mn) & np.isfinite(main.low_mn)
             inside = (sensor >= main.low_mn) & (sensor <= main.high_mn)
-            row["held"] = float(inside[touched].mean()) if touched.any() else None
+            row["coverage"] = float(inside[touched].mean()) if touched.any() else None
     return row
 
 
 def _judged(after: dict[str, Any], before: dict[str, Any], cause: str) -> dict[str, Any]:
-    """A film against itself before it was spoilt; `cause`: a pattern of what names it, empty: need not be."""
-    known = {re.sub(r"[\d.,]+", "", one) for one in before["said"]}
-    new = [one for one in after["said"] if re.sub(r"[\d.,]+", "", one) not in known]
+    """Comparison of the scores after and before a change; `cause`: pattern of a message that names it."""
+    known = {re.sub(r"[\d.,]+", "", one) for one in before["messages"]}
+    new = [one for one in after["messages"] if re.sub(r"[\d.,]+", "", one) not in known]
     worse = any(
         after[key] is not None and after[key] > max(_DOUBLED * (before[key] or 0.0), _LEAST)
         for key in ("error", "over_time")
     )
     named = any(re.search(cause, one) for one in new) if cause else None
-    row = {"before": before["error"], **after, "said": new, "worse": worse, "named": named}
-    return {**row, "silently_wrong": worse and (after["held"] or 0.0) < _COVERED and not new}
+    row = {"before": before["error"], **after, "messages": new, "worse": worse, "named": named}
+    return {**row, "silently_wrong": worse and (after["coverage"] or 0.0) < _COVERED and not new}
 
 
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line for each way."""
+    """A line for each change."""
     lines = []
-    for film in dict.fromkeys(row["film"] for row in rows):
-        own = [row for row in rows if row["film"] == film]
+    for name in dict.fromkeys(row["change"] for row in rows):
+        own = [row for row in rows if row["change"] == name]
         named = [row["named"] for row in own if row["named"] is not None]
-        said, cause = (one for row in own for one in row["said"]), FILMS[film][1] or "$^"
+        messages, cause = (one for row in own for one in row["messages"]), CHANGES[name][1] or "$^"
         errors = {k: [row[k] for row in own if row[k] is not None] for k in ("before", "error", "physics")}
         lines.append(
-            {"film": film, "eyes": own[0]["eyes"]}
+            {"change": name, "cameras": own[0]["cameras"]}
             | {key: f"{100 * np.median(e):.0f}%" if e else "none" for key, e in errors.items()}
             | {
                 "worse": f"{sum(row['worse'] for row in own)} of {len(own)}",
-                "interval holds": f"{sum((row['held'] or 0) >= _COVERED for row in own)} of {len(own)}",
+                "covered": f"{sum((row['held'] or 0) >= _COVERED for row in own)} of {len(own)}",
                 "named": f"{sum(named)} of {len(named)}" if named else None,
                 "silently wrong": sum(row["silently_wrong"] for row in own),
-                "said": max(said, key=lambda one: bool(re.search(cause, one)), default="")[:90],
+                "message": max(messages, key=lambda one: bool(re.search(cause, one)), default="")[:90],
             }
         )
     return lines
 
 
 def _alarms(work: Path, seed: int) -> Iterator[dict[str, Any]]:
-    """What is said of films as they are, which nothing here was tuned on."""
+    """Messages on undegraded recordings, which were not tuned on."""
     for name in _JOBS:
-        folders, said = _rendered(work, name, seed, _CLEAN), Counter[str]()
+        folders, causes = _rendered(work, name, seed, _CLEAN), Counter[str]()
         for folder in folders:
             where = _written(_read(folder), work)
-            said.update({one.split(":")[0] for one in _scored(where, 1.0)["said"]} or {"nothing"})
-        line = ", ".join(f"{k}: {n}" for k, n in said.items())
-        yield {"films": name, "count": len(folders), "said of": line}
+            causes.update({one.split(":")[0] for one in _scored(where, 1.0)["messages"]} or {"none"})
+        line = ", ".join(f"{k}: {n}" for k, n in causes.items())
+        yield {"scenes": name, "count": len(folders), "messages on": line}
 
 
-def page(found: dict[str, Any]) -> report.Page:
-    """Draws `stability.json`: the films that an error or a missing name makes worth a look."""
-    films = found["films"]
-    silent = sum(row["silently wrong"] for row in films)
-    columns = ("film", "eyes", "before", "error", "worse", "interval holds", "named")
-    shown = [row for row in films if row["worse"][0] != "0" or row["named"] in ("0 of 2", "1 of 2")]
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Draws `stability.json`: the changes with a larger error, or without a message on the cause."""
+    changes = found["changes"]
+    silent = sum(row["silently wrong"] for row in changes)
+    columns = ("change", "cameras", "before", "error", "worse", "covered", "named")
+    shown = [row for row in changes if row["worse"][0] != "0" or row["named"] in ("0 of 2", "1 of 2")]
     words = [
-        f"**{silent or 'None'} of {len(films)} ways to spoil a film moved the force out of its interval "
-        f"unsaid.** {len(shown)} made the error worse or weren't always named (the rest: in the data).",
-        "Two scenes each, one with tissue from edge to edge. Errors are of the peak, in the median. *Worse*: "
-        "more than doubled and above a tenth of the peak, there or over time. *Named*: a warning says why. "
-        "*Unsaid*: without any warning that the film unspoilt doesn't have.",
+        f"**{silent or 'None'} of {len(changes)} degradations moved the force out of its interval without a "
+        f"message.** {len(shown)} increased the error or were not always named (others: in the data).",
+        "Two scenes each, one with tissue from edge to edge. Errors are of the peak force, medians. *Worse*: "
+        "more than doubled and above a tenth of the peak, at the peak or over time. *Covered*: at least 80% "
+        "of frames inside the 90% interval. *Named*: a message names the cause.",
     ]
     sections = [
-        report.Section("Spoilt", [{key: row[key] for key in columns} for row in shown]),
-        report.Section("What is said where nothing is wrong", found["undegraded"]),
+        report.Section("Degraded recordings", [{key: row[key] for key in columns} for row in shown]),
+        report.Section("Messages on undegraded recordings", found["undegraded"]),
     ]
-    return report.Page("Scoring: films that go wrong", found, (), sections, words)
+    return report.Page("Scoring: degraded recordings", found, (), sections, words)
 
 
 def _each(change: Callable[[NDArray[np.uint8], int], Any]) -> Change:
-    """A change of each picture (H, W, 3) of the left eye, given its number."""
-    return lambda film: replace(
-        film,
-        rgb=np.stack([np.clip(change(rgb, k), 0, 255).astype(np.uint8) for k, rgb in enumerate(film.rgb)]),
+    """A change of each image (H, W, 3) of the left camera and its number."""
+    return lambda video: replace(
+        video,
+        rgb=np.stack([np.clip(change(rgb, k), 0, 255).astype(np.uint8) for k, rgb in enumerate(video.rgb)]),
     )
 
 
@@ -281,23 +280,23 @@ def _warped(rgb: NDArray[np.uint8], matrix: Any) -> Any:
     return cv2.warpAffine(rgb, matrix, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
-def _moved(film: Film, scale: float = 1.0, turn_deg: float = 0.0, shift: float = 0.0) -> Film:
-    """The camera from the middle of the film on."""
-    height, width = film.rgb.shape[1:3]
+def _moved(video: Video, scale: float = 1.0, turn_deg: float = 0.0, shift: float = 0.0) -> Video:
+    """The recording with the left camera moved from half of its frames on."""
+    height, width = video.rgb.shape[1:3]
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, scale)
     matrix[:, 2] += np.array([0.8, 0.6]) * shift
-    return _each(lambda rgb, k: rgb if k < len(film.rgb) // 2 else _warped(rgb, matrix))(film)
+    return _each(lambda rgb, k: rgb if k < len(video.rgb) // 2 else _warped(rgb, matrix))(video)
 
 
-def _swayed(film: Film) -> Film:
-    """Nothing is touched."""
-    still = np.clip(film.rgb[:1] + np.random.default_rng(1).normal(0, 1.5, film.rgb.shape), 0, 255)
-    sensor = film.sensor.copy()
+def _moved_untouched(video: Video) -> Video:
+    """The first frame under camera motion, without contact."""
+    still = np.clip(video.rgb[:1] + np.random.default_rng(1).normal(0, 1.5, video.rgb.shape), 0, 255)
+    sensor = video.sensor.copy()
     sensor[:, 1:] -= cv2.GaussianBlur(sensor[:, 1:], (1, 15), 0)
-    film = replace(film, rgb=still.astype(np.uint8), sensor=sensor, tool=film.tool & False)
+    video = replace(video, rgb=still.astype(np.uint8), sensor=sensor, tool=video.tool & False)
     return _each(
         lambda rgb, k: _warped(rgb, np.array([[1, 0, 5 * np.sin(k / 3)], [0, 1, 2 * np.sin(k / 2)]]))
-    )(film)
+    )(video)
 
 
 def _rippled(rgb: NDArray[np.uint8], k: int) -> Any:
@@ -307,30 +306,30 @@ def _rippled(rgb: NDArray[np.uint8], k: int) -> Any:
 
 
 def _order(of: Callable[[NDArray[np.intp]], Any], right: bool = False) -> Change:
-    """Other pictures in these places, those of one eye; the tool's masks go with the left."""
+    """A change of the order of one camera's images; tool masks follow those of the left."""
 
-    def change(film: Film) -> Film:
-        order = np.asarray(of(np.arange(len(film.rgb))))
+    def change(video: Video) -> Video:
+        order = np.asarray(of(np.arange(len(video.rgb))))
         if right:
-            return replace(film, right=film.right[order])
-        return replace(film, rgb=film.rgb[order], tool=film.tool[order], time_s=film.time_s[: len(order)])
+            return replace(video, right=video.right[order])
+        return replace(video, rgb=video.rgb[order], tool=video.tool[order], time_s=video.time_s[: len(order)])
 
     return change
 
 
-def _hand(film: Film) -> Film:
-    """A finger of a glove, from the right, from the middle of the film on."""
-    height, width = film.rgb.shape[1:3]
+def _hand(video: Video) -> Video:
+    """The recording with a gloved finger that enters from the right after a third of its frames."""
+    height, width = video.rgb.shape[1:3]
     weave = np.random.default_rng(2).normal(0, 60, (height, width, 1)).astype(np.float32)
     weave = cv2.GaussianBlur(weave, (0, 0), 2)[..., None]
 
     def one(rgb: NDArray[np.uint8], k: int) -> Any:
-        into = min(max(k - len(film.rgb) // 3, 0) / 5, 1) * 0.45 * width
+        into = min(max(k - len(video.rgb) // 3, 0) / 5, 1) * 0.45 * width
         mask, centre = np.zeros((height, width), np.uint8), (int(width * 1.1 - into), height // 2)
         cv2.ellipse(mask, centre, (width // 5, height // 6), 0, 0, 360, 255, -1)
         return np.where(mask[..., None] > 0, np.array([222, 202, 180]) + weave, rgb)
 
-    return _each(one)(film)
+    return _each(one)(video)
 
 
 def _noise(levels: float, k: int, rgb: NDArray[np.uint8]) -> Any:
@@ -338,7 +337,7 @@ def _noise(levels: float, k: int, rgb: NDArray[np.uint8]) -> Any:
 
 
 def _still(colour: tuple[int, int, int], noise: float, *points: tuple[float, float]) -> Change:
-    """Something of a colour that lies there in all frames."""
+    """A polygon of a colour in all frames; points in shares of the image."""
 
     def one(rgb: NDArray[np.uint8], k: int) -> Any:
         mask = np.zeros(rgb.shape[:2], np.uint8)
@@ -354,13 +353,15 @@ def _jpeg(quality: int) -> Change:
     return _each(lambda rgb, k: cv2.imdecode(cv2.imencode(".jpg", rgb, how)[1], 1))
 
 
-def _squeezed(film: Film, video: tuple[int, str, int] | None) -> Film:
-    """Fewer columns than square pixels would have; only a video says so."""
-    small = np.stack([cv2.resize(rgb, None, fx=0.75, fy=1, interpolation=cv2.INTER_AREA) for rgb in film.rgb])
-    if video:
-        return replace(film, rgb=small, video=video)
-    columns = np.linspace(0, film.tissue.shape[1] - 1, small.shape[2]).astype(int)
-    return replace(film, rgb=small, tissue=film.tissue[:, columns], tool=film.tool[..., columns])
+def _squeezed(video: Video, codec: tuple[int, str, int] | None) -> Video:
+    """The recording with non-square pixels; only a video declares their aspect ratio."""
+    small = np.stack(
+        [cv2.resize(rgb, None, fx=0.75, fy=1, interpolation=cv2.INTER_AREA) for rgb in video.rgb]
+    )
+    if codec:
+        return replace(video, rgb=small, codec=codec)
+    columns = np.linspace(0, video.tissue.shape[1] - 1, small.shape[2]).astype(int)
+    return replace(video, rgb=small, tissue=video.tissue[:, columns], tool=video.tool[..., columns])
 
 
 def _boxed(rgb: NDArray[np.uint8], k: int) -> Any:
@@ -369,23 +370,23 @@ def _boxed(rgb: NDArray[np.uint8], k: int) -> Any:
     return cv2.copyMakeBorder(inner, bar, bar, 0, 0, cv2.BORDER_CONSTANT, value=(16, 16, 16))
 
 
-def _combed(film: Film) -> Film:
-    rgb = film.rgb.copy()
-    rgb[:-1, 1::2] = film.rgb[1:, 1::2]
-    return replace(film, rgb=rgb)
+def _combed(video: Video) -> Video:
+    rgb = video.rgb.copy()
+    rgb[:-1, 1::2] = video.rgb[1:, 1::2]
+    return replace(video, rgb=rgb)
 
 
 def _stated(**changes: Any) -> Change:
-    """Other things in meta.yaml; a float multiplies what is there."""
-    return lambda film: replace(
-        film,
-        meta=film.meta | {k: film.meta[k] * v if isinstance(v, float) else v for k, v in changes.items()},
+    """Changes of meta.yaml; a float multiplies the value."""
+    return lambda video: replace(
+        video,
+        meta=video.meta | {k: video.meta[k] * v if isinstance(v, float) else v for k, v in changes.items()},
     )
 
 
 def _sensor(of: Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]) -> Change:
-    """Another sensor, made of its times (N,) and forces (N, 3)."""
-    return lambda film: replace(film, sensor=np.column_stack(of(film.sensor[:, 0], film.sensor[:, 1:])))
+    """A change of the sensor's times (N,) and forces (N, 3)."""
+    return lambda video: replace(video, sensor=np.column_stack(of(video.sensor[:, 0], video.sensor[:, 1:])))
 
 
 def _clipped(force: NDArray[np.float64]) -> Any:
@@ -397,52 +398,54 @@ def _stuck(force: NDArray[np.float64]) -> Any:
     return np.where((np.arange(len(force)) < peak)[:, None], force, force[peak])
 
 
-def _rest_at_peak(film: Film) -> Film:
-    at = film.sensor[np.linalg.norm(film.sensor[:, 1:], axis=1).argmax(), 0]
-    return replace(film, meta={**film.meta, "rest_frame": int(np.abs(film.time_s - at).argmin())})
+def _rest_at_peak(video: Video) -> Video:
+    at = video.sensor[np.linalg.norm(video.sensor[:, 1:], axis=1).argmax(), 0]
+    return replace(video, meta={**video.meta, "rest_frame": int(np.abs(video.time_s - at).argmin())})
 
 
-def _right(of: Callable[[Film], Any]) -> Change:
-    return lambda film: replace(film, right=np.ascontiguousarray(of(film)))
+def _right(of: Callable[[Video], Any]) -> Change:
+    return lambda video: replace(video, right=np.ascontiguousarray(of(video)))
 
 
-def _doubled(film: Film) -> Film:
-    twice = np.repeat(np.arange(len(film.rgb)), 2)
-    time_s = np.arange(len(twice)) * (film.time_s[1] - film.time_s[0]) / 2
-    return replace(film, rgb=film.rgb[twice], tool=film.tool[twice], time_s=time_s)
+def _doubled(video: Video) -> Video:
+    twice = np.repeat(np.arange(len(video.rgb)), 2)
+    time_s = np.arange(len(twice)) * (video.time_s[1] - video.time_s[0]) / 2
+    return replace(video, rgb=video.rgb[twice], tool=video.tool[twice], time_s=time_s)
 
 
-def _turned(film: Film, how: Any) -> Film:
+def _turned(video: Video, how: Any) -> Video:
     masks = (..., *how)
-    return replace(film, rgb=film.rgb[(*masks, np.s_[:])], tool=film.tool[masks], tissue=film.tissue[masks])
+    return replace(
+        video, rgb=video.rgb[(*masks, np.s_[:])], tool=video.tool[masks], tissue=video.tissue[masks]
+    )
 
 
-def _both_bumped(film: Film) -> Film:
-    right = _moved(replace(film, rgb=film.right), shift=5.0).rgb
-    return replace(_moved(film, shift=5.0), right=right)
+def _both_bumped(video: Video) -> Video:
+    right = _moved(replace(video, rgb=video.right), shift=5.0).rgb
+    return replace(_moved(video, shift=5.0), right=right)
 
 
-_UNSEEN, _AGAIN = "out of distribution", "again"
+_OOD, _AGAIN = "out of distribution", "again"
 _MISSING = r"^pictures: .*missing|^clocks|^times"
 _LATE = "^stereo: .*(late|early)"
 _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", np.s_[::-1]
-# How it is made, and what names its cause (a pattern; none: the answer is to hold).
-ONE_EYE: dict[str, tuple[Change, str]] = {
-    "camera bumped by 5 px": (lambda film: _moved(film, shift=5.0), "^camera"),
-    "camera sways, nothing touched": (_swayed, "^camera"),
-    "zoom by 3%": (lambda film: _moved(film, scale=1.03), "^camera"),
-    "rotation by 2 deg": (lambda film: _moved(film, turn_deg=2.0), "^camera"),
-    "ripples of 1 px": (_each(_rippled), f"moves unlike|{_UNSEEN}"),
+# Function that makes it, and pattern of the message on its cause; empty: the force should stay the same.
+MONOCULAR: dict[str, tuple[Change, str]] = {
+    "camera bumped by 5 px": (lambda video: _moved(video, shift=5.0), "^camera"),
+    "camera moves, no contact": (_moved_untouched, "^camera"),
+    "zoom by 3%": (lambda video: _moved(video, scale=1.03), "^camera"),
+    "rotation by 2 deg": (lambda video: _moved(video, turn_deg=2.0), "^camera"),
+    "ripples of 1 px": (_each(_rippled), f"moves unlike|{_OOD}"),
     "rest frame at the peak": (_rest_at_peak, "^rest frame"),
     "frozen for 5 frames": (_order(lambda k: np.where((k > 7) & (k < 13), 8, k)), _AGAIN),
     "4 frames dropped": (_order(lambda k: k[(k < 8) | (k > 11)]), _MISSING),
     "4 frames late": (_order(lambda k: np.maximum(k - 4, 0)), f"{_MISSING}|{_AGAIN}"),
     "a hand comes into view": (_hand, "^foreground"),
     "interlaced": (_combed, "interlaced"),
-    "pixels 4:3, said": (lambda film: _squeezed(film, (12, "yuv420p", 4)), ""),
-    "pixels 4:3, not said": (lambda film: _squeezed(film, None), "(?i)pixels"),
+    "pixels 4:3, declared": (lambda video: _squeezed(video, (12, "yuv420p", 4)), ""),
+    "pixels 4:3, not declared": (lambda video: _squeezed(video, None), "(?i)pixels"),
     "letterbox": (_each(_boxed), "bars"),
-    "H.264 at crf 51": (lambda film: replace(film, video=(51, "yuv420p", 3)), _COARSE),
+    "H.264 at crf 51": (lambda video: replace(video, codec=(51, "yuv420p", 3)), _COARSE),
     "JPEG at quality 3": (_jpeg(3), _COARSE),
     "noise of 30 levels": (_each(lambda rgb, k: rgb + _noise(30, k, rgb)), "noisy"),
     "dark": (_each(lambda rgb, k: 0.2 * rgb + _noise(1, k, rgb)), "dim"),
@@ -455,7 +458,7 @@ ONE_EYE: dict[str, tuple[Change, str]] = {
     "scale in px": (_stated(scale_mm_per_px=1), "^scale"),
     "E in Pa": (_stated(young_kpa=1000.0), "^stiffness"),
     "E in MPa": (_stated(young_kpa=0.001), "^stiffness"),
-    "tissue.png inverted": (lambda film: replace(film, tissue=~film.tissue), "^tissue|marks no tissue"),
+    "tissue.png inverted": (lambda video: replace(video, tissue=~video.tissue), "^tissue|marks no tissue"),
     "sensor: grams": (_sensor(lambda t, f: (t, f * 1000 / 9.81)), _UNITS),
     "sensor: mN": (_sensor(lambda t, f: (t, f * 1000)), _UNITS),
     "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor"),
@@ -464,9 +467,9 @@ ONE_EYE: dict[str, tuple[Change, str]] = {
     "sensor: stuck": (_sensor(lambda t, f: (t, _stuck(f))), "^sensor"),
     "sensor: clock 8% fast": (_sensor(lambda t, f: (t * 1.08, f)), "^clocks"),
     "sensor: clock 0.6 s off": (_sensor(lambda t, f: (t - 0.6, f)), "^clocks"),
-    "film backwards": (_order(lambda k: k[::-1]), "^clocks"),
+    "frames reversed": (_order(lambda k: k[::-1]), "^clocks"),
     "every frame twice": (_doubled, _AGAIN),
-    "masks of 0 and 1": (lambda film: replace(film, white=1), ""),
+    "masks of 0 and 1": (lambda video: replace(video, white=1), ""),
     "exposure 0.4 to 1.6": (_each(lambda rgb, k: rgb * (0.4 + 1.2 * k / 23)), ""),
     "white balance": (_each(lambda rgb, k: rgb * np.array([1.2, 1, 0.7])), ""),
     "text burnt in": (
@@ -476,31 +479,31 @@ ONE_EYE: dict[str, tuple[Change, str]] = {
     "black tool at rest": (_still((15, 15, 17), 3, (0, 0.75), (0, 0.83), (0.35, 0.66), (0.34, 0.61)), ""),
     "gauze at rest": (_still((225, 220, 212), 15, (0.02, 0.1), (0.2, 0.05), (0.22, 0.3), (0.03, 0.32)), ""),
     "blood pool": (_still((95, 10, 14), 2, (0.7, 0.75), (0.85, 0.7), (0.92, 0.85), (0.75, 0.92)), ""),
-    "mirrored": (lambda film: _turned(film, (np.s_[:], _FLIP)), ""),
-    "turned by 180 deg": (lambda film: _turned(film, (_FLIP, _FLIP)), ""),
+    "mirrored": (lambda video: _turned(video, (np.s_[:], _FLIP)), ""),
+    "turned by 180 deg": (lambda video: _turned(video, (_FLIP, _FLIP)), ""),
     "negative": (_each(lambda rgb, k: 255 - rgb), ""),
     "grey": (_each(lambda rgb, k: rgb @ np.full((3, 3), 1 / 3)), ""),
     "BGR": (_each(lambda rgb, k: rgb[..., ::-1]), ""),
-    "10 bits": (lambda film: replace(film, video=(12, "yuv420p10le", 3)), ""),
+    "10 bits": (lambda video: replace(video, codec=(12, "yuv420p10le", 3)), ""),
     "JPEG at quality 10": (_jpeg(10), ""),
     "flicker": (_each(lambda rgb, k: rgb * (1 + 0.15 * (-1) ** k)), ""),
 }
-TWO_EYES: dict[str, tuple[Change, str]] = {
-    "right eye a frame late": (_order(lambda k: np.maximum(k - 1, 0), True), _LATE),
-    "right eye lost a frame": (_order(lambda k: np.minimum(k + (k > 6), len(k) - 1), True), _LATE),
-    "right eye frozen": (_order(lambda k: np.minimum(k, 6), True), "^stereo"),
-    "right eye mirrored": (_right(lambda film: film.right[:, :, ::-1]), "mirrored"),
-    "right eye 4 rows down": (_right(lambda film: np.roll(film.right, 4, axis=1)), "rows"),
-    "eyes swapped": (lambda film: replace(film, rgb=film.right, right=film.rgb), "swapped"),
-    "right eye a copy of the left": (_right(lambda film: film.rgb), "left camera's own"),
+STEREO: dict[str, tuple[Change, str]] = {
+    "right camera a frame late": (_order(lambda k: np.maximum(k - 1, 0), True), _LATE),
+    "right camera lost a frame": (_order(lambda k: np.minimum(k + (k > 6), len(k) - 1), True), _LATE),
+    "right camera frozen": (_order(lambda k: np.minimum(k, 6), True), "^stereo"),
+    "right camera mirrored": (_right(lambda video: video.right[:, :, ::-1]), "mirrored"),
+    "right camera 4 rows down": (_right(lambda video: np.roll(video.right, 4, axis=1)), "rows"),
+    "cameras swapped": (lambda video: replace(video, rgb=video.right, right=video.rgb), "swapped"),
+    "right camera a copy of the left": (_right(lambda video: video.rgb), "left camera's own"),
     "baseline 2 times too long": (
         _stated(stereo={"calibration": "stereo.yaml", "mm_per_unit": 2}),
         "^scale",
     ),
-    "scale 1.5 times too large, two eyes": (_stated(scale_mm_per_px=1.5), "^scale"),
-    "bumped by 5 px, two eyes": (_both_bumped, "^camera"),
+    "scale 1.5 times too large, stereo": (_stated(scale_mm_per_px=1.5), "^scale"),
+    "bumped by 5 px, stereo": (_both_bumped, "^camera"),
 }
-FILMS = ONE_EYE | TWO_EYES
+CHANGES = MONOCULAR | STEREO
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Tuning measured: is a budget kept on fresh sequences?"""
+"""Tuning measured: whether fresh sequences stay within the budget."""

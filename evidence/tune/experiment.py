@@ -1,4 +1,4 @@
-"""Does `synth tune` keep its budget on sequences that had no part in the choice, and what does it save?
+"""Error and cost of jobs tuned by `synth tune`, on sequences that were not used for tuning.
 
 Run: python -m evidence.tune.experiment
 """
@@ -19,35 +19,36 @@ from synth.tune import search
 from synth.tune.grid import differences
 
 _WORDS = (
-    "The displacement of a frame stands for a force by a dual-weighted residual (`synth/tune/probe.py`). "
-    "*Error*: how far that of recovered displacement is off the truth of full fidelity, root mean square "
-    "over frames as a part of the force, mean over sequences. A setting *takes* of the budget by how much "
-    "that is more than at full fidelity, or by how much the label itself moves, whichever is more. Intervals "
-    "are over fresh sequences; costs are CPU time of physics, scene, rendering and flow.",
+    "The force is estimated from the displacement of a frame by a fixed linear rule (`synth/tune`). *Error*: "
+    "of the force estimated from recovered displacement against the true force at full fidelity, root mean "
+    "square relative to the force, mean over sequences. *Used* of the budget: the increase of the error over "
+    "full fidelity, or the change of the label, whichever is larger. Intervals are over fresh sequences; "
+    "costs are CPU time of physics, scene, rendering and flow.",
 )
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Has a job SCENE.yaml for each scene.")] = report.RESULTS / "tune",
+    out: Annotated[Path, typer.Option(help="Folder with a job SCENE.yaml a scene.")] = report.RESULTS
+    / "tune",
     scenes: str = "easy,middle,hard",
     budgets: str = "force 5%,force 3%",
-    probes: Annotated[int, typer.Option(help="Sequences that every setting is measured on.")] = 2,
-    checks: Annotated[int, typer.Option(help="Further ones for whole settings.")] = 2,
-    fresh: Annotated[int, typer.Option(min=3, help="Sequences that had no part in the choice.")] = 6,
+    probes: Annotated[int, typer.Option(help="Sequences on which every setting is measured.")] = 2,
+    checks: Annotated[int, typer.Option(help="Further ones for complete jobs.")] = 2,
+    fresh: Annotated[int, typer.Option(min=3, help="Sequences not used for tuning.")] = 6,
 ) -> None:
     """Tunes scenes of different difficulty and checks budget and cost on fresh sequences."""
     rows = []
     for scene in scenes.split(","):
         job = reader.load_job(str(out / f"{scene}.yaml"))
         journal = out / f"{scene}.part"
-        # One budget after the other finds what was measured for the one before.
+        # Each budget reuses the measurements of the one before.
         measurements = search.Measurements(job, journal)
         for budget in map(search.parse_budget, budgets.split(",")):
             tuned = search.tune(measurements, budget, probes, checks)
-            unseen = range(probes + checks, probes + checks + fresh)
+            others = range(probes + checks, probes + checks + fresh)
             whole = {"full": tuned.full, "own": tuned.own, "best": tuned.best}
             again = {
-                kind: measurements.evaluate(one.settings, unseen)
+                kind: measurements.evaluate(one.settings, others)
                 for kind, one in zip(("full", "before", "after"), whole.values(), strict=True)
             }
             changes = dict(differences(tuned.best.settings, tuned.own.settings))
@@ -55,13 +56,11 @@ def main(
             checked = {kind: _described(one) for kind, one in again.items()}
             rows.append({"scene": scene, "budget": budget, "changes": changes, **described, "fresh": checked})
         journal.unlink()
-    kept = {"rows": rows}
-    report.save(out, "tune.json", kept, page(kept))
-    report.show({"rows": table(rows)})
+    report.publish(out, "tune.json", {"rows": rows}, page, {"rows": table(rows)})
 
 
 def _described(one: search.Evaluation) -> dict[str, Any]:
-    """Ready for JSON; None where a sequence could not be carried out."""
+    """An evaluation as JSON; None where a sequence failed."""
     errors, totals, (cost,) = (
         [float(value) if np.isfinite(value) else None for value in values]
         for values in (one.growths, one.errors, [one.stages.sum()])
@@ -70,7 +69,7 @@ def _described(one: search.Evaluation) -> dict[str, Any]:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Draws `tune.json`: error of the force over cost of whole jobs."""
+    """Draws `tune.json`: error of the force against cost of complete jobs."""
     panels = []
     for scene in dict.fromkeys(row["scene"] for row in found["rows"]):
         curves = []
@@ -79,27 +78,26 @@ def page(found: Mapping[str, Any]) -> report.Page:
                 whole = row["full"], row["own"], row["best"]
                 costs = tuple(one["cpu_s_a_frame"] for one in whole)
                 errors = tuple(100 * _mean(one["totals"]) for one in whole)
-                labels, name = ("full", "the job as it was", "tuned"), f"budget {100 * row['budget']:g}%"
+                labels, name = ("full", "untuned", "tuned"), f"budget {100 * row['budget']:g}%"
                 curves.append(report.Curve(name, costs, errors, labels, ringed=(2,)))
         panels.append(report.Panel(scene, "CPU s a frame", "error of the force [%]", tuple(curves)))
     sections = [report.Section("", table(found["rows"]))]
     words = [_verdict(found["rows"]), *found.get("notes", ()), *_WORDS]
-    title = "Does tuning keep its budget on fresh sequences?"
-    return report.Page(title, found, panels, sections, words)
+    return report.Page("Tuning: error and cost on fresh sequences", found, panels, sections, words)
 
 
 def _verdict(rows: list[dict[str, Any]]) -> str:
-    kept = [_mean(row["fresh"]["after"]["errors"]) <= row["budget"] for row in rows]
+    within = [_mean(row["fresh"]["after"]["errors"]) <= row["budget"] for row in rows]
     costs = [row["fresh"][kind]["cpu_s_a_frame"] for row in rows for kind in ("after", "before")]
     ratios = [after / before for after, before in zip(costs[::2], costs[1::2], strict=True)]
     return (
-        f"**The mean over fresh sequences is within the budget in {sum(kept)} of {len(kept)} cases, at "
-        f"{min(ratios):.2f} to {max(ratios):.2f} of the cost of the job as it was.**"
+        f"**The mean over fresh sequences is within the budget in {sum(within)} of {len(within)} cases, at "
+        f"{min(ratios):.2f} to {max(ratios):.2f} times the cost of the untuned job.**"
     )
 
 
 def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One line a scene and budget."""
+    """One line for each scene and budget."""
     lines = []
     for row in rows:
         full, before, after = (row["fresh"][kind] for kind in ("full", "before", "after"))
@@ -108,11 +106,11 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             {
                 "scene": row["scene"],
                 "budget [%]": 100 * row["budget"],
-                "taken, probes [%]": f"{100 * _mean(row['best']['errors']):.1f}",
-                "taken, fresh [%]": _over(after["errors"]),
-                "as it was, fresh [%]": _over(before["errors"]),
-                "error, fresh: full, as it was, tuned [%]": ", ".join(errors),
-                "CPU s a frame, as it was": before["cpu_s_a_frame"],
+                "used, probes [%]": f"{100 * _mean(row['best']['errors']):.1f}",
+                "used, fresh [%]": _over(after["errors"]),
+                "used untuned, fresh [%]": _over(before["errors"]),
+                "error, fresh: full, untuned, tuned [%]": ", ".join(errors),
+                "CPU s a frame, untuned": before["cpu_s_a_frame"],
                 "CPU s a frame, tuned": after["cpu_s_a_frame"],
                 "cost ratio": after["cpu_s_a_frame"] / before["cpu_s_a_frame"],
                 "changes": ", ".join(f"{key} {value}" for key, value in row["changes"].items()),
@@ -122,7 +120,7 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _mean(values: list[float | None]) -> float:
-    """NaN where a sequence could not be carried out."""
+    """Mean, NaN if a sequence failed."""
     known = [value for value in values if value is not None]
     return sum(known) / len(values) if len(known) == len(values) else float("nan")
 
@@ -132,9 +130,7 @@ def _over(values: list[float | None]) -> str:
     if None in values:
         return "out of range"
     found = interval(100 * np.asarray(values, np.float64), np.random.default_rng(0))
-    if not np.isfinite(found.low):  # too few, or all the same
-        return f"{found.mean:.1f}"
-    return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
+    return report.mean_cell([found.mean, found.low, found.high], ".1f")
 
 
 if __name__ == "__main__":

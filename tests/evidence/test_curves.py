@@ -1,4 +1,4 @@
-"""Learning curves: estimators find a force that is put in and ask what is held out."""
+"""Learning curves: estimators recover a known force and are tested on held-out sequences."""
 
 from __future__ import annotations
 
@@ -10,67 +10,55 @@ import pytest
 from made_clip import made_clip
 
 from evidence.curves import estimators
-from evidence.curves.estimators import GRID, Reader, World
+from evidence.curves.estimators import GRID, Estimator, Experiment
 from learn.data.clips import Clip
 
 
 @pytest.fixture(scope="module")
 def clips() -> list[Clip]:
-    """Displacement is the force itself, spread over the grid; what is recovered is half of it."""
+    """Clips whose displacement is the force, all over the grid; recovered displacement is half of it."""
     rng, made = np.random.default_rng(1), []
     for k in range(12):
         force = rng.normal(size=(6, 3))
         moved = np.broadcast_to(force[:, :, None, None], (6, 3, GRID.size, GRID.size)).astype(np.float32)
         one = made_clip(k, moved[:, :2], 2.0 * force)
-        given = {
-            "ideal": 2 * moved[:, :2],
-            "recovered": moved[:, :2],
-            "motion-ideal": 2 * moved,
-            "motion": moved,
-        }
+        half = {"recovered": moved[:, :2], "motion": moved}
+        fields = half | {"ideal": 2 * moved[:, :2], "motion-ideal": 2 * moved}
         sure = np.ones((6, 2, GRID.size, GRID.size), np.float32)
-        made.append(
-            replace(one, displacement=given, motion_confidence=sure, density=moved / GRID.extent_mm**2)
-        )
+        density = moved / GRID.extent_mm**2
+        made.append(replace(one, displacement=fields, motion_confidence=sure, density=density))
     return made
 
 
 @pytest.fixture
-def world(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
+def experiment(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
     monkeypatch.setattr(estimators, "_load", lambda root, work: clips)
     monkeypatch.setattr(estimators, "_bare", lambda root: [k % 2 == 0 for k in range(12)])
-    monkeypatch.setattr(World, "generation_cpu_s", lambda self: 3600.0)
-    return World(tmp_path / "data", (), 4, 2, 10, tmp_path / "work")
+    monkeypatch.setattr(estimators, "generation_cpu_s", lambda root: 3600.0)
+    return Experiment(tmp_path / "data", (), 4, 2, 10, tmp_path / "work")
 
 
-def test_ridge_of_two_eyes_finds_the_force_and_of_one_its_part(world: World) -> None:
-    two = world.rows(Reader("ridge", "recovered", 2, 6))[0]
-    one = world.rows(Reader("ridge", "recovered", 1, 6))[0]
+def test_ridge_estimates_force_in_stereo_and_its_lateral_part_monocular(experiment: Experiment) -> None:
+    two = experiment.rows(Estimator("ridge", "recovered", 2, 6))[0]
+    one = experiment.rows(Estimator("ridge", "recovered", 1, 6))[0]
     assert two["whole"][0] < 0.02
     assert two["gain"] == pytest.approx(1, abs=0.02)
     assert one["across"][0] < 0.02
     assert one["along"][0] > 0.3
     assert two["cpu_h"] == pytest.approx(6, abs=0.1)
+    assert experiment.rows(Estimator("ridge", "exact", 2, 6))[0]["whole"][0] < 0.02
 
 
-def test_exact_is_fitted_on_true_motion_and_asked_with_it(world: World) -> None:
-    assert world.rows(Reader("ridge", "exact", 2, 6))[0]["whole"][0] < 0.02
-
-
-def test_no_sequence_that_is_asked_was_fitted(
-    world: World, clips: list[Clip], monkeypatch: pytest.MonkeyPatch
+def test_tested_sequences_are_held_out(
+    experiment: Experiment, clips: list[Clip], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: dict[str, list[str]] = {}
+    used: dict[str, list[str]] = {}
 
-    def fitted(self: World, one: Reader, fit: list[Clip], choose: list[Clip], key: str) -> object:
-        seen.update(fit=[c.content_hash for c in fit], choose=[c.content_hash for c in choose])
-        return lambda clip: seen.setdefault("asked", []).append(clip.content_hash) or clip.force
+    def fitted(self: Experiment, one: Estimator, fit: list[Clip], select: list[Clip], key: str) -> object:
+        used.update(fit=[c.content_hash for c in fit], select=[c.content_hash for c in select])
+        return lambda clip: used.setdefault("test", []).append(clip.content_hash) or clip.force
 
-    monkeypatch.setattr(World, "_fitted", fitted)
-    row = world.rows(Reader("ridge", "recovered", 2, 6))[0]
+    monkeypatch.setattr(Experiment, "_fitted", fitted)
+    row = experiment.rows(Estimator("ridge", "recovered", 2, 6))[0]
     assert row["whole"][0] == 0
-    assert seen == {
-        "fit": ["6", "7", "8", "9", "10", "11"],
-        "choose": ["4", "5"],
-        "asked": ["0", "1", "2", "3"],
-    }
+    assert used == {"fit": [*map(str, range(6, 12))], "select": ["4", "5"], "test": ["0", "1", "2", "3"]}

@@ -1,4 +1,4 @@
-"""Whole pipelines: errors of known answers, turns that keep the physics, rules that find what is linear."""
+"""Whole pipelines: errors of known estimates, orientations of clips, ridge, the cache."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ N, T = 16, 6
 
 
 def clip(rng: np.random.Generator, name: int = 0) -> Clip:
-    """Force across the line of sight: E times the sum of displacement; a mask with a corner missing."""
+    """Clip with a force across the line of sight, E times the sum of displacement, and an incomplete mask."""
     mask = np.ones((N, N), np.float32)
     mask[:3, :5] = 0
     moved = rng.standard_normal((T, 2, N, N)).astype(np.float32) * mask
@@ -28,24 +28,23 @@ def clip(rng: np.random.Generator, name: int = 0) -> Clip:
     return made_clip(name, moved, force, mask)
 
 
-def test_errors_of_known_answers() -> None:
+def test_errors_of_known_estimates() -> None:
     force = np.tile([3.0, 0.0, 4.0], (2, 1))
     nothing = models.errors([np.zeros((2, 3))], [force])
     assert [nothing[part][0] for part in ("errors", "across", "along")] == pytest.approx([1, 0.6, 0.8])
-    # A small press weighs as much as a large one.
-    assert models.errors([force * 0, force * 0.5], [force, 100 * force])["errors"] == pytest.approx(
-        [1, 0.995]
-    )
+    # Sequences have equal weights, whatever their force.
+    both = models.errors([force * 0, force * 0.5], [force, 100 * force])
+    assert both["errors"] == pytest.approx([1, 0.995])
 
 
 def arrow(clip: Clip) -> NDArray[np.float64]:
-    """Where the one moved cell is from the middle, and how it moves, (4,)."""
+    """Position of the only moved cell from the centre, and its displacement, (4,)."""
     moved = np.asarray(clip.displacement["recovered"][0])
     row, col = np.argwhere(np.abs(moved).sum(axis=0) > 0)[0]
     return np.array([col - (N - 1) / 2, row - (N - 1) / 2, *moved[:, row, col]])
 
 
-def test_turns_turn_places_and_vectors_alike() -> None:
+def test_orientations_transform_places_and_vectors_alike() -> None:
     one = clip(np.random.default_rng(0))
     moved = np.zeros((T, 2, N, N), np.float32)
     moved[:, :, 2, 11] = (3.5, -5.5)  # outwards: x right, y down
@@ -59,7 +58,7 @@ def test_turns_turn_places_and_vectors_alike() -> None:
 
 
 @pytest.mark.slow
-def test_ridge_finds_what_is_linear_and_nothing_where_nothing_moves() -> None:
+def test_ridge_recovers_a_linear_relation_and_zero_force_without_motion() -> None:
     rng = np.random.default_rng(2)
     fit, fresh = [clip(rng, k) for k in range(12)], clip(rng, 12)
     ridge = models.build(models.RIDGE, fit)
@@ -68,21 +67,19 @@ def test_ridge_finds_what_is_linear_and_nothing_where_nothing_moves() -> None:
     assert ridge(still) == pytest.approx(0)
 
 
-def test_what_is_kept_is_found_only_by_all_that_made_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[int] = []
+def test_cached_results_depend_on_inputs_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[int] = []
 
-    def ask(*parts: object) -> int:
-        cache.result(tmp_path, "x", cache.key(*parts), lambda: asked.append(1) or len(asked))
-        return len(asked)
+    def count(*parts: object) -> int:
+        cache.result(tmp_path, "x", cache.key(*parts), lambda: computed.append(1) or len(computed))
+        return len(computed)
 
-    assert [ask("a", ["b"]), ask("a", ["b"]), ask("a", ["c"]), ask("a", ["b"])] == [1, 1, 2, 2]
+    assert [count("a", ["b"]), count("a", ["b"]), count("a", ["c"]), count("a", ["b"])] == [1, 1, 2, 2]
     (home := tmp_path / "learn").mkdir()
-    words = []
+    hashes = []
     for text in ("RATE = 1", "RATE = 2"):
         (home / "train.py").write_text(text)
-        words.append(provenance.code("learn", home=tmp_path))
-    assert words[0] != words[1]
-    monkeypatch.setattr(cache, "code", lambda: words[1])
-    assert ask("a", ["b"]) == 3
+        hashes.append(provenance.code("learn", home=tmp_path))
+    assert hashes[0] != hashes[1]
+    monkeypatch.setattr(cache, "code", lambda: hashes[1])
+    assert count("a", ["b"]) == 3

@@ -1,4 +1,4 @@
-"""The flow room: errors, scenes that hold their own truth, films from elsewhere, figures of two eyes."""
+"""Measurements of flow: errors, ground truth of scenes and videos, figures of stereo."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from evidence.flow import foreign
-from evidence.flow.foreign_scenes import Recipe, film, recipes
+from evidence.flow.foreign_scenes import Recipe, recipes, video
 from evidence.flow.measure import against, divergence
 from evidence.flow.scenes import CLEAN, Pair, inverse, pairs, pixels, pull_field
 from evidence.flow.scenes import Recipe as Pull
@@ -27,15 +27,13 @@ def test_error_of_a_known_offset() -> None:
     assert error.magnitude == pytest.approx(0.25)  # |(4, 3)| = 5 against 4
     assert np.isnan(error.hidden)
 
-
-def test_contact_counts_hidden_points_and_contact_seen_does_not() -> None:
     truth = np.zeros((4, 4, 2), np.float32)
     flow = truth.copy()
     flow[0, :, 0] = 8.0  # wrong under the tool only
     contact, hidden = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
     contact[:2], hidden[0] = True, True
     error = against(flow, known(truth, hidden, contact), 0.0)
-    assert (error.contact, error.contact_seen, error.hidden) == (4.0, 0.0, 8.0)
+    assert (error.contact, error.contact_visible, error.hidden) == (4.0, 0.0, 8.0)
 
 
 def test_divergence_of_a_linear_field() -> None:
@@ -43,8 +41,8 @@ def test_divergence_of_a_linear_field() -> None:
     np.testing.assert_allclose(found[8:-8, 8:-8], 0.2, atol=1e-5)
 
 
-def test_scene_holds_its_own_truth() -> None:
-    """The now frame, read where the flow points, is the rest frame; the inverse of the flow undoes it."""
+def test_scene_agrees_with_its_flow() -> None:
+    """The current frame warped by the flow is the rest frame; the inverse of the flow undoes it."""
     (pair,) = pairs(CLEAN, 1, 3)
     x, y = np.moveaxis(pixels(*pair.flow.shape[:2]) + pair.flow, -1, 0)
     moved = map_coordinates(pair.now[..., 1].astype(float), (y, x), order=3, mode="nearest")
@@ -56,12 +54,10 @@ def test_scene_holds_its_own_truth() -> None:
     assert np.abs(source + np.stack(there, -1) - pixels(96, 96))[4:-4, 4:-4].max() < 0.01
 
 
-_PLAIN = Recipe(0, "drawn grey", "", False, "twist", 3.0, "white", 0.0, False, False, 0, 0.0, ())
-
-
-def test_film_holds_its_own_truth() -> None:
-    """The now frame, read where the flow points, is the rest frame, lit a little otherwise."""
-    rest, *later = film(_PLAIN, 96, 6)
+def test_video_agrees_with_its_flow() -> None:
+    """The current frame warped by the flow is the rest frame, up to the light."""
+    plain = Recipe(0, "drawn grey", "", False, "twist", 3.0, "white", 0.0, False, False, 0, 0.0, ())
+    rest, *later = video(plain, 96, 6)
     one = max(later, key=lambda shown: shown.amplitude)
     assert np.linalg.norm(one.flow, axis=-1).max() > 1.0
     inner = (slice(10, -10), slice(10, -10))
@@ -71,21 +67,21 @@ def test_film_holds_its_own_truth() -> None:
         ratio = moved[inner] / rest.rgb[..., 1][inner]
         return float(np.abs(ratio - np.median(ratio)).mean())
 
-    assert spread(pixels(96, 96) + one.flow) < 0.03  # the bulge's own light
+    assert spread(pixels(96, 96) + one.flow) < 0.03  # the bulge changes the light
     assert spread(pixels(96, 96)) > 1.5 * spread(pixels(96, 96) + one.flow)
 
 
 @pytest.mark.slow
-def test_chosen_masks_are_as_good_as_the_better_of_all_and_none() -> None:
-    """At a small size: all of the third film's tissue is taken for a tool."""
+def test_selected_masks_are_as_good_as_the_better_of_all_and_none() -> None:
+    """At a small size; all tissue of the third video is mistaken for a tool."""
     rows = [foreign.judge(one, 112, 8) for one in recipes("tuning", 4)]
     assert sum(row["both"] for row in rows) > 1.3 * sum(row["auto"] for row in rows)
-    found = {row["what"]: row["found"] for row in foreign.summarise(rows)}
+    found = {row["what"]: row["measured"] for row in foreign.summarise(rows)}
     assert found["EPE / better of all masks and none"] < 1.1
-    assert found["largest share of free tissue masked"] < 0.1
+    assert found["largest share of unobstructed tissue masked"] < 0.1
 
 
-def test_errors_bias_and_scores_of_two_eyes_are_those_put_in() -> None:
+def test_errors_bias_and_z_scores_of_stereo_are_those_put_in() -> None:
     true = np.zeros((40_000, 3))
     true[:, 2] = 0.5
 

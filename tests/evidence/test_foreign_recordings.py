@@ -1,4 +1,4 @@
-"""Recordings of other programs' making: what is ours of them tells the truth."""
+"""Recordings simulated and rendered by other programs: interpolation, forces, calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evidence.foreign import recordings
 
 
 def solved() -> dict[str, Any]:
-    """A surface that moves down by the square of the level, and rises with the pulse by 0.2 mm everywhere."""
+    """A surface that sinks by the square of the level and rises by 0.2 mm with the pulse, as by felupe."""
     x = np.linspace(-45, 45, 9)
     at = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     moved, pulse = np.zeros((4, 3, len(at), 3)), np.zeros((len(at), 3))
@@ -23,7 +23,7 @@ def solved() -> dict[str, Any]:
     return {"at": at, "moved": moved, "pulse": pulse}
 
 
-def test_between_levels_and_nodes_the_surface_moves_as_it_did_at_them() -> None:
+def test_the_surface_interpolates_levels_and_nodes() -> None:
     surface = recordings.Surface.of(solved(), np.random.default_rng(0))
     assert np.abs(surface.at(np.zeros(4), 0.0)).max() == 0
     for level in (0.2, 1 / 3, 0.8, 1.0):
@@ -33,8 +33,8 @@ def test_between_levels_and_nodes_the_surface_moves_as_it_did_at_them() -> None:
 
 
 @pytest.mark.slow
-def test_a_recording_holds_the_force_that_was_put_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both programs replaced: what they are given and what the folder holds must agree."""
+def test_a_recording_contains_the_prescribed_force(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With both programs replaced, their input and the recording agree."""
     given: dict[str, Any] = {}
 
     def ran(python: Path, folder: Path, work: str, values: dict[str, Any], arrays: Any = None) -> Path:
@@ -43,9 +43,9 @@ def test_a_recording_holds_the_force_that_was_put_in(tmp_path: Path, monkeypatch
             np.savez(folder / "mechanics.npz", **solved())
         else:
             shown = cv2.resize(np.uint8(255 * arrays["albedo"]), (320, 240))
-            for eye in values["cameras"]:
+            for prefix in values["cameras"]:
                 for k in range(len(arrays["moved"])):
-                    cv2.imwrite(str(folder / f"{eye}{k:05d}.png"), shown)
+                    cv2.imwrite(str(folder / f"{prefix}{k:05d}.png"), shown)
         return folder / f"{work}.npz"
 
     monkeypatch.setattr(recordings, "run", ran)
@@ -54,20 +54,20 @@ def test_a_recording_holds_the_force_that_was_put_in(tmp_path: Path, monkeypatch
     rows = np.loadtxt(tmp_path / "pulse-0/force.csv", delimiter=",", skiprows=1)
     contacts = given["mechanics"]["contacts"]
     strongest = max(np.linalg.norm(one["force_mn"]) for one in contacts)
-    seen = 1000 * np.linalg.norm(rows[:, 1:], axis=1)
-    assert 0.5 * strongest < seen.max() < 1.1 * strongest
-    assert np.median(seen[rows[:, 0] < 1.9]) < 0.1
-    # A press goes down, away from a camera above: along the line of sight it is positive.
-    peaks = [rows[np.argmax(seen * (np.abs(rows[:, 0] - t) < 0.75)), 3] for t in (2.75, 4.25, 5.75, 7.25)]
+    measured = 1000 * np.linalg.norm(rows[:, 1:], axis=1)
+    assert 0.5 * strongest < measured.max() < 1.1 * strongest
+    assert np.median(measured[rows[:, 0] < 1.9]) < 0.1
+    # A press points away from the camera: positive along the line of sight.
+    peaks = [rows[np.argmax(measured * (np.abs(rows[:, 0] - t) < 0.75)), 3] for t in (2.75, 4.25, 5.75, 7.25)]
     assert [bool(peak > 0) for peak in peaks] == [one["force_mn"][2] < 0 for one in contacts]
     assert opened.meta.stereo is not None
     assert opened.meta.young_kpa == pytest.approx(given["mechanics"]["young_kpa"])
 
 
-def test_the_pair_that_is_written_sees_a_point_where_both_cameras_do(tmp_path: Path) -> None:
-    """Projected by Blender's matrices by hand, and by OpenCV with the file's K, R and T."""
+def test_the_stereo_calibration_agrees_with_blender(tmp_path: Path) -> None:
+    """A point has the same projection by Blender's matrices and by OpenCV with the file's K, R and T."""
     left, focal = recordings.first_camera(np.random.default_rng(4))
-    right = recordings.beside(left)
+    right = recordings.right_camera(left)
     recordings.write_pair(tmp_path / "pair.yaml", left, right, focal)
     file = cv2.FileStorage(str(tmp_path / "pair.yaml"), cv2.FILE_STORAGE_READ)
     K, R, T = (file.getNode(name).mat() for name in ("K2", "R", "T"))

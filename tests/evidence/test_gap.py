@@ -1,4 +1,4 @@
-"""The gap's arithmetic on errors that are known, the noise model on noise that is."""
+"""The gap on known errors, the noise model on known noise, and the split."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from evidence.gap import experiment, gap
 from synth.errors import UserError
 
 
-def test_share_closed_by_hand() -> None:
+def test_share_closed_of_known_errors() -> None:
     rng = np.random.default_rng(0)
     base = rng.uniform(0.9, 1.1, 30)
     got = gap.closed(10 * base, 6 * base, 2 * base, rng)
     assert got.share == pytest.approx(4 / 8, rel=1e-9)
-    assert got.interval == pytest.approx((0.5, 0.5), abs=1e-6)  # all in proportion: pairs leave no doubt
+    assert got.interval == pytest.approx((0.5, 0.5), abs=1e-6)  # proportional pairs: no uncertainty
     errors = rng.normal(5, 2, 20)
     none = gap.closed(errors, errors - 1, errors + 0.3 * rng.normal(size=20), rng)
     assert np.isnan(none.share)
     assert none.undefined
 
 
-def test_noise_is_fitted_and_made_alike() -> None:
+def test_fitted_noise_is_that_added() -> None:
     rng = np.random.default_rng(1)
     mask = np.zeros((48, 48), np.float32)
     mask[6:-6, 6:-6] = 1
@@ -37,14 +37,14 @@ def test_noise_is_fitted_and_made_alike() -> None:
     assert not true.add(ideal[0], mask, rng)[:, :, 0, 0].any()
 
 
-def test_the_unseen_world_shares_no_anatomy() -> None:
+def test_the_parts_share_no_anatomy() -> None:
     def made(name: str, count: int) -> list[Any]:
         return [SimpleNamespace(group=f"{name}{k // 2}", content_hash=f"{name}{k}") for k in range(count)]
 
     ours, theirs = made("a", 60), made("b", 8)
-    split, seen = experiment.parts(ours, theirs)
+    split, tested = experiment.parts(ours, theirs)
     assert split.test == tuple(range(60, 68))
-    parts = [set(split.fit), set(split.select), set(seen)]
+    parts = [set(split.fit), set(split.select), set(tested)]
     assert set.union(*parts) == set(range(60))
     anatomies = [{i // 2 for i in part} for part in parts]
     assert sum(map(len, anatomies)) == len(set.union(*anatomies))

@@ -1,8 +1,8 @@
-"""Learn's evidence: disturbances have their size, controls score what they must."""
+"""Measurements of learning: size of disturbances, scores of controls, cached runs."""
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace as replace_field
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ def run() -> Run:
     return Run("mse-fold0-seed0", replace(runs.study(), size=32, epochs=1, arch=arch))
 
 
-def test_a_run_is_made_once_for_its_settings_and_data(
+def test_a_run_is_cached_by_settings_and_data(
     run: Run, clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
@@ -36,13 +36,10 @@ def test_a_run_is_made_once_for_its_settings_and_data(
     assert len(trained) == 1
     runs.carry_out(Run(run.name, replace(run.settings, seed=1)), clips, tmp_path)
     assert len(set(trained)) == 2
-    # Controls of the scoring: no motion explains nothing, the truth everything.
+    # Controls: R² is at most 0 without motion and 1 for the true force.
     predictor = runs.fit(run, clips, tmp_path)
-    held = [clip.name for clip in clips]
-    assert {row["name"] for row in first["sequences"]} <= set(held)
-    nothing = [
-        dataclasses.replace(c, displacement={k: 0 * v for k, v in c.displacement.items()}) for c in clips
-    ]
+    assert {row["name"] for row in first["sequences"]} <= {clip.name for clip in clips}
+    nothing = [replace_field(c, displacement={"ideal": 0 * c.displacement["ideal"]}) for c in clips]
     assert evaluate(predictor, nothing, "ideal").summary()["map_r2_pooled"] <= 0
     card = predictor.card
     kind, parts = card.settings.target, card.settings.arch.components
@@ -53,7 +50,7 @@ def test_a_run_is_made_once_for_its_settings_and_data(
 
 
 @pytest.mark.parametrize("patch", [0.0, 3.0])
-def test_noise_has_its_size_and_leaves_the_rest_frame(clips: list[Clip], patch: float) -> None:
+def test_noise_has_its_size_and_spares_the_rest_frame(clips: list[Clip], patch: float) -> None:
     noisy = stability.noisy(clips[0], 0.02, patch, GRID, np.random.default_rng(0))
     added = noisy.displacement["ideal"] - clips[0].displacement["ideal"]
     assert not added[0].any()
@@ -61,16 +58,16 @@ def test_noise_has_its_size_and_leaves_the_rest_frame(clips: list[Clip], patch: 
     assert inside.std() == pytest.approx(0.02, rel=0.1 if patch == 0 else 0.4)
 
 
-def test_a_wrong_scale_makes_lengths_longer_and_keeps_the_centre(clips: list[Clip]) -> None:
-    seen = stability.scaled(clips[2], 1.25)
-    assert seen.mask.sum() == pytest.approx(clips[2].mask.sum() * 1.25**2, rel=0.1)
-    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], seen)]
+def test_a_wrong_scale_multiplies_lengths_about_the_centre(clips: list[Clip]) -> None:
+    zoomed = stability.scaled(clips[2], 1.25)
+    assert zoomed.mask.sum() == pytest.approx(clips[2].mask.sum() * 1.25**2, rel=0.1)
+    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], zoomed)]
     assert largest[1] == pytest.approx(1.25 * largest[0], rel=0.1)
     same = stability.scaled(clips[2], 1.0)
     np.testing.assert_allclose(same.displacement["ideal"], clips[2].displacement["ideal"], atol=1e-6)
 
 
-def test_a_coarser_grid_keeps_force_and_motion(clips: list[Clip]) -> None:
+def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
     wide = coarser(clips[2], GRID, 2)
     fine = clips[2].density.sum((2, 3)) * GRID.pitch_mm**2
     np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)

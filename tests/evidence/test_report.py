@@ -1,4 +1,4 @@
-"""What a measurement leaves: data with what made them."""
+"""Results of a measurement: data with their provenance, charts."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ CHART = Chart("error", "mN", bars({"ours": 1.0, "theirs": 2.0}, {"ours": (0.5, 1
 ROWS = [{"law": "<linear>", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a | b"}]
 
 
-def test_data_are_kept_with_what_made_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["x", "/some/where.csv", "--cache=/a/b", "-o", "/tmp/o", "--seeds", "3"])
-    report.save(tmp_path, "found.json", {"third": 1 / 3, "rows": ROWS}, Page("Room", {}, [PANEL, CHART]))
+    report.save(tmp_path, "found.json", {"third": 1 / 3, "rows": ROWS}, Page("Title", {}, [PANEL, CHART]))
     found = json.loads((tmp_path / "found.json").read_text())
     assert list(found) == ["command", "commit", "machine", "cpu_hours", "third", "rows"]
     assert found["command"].endswith("where.csv --cache=b --seeds 3")
@@ -32,5 +32,5 @@ def test_data_are_kept_with_what_made_them(tmp_path: Path, monkeypatch: pytest.M
         assert all(value in text for value in values)
 
 
-def test_a_front_has_what_nothing_beats() -> None:
+def test_pareto_front() -> None:
     assert report.front([(2.0, 1.0), (1.0, 3.0), (3.0, 2.0), (1.0, 2.0)]) == [3, 0]

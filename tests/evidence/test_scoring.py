@@ -1,4 +1,4 @@
-"""Stand-ins for ex vivo recordings."""
+"""Ex vivo stand-ins."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from synth.recording_flow.video_flow import RecordingFlowSettings
 
 
 @pytest.mark.slow
-def test_a_stand_in_has_a_second_eye_where_asked(tmp_path: Path) -> None:
-    plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72), eyes=2)
+def test_a_stereo_stand_in_agrees_with_its_calibration(tmp_path: Path) -> None:
+    plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72), cameras=2)
     recording = open_recording(exvivo.make(plan, 0, tmp_path / "000"))
     left, right = list(recording.frames()), list(recording.right_frames())
     assert len(left) == len(right) == 9
@@ -24,5 +24,7 @@ def test_a_stand_in_has_a_second_eye_where_asked(tmp_path: Path) -> None:
     )
     assert done.stereo is not None
     assert done.stereo.baseline_mm == pytest.approx(24.0, abs=1e-6)
-    assert done.stereo.epipolar_px < 0.3, "the calibration is that of the pictures"
-    assert np.abs(left[0].rgb.astype(int) - right[0].rgb.astype(int)).mean() > 4, "two places"
+    assert done.stereo.epipolar_px < 0.3, "the calibration fits the images"
+    assert np.abs(left[0].rgb.astype(int) - right[0].rgb.astype(int)).mean() > 4, (
+        "the cameras are in different places"
+    )

@@ -1,4 +1,4 @@
-"""Kept results: whether what made them has changed since."""
+"""Stored results: whether the files that made them have changed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evidence import status
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A checkout with a script, a module that it imports, another one, data, and the script's result."""
+    """A checkout with a script, an imported module, another module, data, and the script's result."""
     files = {
         "evidence/flow/pareto.py": "from synth import flow",
         "synth/__init__.py": "",
@@ -45,15 +45,9 @@ def git(folder: Path, *words: str) -> str:
 
 @pytest.mark.parametrize(
     ("changed", "found"),
-    [
-        ("synth/other.py", ()),
-        ("synth/job.py", ("synth/job.py",)),
-        ("data/job.yaml", ("data/job.yaml",)),
-    ],
+    [("synth/other.py", ()), *((name, (name,)) for name in ("synth/job.py", "data/job.yaml"))],
 )
-def test_stale_if_what_it_imports_or_read_has_changed(
-    home: Path, changed: str, found: tuple[str, ...]
-) -> None:
+def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple[str, ...]) -> None:
     assert [one.changed for one in status.gather(home / "results", home)] == [()]
     (home / changed).write_text((home / changed).read_text() + "\n")
     (one,) = status.gather(home / "results", home)

@@ -1,4 +1,4 @@
-"""Stand-ins for the pipeline: sequences that cost nothing, and such that end badly."""
+"""Stand-ins for the pipeline: sequences without rendering, and sequences that fail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ProgressCallback = Callable[[str, int, int], None]
 
 
 def sequence(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """Every field random, from the job's seed and the index only."""
+    """A sequence of random fields, which depend on the job's seed and the index alone."""
     rng = np.random.default_rng((job.seed, index))
     width, height = job.render.size
     writer = Writer(folder, index, frames=job.frames, size=(height, width), job=job)
@@ -38,7 +38,7 @@ def sequence(job: Job, index: int, folder: Path, report: ProgressCallback) -> No
 
 
 def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
-    """What a stand-in's store says of itself."""
+    """Attributes of a stand-in's store."""
     gesture = {"kind": "pull", "load": 0.1}
     return {
         "scenario": {"index": index, "family": "healthy", "gesture": gesture},
@@ -50,7 +50,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 refuses, 7 works at the second try."""
+    """Sequence 1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 is refused, 7 succeeds when repeated."""
     if index == 1:
         report("render", 0, 1)
         os.abort()
@@ -75,32 +75,32 @@ def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> No
 
 
 def seeing(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """Leaves word of the GPU that it sees, and takes long enough that every worker gets one."""
-    (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "whatever is there"))
+    """A slow sequence that writes the GPUs visible to it into a file, so that every worker gets one."""
+    (folder / ".run" / f"saw-{index}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "unset"))
     slow(job, index, folder, report)
 
 
 def hanging(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """It never comes back."""
+    """A sequence that takes ten minutes."""
     time.sleep(600)
 
 
 def trying(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """Sequences 2 and 6 cannot be carried out."""
+    """A sequence; 2 and 6 are refused."""
     if index in (2, 6):
         raise UserError("the load is past the material's range")
     sequence(job, index, folder, report)
 
 
 def full(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """The disk is full at the third sequence."""
+    """A sequence; from the third one on the disk is full."""
     if index >= 2:
         raise OSError(28, "No space left on device")
     sequence(job, index, folder, report)
 
 
 def slow(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """A sequence that takes its time, so that it can be interrupted."""
+    """A sequence that takes a quarter of a second, so that it can be interrupted."""
     for t in range(5):
         report("fem", t, 5)
         time.sleep(0.05)
@@ -108,7 +108,7 @@ def slow(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
 
 
 def stuck(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """From the fourth sequence on without end: whoever interrupts it comes in time."""
+    """A sequence; from the fourth one on it runs until it is interrupted."""
     while index >= 3:
         report("fem", 0, 5)
         time.sleep(0.05)
@@ -116,9 +116,9 @@ def stuck(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
 
 
 def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fault: str = "") -> None:
-    """A flat tissue seen squarely that slides to the right while a load rests on it: every invariant holds.
+    """A flat tissue, parallel to the image plane, that slides to the right under a load: all invariants hold.
 
-    `fault` names the field that is made wrong, for tests that must find it.
+    `fault` names a field that is made wrong, for tests of the checks.
     """
     rng = np.random.default_rng((job.seed, index))
     width, height = job.render.size
@@ -219,5 +219,5 @@ def _block(tool: Any, rows: Any, height: int) -> Any:
 
 
 def wrong(fault: str) -> Callable[[Job, int, Path, ProgressCallback], None]:
-    """`consistent` with one fault, sealed as if nothing were wrong."""
+    """`consistent` with one fault, sealed."""
     return lambda job, index, folder, report: consistent(job, index, folder, report, fault)
