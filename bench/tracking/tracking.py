@@ -185,7 +185,7 @@ class _Forces:
         self.pictured = shown.parts[0] if isinstance(shown, FusedEstimate) else pictured
         self.methods, self.watch = methods, watch
         self.out = TrackedRecording(pictured=self.pictured or "")
-        self.answers: list[dict[str, ForceEstimate]] = []
+        self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: NDArray[np.float32] | None = None
         self.stride, self.cameras = 1, 1
 
@@ -200,7 +200,7 @@ class _Forces:
         position = len(out.time_s)
         wanted = position % self.stride == 0
         self.cameras = 1 if moved is None else 2
-        answers: dict[str, ForceEstimate] = {}
+        estimates: dict[str, ForceEstimate] = {}
         density = None
         for name, method in self.methods.items():
             if isinstance(method, FusedEstimate):
@@ -208,13 +208,13 @@ class _Forces:
             with self.watch.stage(name):
                 shown = wanted and name == self.pictured
                 if moved is not None and isinstance(method, Uses3D):
-                    answer = method.in_space(frame.flow, frame.confidence, moved, scene, shown)
+                    estimate = method.in_space(frame.flow, frame.confidence, moved, scene, shown)
                 else:
-                    answer = method(frame.flow, frame.confidence, scene, shown)
-            answers[name] = replace(answer, density=None)
+                    estimate = method(frame.flow, frame.confidence, scene, shown)
+            estimates[name] = replace(estimate, density=None)
             if name == self.pictured:
-                density = answer.density
-        self.answers.append(answers)
+                density = estimate.density
+        self.estimates.append(estimates)
         speed = 0.0
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
@@ -238,20 +238,20 @@ class _Forces:
         for name, method in self.methods.items():
             if isinstance(method, Revising) and len(times):
                 with self.watch.stage(name):
-                    for frame, answer in zip(self.answers, method.revise(contact_free), strict=True):
-                        frame[name] = answer
-        tracked = [frame for frame, known in zip(self.answers, self.out.trusted, strict=True) if known]
+                    for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
+                        frame[name] = estimate
+        tracked = [frame for frame, known in zip(self.estimates, self.out.trusted, strict=True) if known]
         for name, method in self.methods.items():
             if isinstance(method, FusedEstimate):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras)
-                for frame, answer in zip(tracked, fused, strict=True):
-                    frame[name] = answer
-                for frame in self.answers:
+                for frame, estimate in zip(tracked, fused, strict=True):
+                    frame[name] = estimate
+                for frame in self.estimates:
                     frame.setdefault(name, frame[method.parts[0]])
         for name in self.methods:
-            self.out.force_mn[name] = [frame[name].force_mn for frame in self.answers]
-            self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.answers]
+            self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
+            self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
 
     def _snap(self, position: int, frame: FrameMotion, density: NDArray[np.float32] | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""

@@ -110,7 +110,7 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
         flow: (H, W, 2) px, the flow that the features describe.
     """
     height, width = flow.shape[:2]
-    small = answer(net, features).transpose(1, 2, 0)
+    small = predict(net, features).transpose(1, 2, 0)
     size = CELL * small.shape[1], CELL * small.shape[0]
     missing, spread = (cv2.resize(part, size)[:height, :width] for part in (small[..., :2], small[..., 2:]))
     # Log-variances are limited to the trained range; the deviation is the geometric mean of both components.
@@ -118,7 +118,7 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
     return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
 
 
-def answer(net: CorrectionNet, features: NDArray[np.float32]) -> NDArray[np.float32]:
+def predict(net: CorrectionNet, features: NDArray[np.float32]) -> NDArray[np.float32]:
     """Output (2 parts, h', w') of the network for features (channels, h, w), with its padding."""
     with torch.inference_mode():
         cells = torch.from_numpy(padded(features))[None]

@@ -131,9 +131,9 @@ class SelectingTracker:
         solved = [(self.rest_blocked, self.blocked, first)]
 
         def solve(rest: Flags, now: Flags) -> Solution:
-            for *masks, answer in solved:
+            for *masks, solution in solved:
                 if np.array_equal([rest, now], masks):
-                    return answer
+                    return solution
             tracker.usable = tracker.tissue & ~rest
             solved.append((rest, now, tracker.solve(frame, now, initial)))
             return solved[-1][2]

@@ -113,9 +113,9 @@ class SimilarityBasis:
         one, nothing = np.ones_like(x), np.zeros_like(x)
         return np.column_stack([one, nothing, x, -y, nothing, one, y, x]).reshape(-1, 4)
 
-    def matrix(self, answer: Floats) -> Floats:
+    def matrix(self, parameters: Floats) -> Floats:
         """(2, 3): from pixels of the rest frame to pixels of the picture."""
-        x, y, larger, turned = answer / np.array([1, 1, self._unit, self._unit])
+        x, y, larger, turned = parameters / np.array([1, 1, self._unit, self._unit])
         linear = np.array([[1 + larger, -turned], [turned, 1 + larger]])
         return np.column_stack([linear, self._centre - linear @ self._centre + (x, y)])
 
@@ -213,7 +213,7 @@ class CameraTracker:
         guess, _ = cv2.estimateAffinePartial2D(at, at + shift, ransacReprojThreshold=0.5)
         if guess is None:
             return None
-        design, answer = self._basis.design(at), np.zeros(4)
+        design, parameters = self._basis.design(at), np.zeros(4)
         left = at + shift - (at @ guess[:, :2].T + guess[:, 2])
         for _ in range(CORNERS.rounds):
             off = np.linalg.norm(left, axis=1)
@@ -222,12 +222,12 @@ class CameraTracker:
             normal = weighed.T @ design
             if weight.sum() < CORNERS.points / 2 or np.linalg.cond(normal) > CORNERS.singular:
                 return None
-            answer = np.linalg.solve(normal, weighed.T @ shift.ravel())
-            left = shift - (design @ answer).reshape(-1, 2)
+            parameters = np.linalg.solve(normal, weighed.T @ shift.ravel())
+            left = shift - (design @ parameters).reshape(-1, 2)
         tissue = self._basis.design(self._tissue)
         leverage = ((tissue @ np.linalg.inv(normal)) * tissue).sum(axis=1).mean()
         variance = CORNERS.correlated * spread**2 * 2 * leverage
-        matrix = self._basis.matrix(answer)
+        matrix = self._basis.matrix(parameters)
         length = self._length(matrix - np.eye(2, 3))
         # Surroundings that move more near the tissue than far from it are tissue outside the mask.
         away = np.linalg.norm(at - self._tissue.mean(axis=0), axis=1)

@@ -151,14 +151,14 @@ class SharedMotion:
     def _fit(self, motion: Floats, weight: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]:
         """Robust fit to visible cells: similarity (4,), amplitudes (S,) of shapes and residual (2 P,)."""
         both, left = np.hstack([self._columns, shapes]), motion
-        answer, sure = np.zeros(both.shape[1]), weight
+        fitted, sure = np.zeros(both.shape[1]), weight
         for _ in range(MODEL.rounds):
             weighed = np.repeat(sure, 2)[:, None] * both
-            answer = np.linalg.lstsq(weighed.T @ both, weighed.T @ motion, rcond=1e-9)[0]
-            left = motion - both @ answer
+            fitted = np.linalg.lstsq(weighed.T @ both, weighed.T @ motion, rcond=1e-9)[0]
+            left = motion - both @ fitted
             off = np.linalg.norm(left.reshape(-1, 2), axis=1)
             sure = weight * weigh_outliers(off, off[weight > 0])[0]
-        return np.asarray(answer[:4]), np.asarray(answer[4:]), left * np.repeat(weight > 0, 2)
+        return np.asarray(fitted[:4]), np.asarray(fitted[4:]), left * np.repeat(weight > 0, 2)
 
     def _learn(self, shape: Floats) -> None:
         """Adds a shape (2 P,) and the prediction of its similarity to the state."""
@@ -195,9 +195,9 @@ class SharedMotion:
         deviation = float(np.sqrt(max(2 * of_cells.mean(), 0.0)))
         return Similarity(self._basis.matrix(state[:4]), deviation, self._length(state[:4]))
 
-    def _length(self, answer: Floats) -> float:
+    def _length(self, similarity: Floats) -> float:
         """Root mean square of a similarity (4,) over the cells [px]."""
-        return float(self._rms((self._columns @ answer)[:, None])[0])
+        return float(self._rms((self._columns @ similarity)[:, None])[0])
 
     @staticmethod
     def _rms(columns: Floats) -> Floats:

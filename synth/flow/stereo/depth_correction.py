@@ -71,5 +71,5 @@ def correct(features: NDArray[np.float32]) -> tuple[Map, Map]:
         UserError: the weights are missing.
     """
     height, width = features.shape[1:]
-    found = correction.answer(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]
+    found = correction.predict(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]
     return UNIT_MM * found[0], UNIT_MM * np.exp(0.5 * found[1].clip(-8, 5))

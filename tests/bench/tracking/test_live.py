@@ -37,10 +37,10 @@ def pictures(frames: int) -> list[Picture]:
 @pytest.mark.slow
 def test_flow_in_another_process_gives_the_same_results_in_order() -> None:
     def watched(flow: LocalFlow | None) -> list[live.LiveFrame]:
-        answered: list[live.LiveFrame] = []
+        results: list[live.LiveFrame] = []
         footage, settings = Footage(pictures(5), "test"), RecordingFlowSettings("dis", 1, None, False, "none")
-        live.stream_video(footage, settings, paced=False, report=answered.append, flow=flow)
-        return answered
+        live.stream_video(footage, settings, paced=False, report=results.append, flow=flow)
+        return results
 
     here = watched(None)
     with closing(FlowProcess()) as process:
