@@ -5,18 +5,13 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
-
-if TYPE_CHECKING:
-    from bench.recording.folder import Recording
-    from synth.recording_flow.video_flow import RecordingFlowSettings
 
 app = typer.Typer(
     name="bench",
@@ -75,16 +70,50 @@ def score(
 
     Prints no table and exits with code 2 if the recording can't be measured.
     """
+    from rich.console import Console
+    from threadpoolctl import threadpool_limits
+
+    from bench.methods.network import Model
     from bench.recording.folder import open_recording
-    from synth.recording_flow.video_flow import RecordingFlowSettings
+    from bench.scoring import report
+    from bench.scoring import score as scoring
+    from bench.scoring.headline import headline
+    from bench.scoring.result import as_json
+    from learn.inference.shipped import require_model
+    from learn.training.threads import set_threads
     from synth.video.mask_files import read_choice
 
     others = _pairs("--also", also, "NAME=FOLDER")
     kind, files = read_choice(masks)
     opened = open_recording(recording, phantom).within(files, _rectangle(region))
-    settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     folder = out or Path(f"{opened.name}-score")
-    _score(opened, model, folder, settings, title, json, others, train=train)
+    # NumPy's BLAS too: its threads would compete with the flow for the same cores.
+    threadpool_limits(set_threads(None))
+    result = scoring.score(
+        opened,
+        model or require_model(opened.has_stereo),
+        methods={name: Model(Path(at)) for name, at in others.items()},
+        train=train,
+        settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),
+        out=folder,
+        title=title,
+        progress=True,
+        own_process=True,
+    )
+    if json:
+        print(json_.dumps(as_json(result), allow_nan=False))
+    else:
+        console, first = Console(), headline(result)
+        for line in filter(None, (first.refused, *first.warnings)):
+            console.print(line, style="bold red", markup=False, highlight=False)
+        if not result.refused:
+            console.print(report.terminal_table(result))
+        for note in result.notes:
+            console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+        # Never wrapped, so that the path can be copied.
+        console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+    if result.refused:
+        raise typer.Exit(2)
 
 
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
@@ -233,57 +262,6 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
             raise UserError(f"{option} {word}: expected {form}")
         named[name] = value
     return named
-
-
-def _score(
-    opened: Recording,
-    model: Path | None,
-    folder: Path,
-    settings: RecordingFlowSettings,
-    title: str,
-    json: bool,
-    also: Mapping[str, str | Path] | None = None,
-    **more: Any,
-) -> None:
-    """Scores a recording, writes into `folder` and prints; `also`: more models; `more`: for `bench.score`."""
-    from rich.console import Console
-    from threadpoolctl import threadpool_limits
-
-    from bench.methods.network import Model
-    from bench.scoring import headline, report
-    from bench.scoring.result import as_json
-    from bench.scoring.score import score
-    from learn.inference.shipped import require_model
-    from learn.training.threads import set_threads
-
-    # NumPy's BLAS too: its threads would compete with the flow for the same cores.
-    threadpool_limits(set_threads(None))
-    result = score(
-        opened,
-        model or require_model(opened.has_stereo),
-        methods={name: Model(Path(at)) for name, at in (also or {}).items()},
-        settings=settings,
-        out=folder,
-        title=title,
-        progress=True,
-        own_process=True,
-        **more,
-    )
-    if json:
-        print(json_.dumps(as_json(result), allow_nan=False))
-        raise typer.Exit(2 if result.refused else 0)
-    console = Console()
-    first = headline.headline(result)
-    for line in filter(None, (first.refused, *first.warnings)):
-        console.print(line, style="bold red", markup=False, highlight=False)
-    if not result.refused:
-        console.print(report.terminal_table(result))
-    for note in result.notes:
-        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-    # Never wrapped, so that the path can be copied.
-    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
-    if result.refused:
-        raise typer.Exit(2)
 
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")

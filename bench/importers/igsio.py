@@ -18,8 +18,7 @@ from synth.system.checked_file import refuse_large
 _LARGEST_BYTES = 1 << 42
 _LONGEST_LINE = 65536
 
-Fields = dict[str, dict[int, str]]
-"""Text of a field by name and frame."""
+Fields = dict[str, dict[int, str]]  # text of a field by name and frame
 
 _FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 

@@ -26,8 +26,7 @@ from synth.video.file_numbers import natural_order
 Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
 """Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
-BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")
-"""Parts of a ROS bag; each is a topic."""
+BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")  # topics
 _STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _PLAIN = "bench.importers.plain_files"
 _MAKERS = {

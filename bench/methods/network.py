@@ -59,17 +59,12 @@ class Model:
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        return self._estimate(flow, confidence, None, scene, picture)
+        return self.in_space(flow, confidence, None, scene, picture)
 
     def in_space(
-        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        """See `Uses3D`; a monocular network uses the flow only."""
-        return self._estimate(flow, confidence, moved, scene, picture)
-
-    def _estimate(
         self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
+        """See `Uses3D`; a monocular network uses the flow only."""
         if self._estimator is None or self._estimator[0] is not scene:
             about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
             self._estimator = scene, ForceEstimator(self.predictor, *about)

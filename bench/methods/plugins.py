@@ -14,8 +14,8 @@ from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext, 
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
+# An entry point is a callable without arguments that returns a `Method`.
 METHODS = Registry("sulcus.method", "method", "method", {})
-"""Entry points of methods: callables without arguments that return a `Method`."""
 
 _MOST_MN = 1e12  # larger forces are errors
 

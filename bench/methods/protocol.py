@@ -14,8 +14,7 @@ from bench.methods.force_mixture import ForceMixture
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
-Field = NDArray[np.float32]
-"""(H, W, ...) on the pixels that flow is computed on."""
+Field = NDArray[np.float32]  # (H, W, ...) on the pixels that flow is computed on
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,6 @@ class _Checked:
     def add(self, state: str, what: str, message: str) -> None:
         self.findings.append(Finding(state, what, message))
 
-    def judge(self, fine: bool, what: str, message: str) -> None:
-        self.add("ok" if fine else "odd", what, message)
-
 
 def check_recording(folder: Path, phantom: bool = False, picture: Path | None = None) -> list[Finding]:
     """Opens a recording, decodes its pictures and checks its files against each other. Raises no UserError.
@@ -168,8 +165,8 @@ def _check_scale(recording: Recording, found: _Checked) -> None:
         found.add("ok", "stiffness", f"E = {young:g} kPa ± {100 * recording.meta.young_uncertainty:.2g}%")
     scale = pixel_scale.find_scale(recording.meta, recording.folder)
     found.mm_per_px = scale.mm_per_px
-    message = f"{scale.mm_per_px:.4g} mm/px ± {100 * scale.uncertainty:.2g}% ({scale.source})"
-    found.add("ok", "scale", message)
+    error = f"{100 * scale.uncertainty:.2g}%"
+    found.add("ok", "scale", f"{scale.mm_per_px:.4g} mm/px ± {error} ({scale.source})")
 
 
 def _check_video(recording: Recording, found: _Checked) -> None:
@@ -198,7 +195,7 @@ def _check_video(recording: Recording, found: _Checked) -> None:
         found.add("lack", "tissue", "no tissue.png: the whole picture is assumed to be tissue")
     found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
     if video.summary.frames:
-        found.judge(not video.summary.is_odd, "tracking", video.summary.describe())
+        found.add("odd" if video.summary.is_odd else "ok", "tracking", video.summary.describe())
     stereo = None if second is None else second.quality
     if stereo is not None and not judge_stereo(stereo, found.mm_per_px or stereo.mm_per_px):
         found.add("ok", "stereo", stereo.describe())
@@ -232,8 +229,7 @@ def _check_times(recording: Recording, found: _Checked) -> None:
     jumps = np.diff(t) > _JUMP * np.median(np.diff(t))
     found.add("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")
     if found.timeless or found.back:
-        message = f"{found.timeless} frames without a time, {found.back} whose time runs backwards"
-        found.add("odd", "times", message)
+        found.add("odd", "times", f"{found.timeless} frames without a time, {found.back} backwards in time")
     if jumps.any():
         found.add("odd", "times", f"{jumps.sum()} gaps, the longest {np.diff(t).max():.3g} s")
     if not 0.5 <= rate <= 1000:
@@ -260,7 +256,7 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
         share = max(common, 0) / (times[-1] - times[0])
         other = clocks.find_other_unit(times, t)
         message = other or f"the sensor covers {100 * share:.0f}% of the video"
-        found.judge(share > 0.9 and not other, "clocks", message)
+        found.add("ok" if share > 0.9 and not other else "odd", "clocks", message)
 
 
 def _check_press(recording: Recording, found: _Checked) -> None:
@@ -270,4 +266,4 @@ def _check_press(recording: Recording, found: _Checked) -> None:
         needed_s = _LEAST_PRESS / min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
         inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
         message = f"press_s covers {inside_s:.3g} s of video; at least {needed_s:.3g} s are needed"
-        found.judge(inside_s >= needed_s, "press", message)
+        found.add("ok" if inside_s >= needed_s else "odd", "press", message)

@@ -33,8 +33,7 @@ from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture
 
-Video = Path | dict[int, Path]
-"""A video file, or pictures by the numbers in their names, in order."""
+Video = Path | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
 
 _LARGEST_FORCE_N = 50.0
 _EPOCH_S = 1e8  # three years, longer than any recording: larger times count from 1970

@@ -16,8 +16,7 @@ from synth.flow import image
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo.track import StereoTracker
 
-Motion = NDArray[np.float64]
-"""(T, P, 2) px of P points since the rest frame, the first; NaN: not tracked."""
+Motion = NDArray[np.float64]  # (T, P, 2) px of P points since the rest frame, the first; NaN: not tracked
 Places = NDArray[np.float32]
 
 _CORNERS, _APART_PX, _LEAST_POINTS = 200, 5, 8

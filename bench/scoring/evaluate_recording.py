@@ -77,13 +77,8 @@ def evaluate_recording(
     if meta.young_kpa is None:
         notes.append(_NO_YOUNG)
     press = None if meta.press_s is None else _within(time_s, meta.press_s)
-    against = _Reference(
-        time_s,
-        sensor,
-        _scored_frames(meta, time_s, notes) & ~_repeated(tracked, sensor.size_mn, notes),
-        press,
-        meta.young_kpa is not None,
-    )
+    used = _scored_frames(meta, time_s, notes) & ~_repeated(tracked, sensor.size_mn, notes)
+    against = _Reference(time_s, sensor, used, press, meta.young_kpa is not None)
     if lost.any() and not first_fault(findings):
         notes.append(f"tracking was lost in {lost.sum()} of {len(lost)} frames: they are not scored")
     scored: dict[str, Scored] = {}

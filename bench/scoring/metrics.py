@@ -14,8 +14,7 @@ from bench.bootstrap import Interval
 from learn.evaluation import metrics
 from learn.evaluation.metrics import Metric
 
-Curve = NDArray[np.float64]
-"""(T,) float64."""
+Curve = NDArray[np.float64]  # (T,)
 
 _LARGEST_LAG_S = 0.5
 _LEAST_CONTACT_MN = 1e-3
@@ -35,27 +34,21 @@ METRICS = {
     "lag_s": Metric("lag", "ms", "Delay of predicted, at the best correlation.", "zero", 3, True, "lag"),
     "r_at_lag": Metric("r at that lag", "", "Correlation with the lag removed.", "high", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", "high", column="contact F1"),
-    "false_positive_rate": Metric(
-        "false positives", "%", "Contact-free samples with predicted contact.", "low", column="FPR"
-    ),
+    "false_positive_rate": Metric("false positives", "%", "Free samples with contact.", "low", column="FPR"),
     "background_mn": Metric("background force", "mN", "Mean predicted force without contact.", "low", 2),
     "threshold_mn": Metric("contact threshold", "mN", "Sensor's force at contact.", "", 2, True),
     "events": Metric("contacts", "", "Contacts in the sensor's curve.", relative=True),
     "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", "", 2, True),
     "peak_mae": Metric("peak error", "%", "Mean relative error of peaks.", "low", column="peak err."),
-    "impulse_mae": Metric(
-        "impulse error", "%", "Mean relative error of impulses.", "low", column="impulse err."
-    ),
+    "impulse_mae": Metric("impulse error", "%", "The same for impulses.", "low", column="impulse err."),
     "dropout": Metric("dropout", "%", "Samples without a prediction.", "low", 3, True, "dropout"),
 }
 """Definitions of the scores by their key in `score.json`."""
 
+# Scores that are defined without a known stiffness.
 RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
-"""Scores that are defined without a known stiffness."""
-
-
+# Fields of `learn.evaluation.metrics.Agreement` and their keys here.
 _AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "ccc": "ccc", "r2": "r2"}
-"""Fields of `learn.evaluation.metrics.Agreement` and their keys here."""
 
 
 def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:

@@ -23,8 +23,7 @@ Curve = NDArray[np.float64]
 _METHOD_KEYS = (
     "interval", "scores", "intervals", "calibrated", "worse_by_mn", "gain", "components", "events",
 )  # fmt: skip
-MOST_LOST = 0.2
-"""Share of lost frames from which a recording has no scores: the remaining frames are the easy ones."""
+MOST_LOST = 0.2  # largest share of lost frames for scores: the remaining frames are the easy ones
 
 
 @dataclass(frozen=True)

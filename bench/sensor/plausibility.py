@@ -151,8 +151,7 @@ def _stands(time_s: Curve, axes: Curve, moved: Curve) -> list[Finding]:
             if stands and np.ptp(moved[run]) > LIMITS.moves * np.ptp(moved):
                 span = f"{time_s[run[0]]:.3g} to {time_s[run[-1]]:.3g} s"
                 what = f"f{'xyz'[k]}_n is constant at {values[run[0]]:.3g} mN from {span}"
-                message = f"{what} while the tissue moves: saturated, or stuck?"
-                return [Finding("odd", "sensor", message)]
+                return [Finding("odd", "sensor", f"{what} while the tissue moves: saturated, or stuck?")]
     return []
 
 

@@ -3,14 +3,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from fake_recording import Bump, Maker
+from fake_recording import Maker
 
 
 @pytest.fixture
 def make(tmp_path: Path) -> Maker:
     return Maker(tmp_path)
-
-
-@pytest.fixture
-def bump() -> Bump:
-    return Bump()

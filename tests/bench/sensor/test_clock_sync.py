@@ -52,16 +52,6 @@ def test_periodic_presses_are_ambiguous() -> None:
     assert found.refused
 
 
-def test_noise_is_refused() -> None:
-    frames, _, t, force = recording(0.0)
-    speed = np.abs(np.random.default_rng(5).normal(size=len(frames)))
-    assert clock_sync.find_offset(frames, speed, t, force, 0.5).refused
-
-
-def test_lag_beyond_the_search_is_refused() -> None:
-    assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused
-
-
 def test_intervals_that_were_not_tracked_are_left_out() -> None:
     frames, speed, t, force = recording(0.2)
     lost = np.arange(20, 60)
@@ -73,8 +63,10 @@ def test_intervals_that_were_not_tracked_are_left_out() -> None:
     assert clock_sync.find_offset(frames, speed, t, force, 0.7).refused
 
 
-def test_too_short_a_span_and_a_still_one_are_refused() -> None:
+def test_undetermined_offsets_are_refused() -> None:
     frames, speed, t, force = recording(0.0)
-    assert clock_sync.find_offset(frames[:10], speed[:10], t, force, 0.5).refused
-    assert clock_sync.find_offset(frames, 0 * speed, t, force, 0.5).refused
-    assert clock_sync.find_offset(frames + 100, speed, t, force, 0.5).refused
+    noise = np.abs(np.random.default_rng(5).normal(size=len(frames)))
+    short = frames[:10], speed[:10]
+    for frame_s, moved in (short, (frames, noise), (frames, 0 * speed), (frames + 100, speed)):
+        assert clock_sync.find_offset(frame_s, moved, t, force, 0.5).refused
+    assert clock_sync.find_offset(*recording(0.5), search_s=0.3).refused, "beyond the search"
