@@ -6,6 +6,7 @@ Run: python -m evidence.appearance.classifier cortex.jpg --frames 5 --epochs 8 -
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +88,22 @@ def main(
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
     add("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
-    means, ends = ({row["crops"]: row[key] for row in rows} for key in ("auc", "ends"))
-    bars = report.bars(means, ends)
+    results = {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows}
+    report.publish(out, "classifier.json", results, page)
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Mean AUC of every set of crops, with the range over folds."""
+    rows = found["rows"]
+    bars = tuple(report.Row(row["crops"], row["auc"], tuple(row["ends"])) for row in rows)
     chart = report.Chart("1: separable, 0.5: not separable", "AUC, lowest to highest fold", bars)
-    sections = [report.Section("AUC", rows)]
-    report.publish(
-        out,
-        "classifier.json",
-        {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows},
-        lambda found: report.Page("Rendered crops against a photograph's", found, [chart], sections),
+    table = [
+        {"crops": row["crops"], "count": row["count"], "AUC": report.mean_cell([row["auc"], *row["ends"]])}
+        for row in rows
+    ]
+    words = (f"**AUC of the default job: {rows[0]['auc']:.2f}.** Mean and range over folds.",)
+    return report.Page(
+        "Rendered crops against a photograph's", found, [chart], [report.Section("", table)], words
     )
 
 

@@ -10,7 +10,7 @@ job `mission` and of mission-ood.yaml in this folder.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
+from itertools import product, starmap
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,17 +89,17 @@ def page(found: Mapping[str, Any]) -> report.Page:
         [_panel(own, f"{name}, {_NAMES[cameras]}") for (name, cameras), own in groups.items()],
         [report.Section(heading, _table(rows, part)) for part, heading in _PARTS.items()],
         (
-            " ".join(_verdict(own, f"{name}, {_NAMES[cameras]}") for (name, cameras), own in groups.items()),
+            f"**Least error of the force: {'; '.join(starmap(_verdict, groups.items()))}.**",
             "Root mean square error relative to that of the force, mean over sequences with 95% interval. "
             f"The tables are of {last}. Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence.",
         ),
     )
 
 
-def _verdict(rows: Sequence[Mapping[str, Any]], name: str) -> str:
+def _verdict(group: tuple[str, int], rows: Sequence[Mapping[str, Any]]) -> str:
     best = min(rows, key=lambda row: float(row["whole"][0]))
     error = report.percent(best["whole"])
-    return f"{name}: least error with {best['model']} on {best['size']} sequences, {error}."
+    return f"{group[0]}, {_NAMES[group[1]]}: {error} with {best['model']} on {best['size']} sequences"
 
 
 def _panel(rows: Sequence[Mapping[str, Any]], title: str) -> report.Panel:
