@@ -40,9 +40,9 @@ _NEIGHBOURS = 5
 class Baseline:
     """A rule as a `Method`."""
 
-    def __init__(self, rule: Rule, in_space: bool = False) -> None:
-        """`in_space`: whether the rule requires motion in three dimensions."""
-        self._rule, self._space = rule, in_space
+    def __init__(self, rule: Rule, uses_3d: bool = False) -> None:
+        """`uses_3d`: whether the rule requires motion in three dimensions."""
+        self._rule, self._space = rule, uses_3d
         self._view: tuple[MethodContext, GridView] | None = None
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
@@ -51,7 +51,7 @@ class Baseline:
             raise UserError("fitted on motion in three dimensions: needs a right camera or depth pictures")
         return self._estimate(flow * np.float32(scene.scale_mm_per_px), confidence, scene)
 
-    def in_space(
+    def estimate_3d(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         """See `Uses3D`."""

@@ -59,9 +59,9 @@ class Model:
 
     def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        return self.in_space(flow, confidence, None, scene, picture)
+        return self.estimate_3d(flow, confidence, None, scene, picture)
 
-    def in_space(
+    def estimate_3d(
         self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         """See `Uses3D`; a monocular network uses the flow only."""

@@ -75,7 +75,7 @@ class Physics:
         spread = np.repeat(scale * deviation(confidence)[..., None], 2, axis=2)
         return self._add(flow * scale, spread, scene, picture)
 
-    def in_space(
+    def estimate_3d(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         """See `Uses3D`."""

@@ -27,7 +27,7 @@ class Plugged:
         self._method, self._label = method, label
         # Set only where the method has them, for the protocols `Uses3D` and `Revising`.
         if isinstance(method, Uses3D):
-            self.in_space = partial(self._call, method.in_space)
+            self.estimate_3d = partial(self._call, method.estimate_3d)
         if isinstance(method, Revising):
             self.revise = self._revise
 

@@ -87,7 +87,7 @@ class Method(Protocol):
 class Uses3D(Protocol):
     """A method that can use motion in three dimensions, if a recording has a right or a depth camera."""
 
-    def in_space(
+    def estimate_3d(
         self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         """As a `Method`; `moved`: motion [mm] in camera axes and its standard deviation, (H, W, 3) each."""

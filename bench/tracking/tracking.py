@@ -208,7 +208,7 @@ class _Forces:
             with self.watch.stage(name):
                 shown = wanted and name == self.pictured
                 if moved is not None and isinstance(method, Uses3D):
-                    estimate = method.in_space(frame.flow, frame.confidence, moved, scene, shown)
+                    estimate = method.estimate_3d(frame.flow, frame.confidence, moved, scene, shown)
                 else:
                     estimate = method(frame.flow, frame.confidence, scene, shown)
             estimates[name] = replace(estimate, density=None)

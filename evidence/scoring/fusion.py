@@ -91,7 +91,7 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
                 estimates[name] = method(flow, sure, scene, False)
             else:
                 moved = Moved(sequence["motion_recovered"][k], sequence["motion_deviation"][k])
-                estimates[name] = method.in_space(flow, sure, moved, scene, False)
+                estimates[name] = method.estimate_3d(flow, sure, moved, scene, False)
         frames.append(estimates)
     for estimates, revised in zip(frames, physics.revise(np.zeros(len(frames), bool)), strict=True):
         estimates[PHYSICS] = revised

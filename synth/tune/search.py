@@ -85,7 +85,7 @@ class Measurements:
             with suppress(*[UserError] * (settings != self.full)):
                 self._known[key] = probe.measure(changed(job, settings))
             with self._journal.open("a", encoding="utf-8") as file:
-                # The newline comes first, so that a line that was cut off before spoils itself alone.
+                # The newline comes first, so that a line cut off before it corrupts only itself.
                 file.write("\n" + json.dumps([key, self._known[key]]))
             print(f"sequence {sequence}: {show(settings, self.own)}", file=sys.stderr, flush=True)
         return self._known[key]

@@ -104,8 +104,8 @@ def scores(recording: Path, out: Path) -> tuple[Numbers, dict[str, str]]:
     for name, method in score["methods"].items():
         numbers[f"error, {name}"] = mean_and_maximum(method["scores"]["mae_mn"])
     numbers["sensor"] = mean_and_maximum(curve["sensor_mn"])
-    said = json.dumps({"curve": curve, "methods": score["methods"]}, sort_keys=True)
-    return numbers, {"score": hashlib.blake2b(said.encode(), digest_size=16).hexdigest()}
+    text = json.dumps({"curve": curve, "methods": score["methods"]}, sort_keys=True)
+    return numbers, {"score": hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}
 
 
 def score_stored(work: Path, name: str, job: Sequence[str]) -> tuple[Numbers, dict[str, str]]:

@@ -102,10 +102,10 @@ def _free_ports(count: int) -> list[int]:
 def _wait_for_node(daemons: list[subprocess.Popen[bytes]], home: Path) -> None:
     until = time.monotonic() + 60
     while time.monotonic() < until:
-        said = "\n".join(path.read_text(errors="replace") for path in home.glob("*.out"))
-        assert all(daemon.poll() is None for daemon in daemons), said
+        logs = "\n".join(path.read_text(errors="replace") for path in home.glob("*.out"))
+        assert all(daemon.poll() is None for daemon in daemons), logs
         done = subprocess.run(["sinfo", "-h", "-o", "%T"], capture_output=True, text=True, timeout=60)
         if done.stdout.strip() == "idle":
             return
         time.sleep(0.5)
-    raise AssertionError(f"the node never came up\n{said}")
+    raise AssertionError(f"the node never came up\n{logs}")

@@ -102,7 +102,7 @@ def test_a_baseline_fitted_on_stereo_requires_stereo() -> None:
     motion = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
     flow, sure = motion[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
     assert isinstance(method, Uses3D)
-    found = method.in_space(flow, sure, Moved(motion, np.full_like(motion, 0.01)), scene, False)
+    found = method.estimate_3d(flow, sure, Moved(motion, np.full_like(motion, 0.01)), scene, False)
     assert found.size_mn == pytest.approx(6, rel=0.12)
     with pytest.raises(UserError, match="right camera"):
         method(flow, sure, scene, False)

@@ -105,7 +105,7 @@ class Recorder:
     ) -> ForceEstimate:
         raise AssertionError("motion in three dimensions is available")
 
-    def in_space(
+    def estimate_3d(
         self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: MethodContext, picture: bool
     ) -> ForceEstimate:
         self.inputs.append(moved)

@@ -34,13 +34,13 @@ def test_a_tenth_more_load_is_an_error_of_a_tenth() -> None:
 class Fake:
     """A probe whose errors are known: what parameters do adds up, but for a surprise."""
 
-    asked, refused, scale = 0, 0, 1.0
+    calls, refused, scale = 0, 0, 1.0
 
     def __init__(self, job: Job) -> None:
         self.scale = Fake.scale * (1 + 0.01 * (job.seed % 7))
 
     def measure(self, job: Job) -> list[float]:
-        Fake.asked += 1
+        Fake.calls += 1
         if job.fem.tets == Fake.refused:
             raise UserError("inverted")
         label = {4000: 0.0, 2500: 0.005, 1600: 0.01, 800: 0.012}[job.fem.tets]
@@ -54,7 +54,7 @@ class Fake:
 @pytest.fixture(autouse=True)
 def fake(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "Probe", Fake)
-    for name, value in (("asked", 0), ("refused", 0), ("scale", 1.0)):
+    for name, value in (("calls", 0), ("refused", 0), ("scale", 1.0)):
         monkeypatch.setattr(Fake, name, value)
 
 
@@ -91,13 +91,13 @@ def test_a_job_gets_dearer_only_if_it_surely_misses_the_budget(tmp_path: Path) -
 
 def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "part"
-    first, asked = table.table(tune(tmp_path)), Fake.asked
+    first, calls = table.table(tune(tmp_path)), Fake.calls
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:30])  # killed while it wrote
     assert table.table(tune(tmp_path)) == first
-    assert Fake.asked == asked + 2
+    assert Fake.calls == calls + 2
     tune(tmp_path, job=grid.changed(JOB, {"seed": 2}))
-    assert Fake.asked >= 2 * asked  # of another job nothing is taken
+    assert Fake.calls >= 2 * calls  # of another job nothing is taken
 
 
 @pytest.mark.parametrize("refused", [800, 1600, 2500])
