@@ -136,13 +136,8 @@ class Page:
 def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = None) -> None:
     """Writes data and page into a folder.
 
-    Args:
-        folder: made if it is missing.
-        file: name of the JSON file.
-        found: data; floats are rounded to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this
-            process and its children: less than the total where a cache held parts) are put before them,
-            unless the data have such a key.
-        page: drawn from the data.
+    Floats are rounded to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this process and its
+    children: less than the total where a cache held parts) are put before the data, unless these have them.
     """
     times = os.times()
     made = {

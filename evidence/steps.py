@@ -25,15 +25,9 @@ def run_steps(
 
     A step that has passed before, by the same command and commit, is skipped.
 
-    Args:
-        steps: names and arguments.
-        journal: JSON of the steps that were run, rewritten after every step.
-        logs: folder of a log a step, `NAME.log`.
-        limit_s: time after which a step is stopped.
-
-    Returns:
-        `name`, `command`, `commit`, `exit_code` (-1: stopped at its time limit), `wall_s` and `cpu_s` of
-        these steps.
+    `journal`: JSON of the steps that were run, rewritten after every step; `logs`: folder of NAME.log;
+    `limit_s`: time after which a step is stopped. Returns `name`, `command`, `commit`, `exit_code` (-1:
+    stopped at its time limit), `wall_s` and `cpu_s` of these steps.
     """
     logs.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = json.loads(journal.read_text("utf-8"))["steps"] if journal.is_file() else []

@@ -57,7 +57,7 @@ def main(
     away = places - places.mean(axis=0)
     turn = np.arctan2(away[:, 1], away[:, 0])
     region = turn.argsort().argsort() * _FOLDS // len(turn)  # sectors about the centre, of equally many crops
-    near = crops.overlapping(places)
+    near = np.asarray((np.abs(places[:, None] - places[None]) < crops.SIDE_PX).all(axis=2))  # overlapping
     rows = []
 
     def add(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
@@ -75,7 +75,7 @@ def main(
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
-    fitted = []
+    fitted: list[dict[str, Any]] = []
     for pair in _HELD_OUT:
         usable = crops.without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
         fitted.append(fit_camera(usable))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from evidence.flow.scenes import jpeg
 from evidence.render.case import case
 from evidence.render.picture_statistics import Picture, corners
 from evidence.render.realism import outlined, scaled_photograph
@@ -81,14 +82,7 @@ def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) 
 def taken(rgb: Picture, seed: int) -> Picture:
     """The image with the noise and JPEG compression common to all crops."""
     noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
-    noisy = np.clip(rgb + noise, 0, 255).astype(np.uint8)
-    _, packed = cv2.imencode(".jpg", noisy[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
-
-
-def overlapping(places: Places) -> npt.NDArray[np.bool_]:
-    """Which crops of one image overlap, (N, N)."""
-    return np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))
+    return jpeg(np.clip(rgb + noise, 0, 255).astype(np.uint8), _QUALITY)
 
 
 def _cut(rgb: Picture, found: list[tuple[int, int]]) -> Picture:

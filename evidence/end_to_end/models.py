@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bench.methods import baselines, physics, posterior
 from bench.methods.compliance import TissueKind
+from bench.methods.protocol import Field
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
@@ -46,14 +47,15 @@ def build(model: str, fit: Sequence[Clip]) -> Estimate:
 
 
 def _by_physics(clip: Clip) -> Floats:
-    """Posterior mean force of each frame, for still tissue without a membrane."""
-    forces = []
-    for moved, sure in zip(clip.displacement["recovered"], clip.confidence, strict=True):
-        spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
-        observed = physics.observe(moved, spread, clip.mask)
-        basis = posterior.load_basis(len(moved), TissueKind())
-        forces.append(posterior.infer(basis, observed, np.zeros(len(moved))).force.mean)
-    return clip.young_kpa * np.stack(forces)
+    frames = zip(clip.displacement["recovered"], clip.confidence, strict=True)
+    return clip.young_kpa * np.stack([read_bare(moved, clip.mask, sure) for moved, sure in frames])
+
+
+def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
+    """Force of one frame, the posterior mean for still tissue without a membrane, as a baseline's rule."""
+    spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
+    basis = posterior.load_basis(len(moved), TissueKind())
+    return posterior.infer(basis, physics.observe(moved, spread, mask), np.zeros(len(moved))).force.mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
@@ -67,21 +69,21 @@ def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
 
 def turned(clip: Clip) -> list[Clip]:
     """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
-    return [_turned(clip, turn) for turn in range(8)]
 
-
-def _turned(clip: Clip, turn: int) -> Clip:
-    def each(fields: NDArray[Any]) -> NDArray[Any]:
+    def each(fields: NDArray[Any], turn: int) -> NDArray[Any]:
         return batches.turned(torch.from_numpy(np.array(fields)), turn).numpy()
 
-    return replace(
-        clip,
-        displacement={name: each(moved) for name, moved in clip.displacement.items()},
-        mask=each(clip.mask[None, None])[0, 0],
-        confidence=each(clip.confidence[:, None])[:, 0],
-        density=each(clip.density),
-        force=each(clip.force[..., None, None])[..., 0, 0],
-    )
+    return [
+        replace(
+            clip,
+            displacement={name: each(moved, turn) for name, moved in clip.displacement.items()},
+            mask=each(clip.mask[None, None], turn)[0, 0],
+            confidence=each(clip.confidence[:, None], turn)[:, 0],
+            density=each(clip.density, turn),
+            force=each(clip.force[..., None, None], turn)[..., 0, 0],
+        )
+        for turn in range(8)
+    ]
 
 
 def rows(clip: Clip, source: str = "recovered") -> Floats:

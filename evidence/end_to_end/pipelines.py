@@ -184,14 +184,9 @@ def errors(one: Pipeline, made: Sequences, tested: Sequences, work: Path) -> dic
 def recover_flow(
     sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: NDArray[np.bool_], grid: Grid
 ) -> tuple[Clip, float]:
-    """Clip with recovered flow, and the CPU time of the flow over all frames [s].
+    """Clip with the recovered flow of its rendered sequence, and the CPU time of all frames' flow [s].
 
-    Args:
-        sequence: rendered, with `rgb` and `tissue`.
-        clip: of the sequence on `grid`.
-        estimator: or its name.
-        blocked: (T, H, W) masked pixels: tool, specular highlights.
-        grid: of the clip.
+    `blocked`: (T, H, W) masked pixels: tool, specular highlights.
     """
     tissue = sequence["tissue"][:].astype(bool)
     scale = float(sequence.attrs["scale_mm_per_px"])

@@ -1,7 +1,4 @@
-"""Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals.
-
-Run: python -m evidence.fem.half_space
-"""
+"""Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals."""
 
 from __future__ import annotations
 
@@ -45,10 +42,7 @@ def main(out: Path = report.RESULTS / "fem/half-space", tets: str = "1600,5000")
 def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     """Relative root mean square errors inside the disc and outside, to twice its radius.
 
-    Args:
-        count: tetrahedra to aim for.
-        poisson: of the half-space.
-        sheet_mm: stiffness of the membrane over Young's modulus of the half-space.
+    `sheet_mm`: stiffness of the membrane over Young's modulus of the half-space.
     """
     a = _RADIUS_MM
     size = _WIDE_MM if sheet_mm else tetrahedra.BLOCK_MM

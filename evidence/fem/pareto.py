@@ -1,7 +1,4 @@
-"""Error of the physics against cost by law and mesh, error of each law by load, and cost of a sequence.
-
-Run: python -m evidence.fem.pareto
-"""
+"""Error of the physics against cost by law and mesh, error of each law by load, and cost of a sequence."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Discretisation error of default scenes: the default mesh against refined ones.
-
-Run: python -m evidence.fem.relief
-"""
+"""Discretisation error of default scenes: the default mesh against refined ones."""
 
 from __future__ import annotations
 

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from evidence import report
-from evidence.flow.scenes import Recipe, cortex, inverse, noise_field, pairs, pixels, pull_field, sample
+from evidence.flow import scenes as drawn_scenes
+from evidence.flow.scenes import Recipe, inverse, jpeg, noise_field, pairs, pixels, sample
 from synth.errors import UserError
 from synth.flow import correction, image, mask_detection
 from synth.flow.stereo import depth_correction
@@ -159,7 +160,7 @@ def _drawn(index: int) -> Frames:
         cv2.line(bar, tip.astype(int).tolist(), end.astype(int).tolist(), 1, int(rng.uniform(4, 20)))
         after = np.where(bar[..., None] > 0, rng.uniform(40, 200), after)
     rgb = [
-        _jpeg(np.clip(np.round(one + rng.normal(0, noise, one.shape)), 0, 255).astype(np.uint8), quality)
+        jpeg(np.clip(np.round(one + rng.normal(0, noise, one.shape)), 0, 255).astype(np.uint8), quality)
         for one in (before, after)
     ]
     hidden = np.stack([np.zeros_like(bar), cv2.dilate(bar, np.ones((3, 3), np.uint8))]) > 0
@@ -240,7 +241,7 @@ def _texture(size: int, rng: np.random.Generator) -> Any:
             cv2.ellipse(leaves, middle, axes, turn, 0, 360, colour, -1, cv2.LINE_AA)
         rough = rng.uniform(0, 10) * noise_field(square, float(rng.uniform(4, 20)), rng)
         return cv2.GaussianBlur(leaves, (0, 0), float(rng.uniform(0.7, 2))) + rough[..., None]
-    return 255 * cortex(size, rng)
+    return 255 * drawn_scenes.cortex(size, rng)
 
 
 def _motion(size: int, rng: np.random.Generator) -> Any:
@@ -248,7 +249,7 @@ def _motion(size: int, rng: np.random.Generator) -> Any:
     kind = rng.integers(4)
     if kind == 0:
         direction, reach = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.06, 0.2))
-        return pull_field(
+        return drawn_scenes.pull_field(
             Recipe(size=size, pull=float(rng.uniform(0.2, 10)), direction=direction, reach=reach)
         )
     if kind == 1:
@@ -315,7 +316,7 @@ def depth_example(frames: Frames) -> Frames:
     try:
         tracker = _Observed(pair, left[:still], right[:still], hidden[0][0], hidden[1][0], tissue)
     except UserError:  # too blurred or noisy to match left and right: an example without weight
-        return _example([_empty(depth_correction.CHANNELS)])
+        return _example([[np.zeros((n, 30, 40), np.float32) for n in (depth_correction.CHANNELS, 1, 1)]])
     rows, r, coarse = [], tracker.rectified, tracker.solver.coarse
     inside = r.flags(tissue, 0).astype(np.float32)
     for t in range(1, len(frames["rgb"])):
@@ -331,10 +332,6 @@ def depth_example(frames: Frames) -> Frames:
         weight[weight > 1] *= _PRESSED
         rows.append((tracker.features, missing[None], weight))
     return _example(rows)
-
-
-def _empty(channels: int) -> Any:
-    return [np.zeros((n, 30, 40), np.float32) for n in (channels, 1, 1)]
 
 
 def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
@@ -361,7 +358,7 @@ def _varied(frames: Frames, rng: np.random.Generator, again: int, depth: bool) -
             one = 255 * np.clip(gain * (1 + drift * t / 7) * balance * one**gamma, 0, 1)
             one = np.clip(np.round(one + noise * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8)
             corrupt = not depth and t and rng.random() < _CORRUPTED
-            shown[name].append(_corrupted(_jpeg(one, quality), rng) if corrupt else _jpeg(one, quality))
+            shown[name].append(_corrupted(jpeg(one, quality), rng) if corrupt else jpeg(one, quality))
     return frames | {name: np.stack(pictures) for name, pictures in shown.items()}
 
 
@@ -383,13 +380,6 @@ def _resized(frames: Frames, share: float) -> Frames:
         "flow": flow,
         "rgb": resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC),
     }
-
-
-def _jpeg(picture: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
-    if not quality:
-        return picture
-    _, packed = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
 
 
 def _corrupted(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -1,7 +1,4 @@
-"""Videos not made by this project's renderer, tracked as by `bench score`: masks, lost frames and error.
-
-Run: python -m evidence.flow.foreign
-"""
+"""Videos not made by this project's renderer, tracked as by `bench score`: masks, lost frames and error."""
 
 from __future__ import annotations
 

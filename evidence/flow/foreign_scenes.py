@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 from skimage import data as photographs  # type: ignore[import-not-found, unused-ignore]
 
-from evidence.flow.scenes import Flags, Floats, Rgb, noise_field, pixels
+from evidence.flow.scenes import Flags, Floats, Rgb, jpeg, noise_field, pixels
 
 _FINE = 2  # samples of the source a pixel
 _MARGIN = 24  # px of the source beyond the image, which motion may bring into view
@@ -323,10 +323,7 @@ class _Stage:
             picture = np.repeat(picture.mean(-1, keepdims=True), 3, -1)
         noise = rng.normal(0, self.recipe.noise, picture.shape[:2] + ((1,) if self.recipe.mono else (3,)))
         rgb = np.clip(np.round(255 * picture + noise), 0, 255).astype(np.uint8)
-        if self.recipe.quality:
-            _, packed = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.recipe.quality])
-            rgb = np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))[..., ::-1])
-        return np.asarray(rgb, np.uint8)
+        return jpeg(rgb, self.recipe.quality)
 
 
 def _near(mask: Flags) -> Flags:

@@ -69,13 +69,9 @@ Masks = Callable[[Rgb, Flags], Flags]  # (image, exact mask of usable pixels) â†
 def measure(
     estimator: Estimator, pairs: Iterable[Pair], masks: Masks | None = None, warm: float | None = None
 ) -> Error:
-    """Mean errors over pairs.
+    """Mean errors over pairs, with other masks than the exact ones if they are given.
 
-    Args:
-        estimator: to be measured.
-        pairs: with ground truth.
-        masks: replaces the exact masks.
-        warm: start from this share of the true flow, as from the previous frame; None: cold start.
+    `warm`: start from this share of the true flow, as from the previous frame; None: cold start.
     """
     errors = []
     for pair in pairs:
@@ -99,11 +95,11 @@ def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
 
 def inpainted(pair: Pair) -> Pair:
     """The pair with masked pixels set to the mean intensity, as in the paper, and all pixels usable."""
+
+    def filled(picture: Rgb, usable: Flags) -> Rgb:
+        mean: NDArray[np.float64] = picture[usable].mean(axis=0) if usable.any() else np.full(3, 128.0)
+        return np.where(usable[..., None], picture, np.round(mean)).astype(np.uint8)
+
     every = np.ones_like(pair.rest_usable)
-    rest, now = _filled(pair.rest, pair.rest_usable), _filled(pair.now, pair.now_usable)
+    rest, now = filled(pair.rest, pair.rest_usable), filled(pair.now, pair.now_usable)
     return replace(pair, rest=rest, now=now, rest_usable=every, now_usable=every)
-
-
-def _filled(picture: Rgb, usable: Flags) -> Rgb:
-    mean: NDArray[np.float64] = picture[usable].mean(axis=0) if usable.any() else np.full(3, 128.0)
-    return np.where(usable[..., None], picture, np.round(mean)).astype(np.uint8)

@@ -1,7 +1,4 @@
-"""Flow's error against time for estimators and their settings, the default marked.
-
-Run: python -m evidence.flow.pareto
-"""
+"""Flow's error against time for estimators and their settings, the default marked."""
 
 from __future__ import annotations
 

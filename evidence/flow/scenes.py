@@ -157,10 +157,6 @@ class Stage:
         wet = noise_field(size, 14 * unit, rng) + 1.2 * noise_field(size, 70 * unit, rng)
         return cls(recipe, albedo, wet, noise_field(size, 40 * unit, rng), pull_field(recipe))
 
-    def pair(self, share: float, rng: np.random.Generator) -> Pair:
-        """The rest frame and the frame at `share` of the full pull."""
-        return self.against(self.rest(rng), share, rng)
-
     def rest(self, rng: np.random.Generator) -> tuple[Rgb, Flags]:
         """The rest frame and its highlights: (H, W, 3) uint8, (H, W) bool."""
         grid = pixels(self.recipe.size, self.recipe.size)
@@ -168,7 +164,7 @@ class Stage:
         return self._sense(picture, rng), glare
 
     def against(self, rest: tuple[Rgb, Flags], share: float, rng: np.random.Generator) -> Pair:
-        """As `pair`, with an existing rest frame (a sequence has one)."""
+        """The rest frame and the frame at `share` of the full pull."""
         recipe = self.recipe
         flow = np.asarray(share * self.field, np.float32)
         source = inverse(flow)
@@ -240,7 +236,16 @@ def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:
     """`count` independent pairs with different surfaces and directions of pull."""
     for rng in (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)):
         turned = replace(recipe, direction=float(rng.uniform(0, 2 * np.pi)))
-        yield Stage.set(turned, rng).pair(1.0, rng)
+        stage = Stage.set(turned, rng)
+        yield stage.against(stage.rest(rng), 1.0, rng)
+
+
+def jpeg(rgb: Rgb, quality: int) -> Rgb:
+    """The image after JPEG compression; quality 0: unchanged."""
+    if not quality:
+        return rgb
+    _, packed = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
 
 
 def _metal(shape: tuple[int, int]) -> Floats:

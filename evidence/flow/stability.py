@@ -1,7 +1,4 @@
-"""Error of the flow under single disturbances of increasing size, and whether its confidence flags that.
-
-Run: python -m evidence.flow.stability
-"""
+"""Error of the flow under single disturbances of increasing size, and whether its confidence flags that."""
 
 from __future__ import annotations
 

@@ -27,6 +27,7 @@ from scipy.ndimage import gaussian_filter
 
 from bench.recording import writer
 from bench.recording.meta import read_meta
+from evidence.scoring.exvivo import ramp
 from synth.errors import UserError
 from synth.system.checked_file import read_picture
 
@@ -84,15 +85,9 @@ def record(
     video: tuple[float, float, int],
     pythons: tuple[Path, Path],
 ) -> None:
-    """Writes one recording into the folder `part`.
+    """Writes one recording of a kind of `KINDS` into the folder `part`.
 
-    Args:
-        part: folder of the recording.
-        name: of the specimen.
-        kind: one of `KINDS`.
-        rng: source of all random numbers.
-        video: length [s], frames a second, light paths a pixel.
-        pythons: interpreters of mechanics and of images.
+    `video`: length [s], frames a second, light paths a pixel; `pythons`: of mechanics and of images.
     """
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
@@ -185,15 +180,10 @@ def tool_motion(seconds: float, rng: np.random.Generator) -> tuple[Floats, Float
         start = _STILL_S + k * slot
         rise, fall = rng.uniform(0.25, 0.4) * slot, rng.uniform(0.2, 0.3) * slot
         end = start + 0.9 * slot
-        level[:, k] = _ramp((time - start) / rise) * _ramp((end - time) / fall)
+        level[:, k] = ramp((time - start) / rise) * ramp((end - time) / fall)
         level[:, k] *= rng.uniform(0.6, 1.0)
-        away[:, k] = np.maximum(_ramp((start - time) / 0.4), _ramp((time - end) / 0.4))
+        away[:, k] = np.maximum(ramp((start - time) / 0.4), ramp((time - end) / 0.4))
     return time, level, away
-
-
-def _ramp(s: Floats) -> Floats:
-    s = np.clip(s, 0, 1)
-    return np.asarray(s * s * (3 - 2 * s), np.float64)
 
 
 @dataclass(frozen=True)

@@ -78,10 +78,7 @@ def fit_noise(
 ) -> Noise:
     """Noise fitted to training sequences: gain by least squares, then spread and reach of the residual.
 
-    Args:
-        ideal: each (T, 2, N, N) mm.
-        recovered: each (T, 2, N, N) mm.
-        masks: each (N, N) 0/1.
+    Displacements are (T, 2, N, N) mm each, masks (N, N) 0/1.
     """
     top = sum(float((i * r).sum()) for i, r in zip(ideal, recovered, strict=True))
     gain = top / max(sum(float((i * i).sum()) for i in ideal), 1e-12)

@@ -36,16 +36,9 @@ class Training:
 
 
 def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path) -> Clip:
-    """The clip with the flow recovered by another back end, as in the paper's pipeline.
+    """The clip with the flow recovered by another back end, as in the paper's pipeline, cached in `work`.
 
     Only the instrument is masked, not highlights, as in masks drawn by hand.
-
-    Args:
-        sequence: rendered, with `rgb`, `tool` and `tissue`.
-        clip: of the sequence on `grid`, with ideal and any recovered flow.
-        backend: name of the flow estimator.
-        grid: of the clip.
-        work: folder for packed clips.
     """
 
     def make() -> Clip:
@@ -79,15 +72,10 @@ def carry_out(
     tests: Tests,
     work: Path,
 ) -> dict[str, Any]:
-    """The training's errors in every test, from `work` if it has those of the same training and data.
+    """The training's errors in every test, cached in `work`; an interrupted training is continued.
 
-    Args:
-        training: to carry out.
-        clips: with ideal and recovered displacement; only fit and select of `split` are used.
-        split: of the clips.
-        settings: `input` and `seed` are set by the training.
-        tests: for the trained network.
-        work: folder for results and networks; an interrupted training is continued.
+    Clips have ideal and recovered displacement; only fit and select of `split` are used. `input` and `seed`
+    of the settings are set by the training.
     """
     kind = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}[training.kind]
     chosen = changed(settings, input=kind, seed=training.seed)

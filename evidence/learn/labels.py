@@ -7,6 +7,7 @@ numbers), a core-second a sequence. Recovered flow is not available.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,18 +31,15 @@ def clips(job: Job, grid: Grid, cache: Path) -> list[Clip]:
 
     Labels are made on 128² or finer; 64² is four cells of that in one.
     """
-    return [_one(job, index, grid, cache) for index in range(job.sequences)]
-
-
-def _one(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     if grid.size >= FINE:
-        return whole(job, index, grid, cache)
+        return [whole(job, index, grid, cache) for index in range(job.sequences)]
     fine = Grid(FINE, grid.extent_mm)
 
-    def make() -> Clip:
+    def make(index: int) -> Clip:
         return coarser(whole(job, index, fine, cache), fine, fine.size // grid.size)
 
-    return stored.clip(cache / f"{key(job, index, fine)}-{grid.size}", make)
+    folders = [cache / f"{key(job, index, fine)}-{grid.size}" for index in range(job.sequences)]
+    return [stored.clip(folder, partial(make, index)) for index, folder in enumerate(folders)]
 
 
 def whole(job: Job, index: int, grid: Grid, cache: Path) -> Clip:

@@ -126,10 +126,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
 
 def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> report.Chart:
-    known = {f"{row['model']}: {row['data']}": row[key] for row in rows if row[key] is not None}
-    lines = {name: [np.nan if v is None else v for v in values] for name, values in known.items()}
-    ends = {name: (low, high) for name, (_, low, high) in lines.items()}
-    return report.Chart(title, "share", report.bars({name: one[0] for name, one in lines.items()}, ends))
+    bars = []
+    for row in rows:
+        mean, low, high = (np.nan if value is None else value for value in row[key])
+        bars.append(report.Row(f"{row['model']}: {row['data']}", mean, (low, high)))
+    return report.Chart(title, "share", tuple(bars))
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Coverage of 90% intervals", "covered_size"))

@@ -42,17 +42,15 @@ class Condition:
     mixed: bool = True  # whether it is in the mixture
 
 
-def _membrane(young_kpa: float, thickness_mm: float) -> dict[str, Any]:
-    return {"probability": 1.0, "young_kpa": young_kpa, "thickness_mm": thickness_mm}
-
-
+_SOFT = {"probability": 1.0, "young_kpa": 100.0, "thickness_mm": 0.05}
+_STIFF = {"probability": 1.0, "young_kpa": 1000.0, "thickness_mm": 0.2}
 _PULSE = {"heart_mm": [0.1, 0.5], "breath_mm": [0.1, 1.0]}
 _ALIVE = {"pulse": _PULSE, "membrane": {"probability": 1.0}}
 
 CONDITIONS: dict[str, Condition] = {
     PLAIN: Condition(),
-    "membrane, 5 mN/mm": Condition({"membrane": _membrane(100.0, 0.05)}),
-    "membrane, 200 mN/mm": Condition({"membrane": _membrane(1000.0, 0.2)}),
+    "membrane, 5 mN/mm": Condition({"membrane": _SOFT}),
+    "membrane, 200 mN/mm": Condition({"membrane": _STIFF}),
     "pulse": Condition({"pulse": _PULSE}),
     "pulse, removed": Condition({"pulse": _PULSE}, without="pulse alone", mixed=False),
     "Poisson 0.49": Condition({"poisson": 0.49}),
@@ -123,8 +121,7 @@ class Scenes:
     def clip(self, name: str, index: int) -> Clip | None:
         """A sequence of a condition, with ideal and recovered displacement; None if it was refused.
 
-        Raises:
-            UserError: it was not made.
+        Raises UserError: it was not made.
         """
         found = [self._packed(one, index) for one in rendered(name)]
         if any(clip is None for clip in found):

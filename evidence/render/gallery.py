@@ -1,7 +1,4 @@
-"""Images of the gallery: families, instruments, lights, cameras and scenery side by side.
-
-Run: python -m evidence.render.gallery
-"""
+"""Images of the gallery: families, instruments, lights, cameras and scenery side by side."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Noise and error of recovered flow against cost, by light paths, integrator, vertices and size.
-
-Run: python -m evidence.render.pareto
-"""
+"""Noise and error of recovered flow against cost, by light paths, integrator, vertices and size."""
 
 from __future__ import annotations
 

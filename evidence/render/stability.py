@@ -1,7 +1,4 @@
-"""Limits of the renderer: every case must yield a correct frame or a clear error, never a wrong label.
-
-Run: python -m evidence.render.stability
-"""
+"""Limits of the renderer: every case must yield a correct frame or a clear error, never a wrong label."""
 
 from __future__ import annotations
 

@@ -194,14 +194,14 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
     turn = 0
     while start < plan.seconds - 3.5:
         rise, hold, fall = rng.uniform(0.4, 0.9), rng.uniform(0.2, 0.9), rng.uniform(0.3, 0.8)
-        press = _ramp((time - start) / rise) * (1 - _ramp((time - start - rise - hold) / fall))
+        press = ramp((time - start) / rise) * (1 - ramp((time - start - rise - hold) / fall))
         inside = (time > start - 0.4) & (time < start + rise + hold + fall + 0.4)
         level = np.maximum(level, rng.uniform(0.4, 1.0) * press)
         gesture[time > start - 0.4] = turn % _GESTURES
         away[inside] = np.minimum(
             1,
             np.maximum(
-                _ramp((start - time[inside]) / 0.4), _ramp((time[inside] - start - rise - hold - fall) / 0.4)
+                ramp((start - time[inside]) / 0.4), ramp((time[inside] - start - rise - hold - fall) / 0.4)
             ),
         )
         start += rise + hold + fall + rng.uniform(0.9, 1.6)
@@ -262,7 +262,7 @@ def _free_spans(plan: Plan, lag_s: float) -> list[list[float]]:
     return [[0.1 - lag_s, _STILL_S - 0.1 - lag_s], [plan.seconds - 0.2 - lag_s, plan.seconds + 0.8 - lag_s]]
 
 
-def _ramp(s: Floats) -> Floats:
+def ramp(s: Floats) -> Floats:
     """Smoothstep from 0 to 1."""
     s = np.clip(s, 0, 1)
     return np.asarray(s * s * (3 - 2 * s), np.float64)

@@ -110,15 +110,9 @@ def pulse_motion(time_s: float, phase: Floats, size: int) -> Floats:
 def record(
     folder: Path, contact: Mapping[str, Any], pulse: float, size: int, remove: bool, rng: np.random.Generator
 ) -> None:
-    """Writes the recording: a texture moved by contact and pulse, the sensor, no masks.
+    """Writes a recording of `size` px: a texture moved by `draw_contact` and pulse, the sensor, no masks.
 
-    Args:
-        folder: made.
-        contact: of `draw_contact`.
-        pulse: factor on the pulse; 0: still tissue.
-        size: side of the images [px].
-        remove: whether meta.yaml requests removal of the pulse.
-        rng: of the texture and the camera's noise.
+    `pulse`: factor on the pulse, 0: still tissue; `remove`: whether meta.yaml requests its removal.
     """
     (folder / "frames").mkdir(parents=True)
     rest = texture(size, size, rng)

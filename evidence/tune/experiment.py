@@ -1,7 +1,4 @@
-"""Error and cost of jobs tuned by `synth tune`, on sequences that were not used for tuning.
-
-Run: python -m evidence.tune.experiment
-"""
+"""Error and cost of jobs tuned by `synth tune`, on sequences that were not used for tuning."""
 
 from __future__ import annotations
 
