@@ -81,8 +81,7 @@ _REMEDY = "; `synth report` writes it again"
 def read_index(root: Path) -> pa.Table:
     """The index as stored; `synth verify` compares its rows with the stores.
 
-    Raises:
-        UserError: missing, damaged, or of another program or version.
+    Raises UserError if it is missing, damaged, or of another program or version.
     """
     path = root / NAME
     try:
@@ -101,8 +100,7 @@ def read_index(root: Path) -> pa.Table:
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
     """The split of the dataset in `root`, as stored, else as `write_index` would create it.
 
-    Raises:
-        UserError: `required`, and there are too few groups to split.
+    Raises UserError if there are too few groups to split and a split is `required`.
     """
     stored = split.read_stored(root)
     if stored.sides:

@@ -65,9 +65,7 @@ class Writer:
     def put(self, name: str, array: NDArray[Any]) -> None:
         """Writes a whole field, of the shape in the field table for this sequence.
 
-        Raises:
-            ValueError: another shape or type.
-            NotFinite: a value is NaN or infinite.
+        Raises ValueError for another shape or type, NotFinite if a value is NaN or infinite.
         """
         if not self.wants(name):
             return

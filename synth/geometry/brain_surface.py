@@ -40,16 +40,10 @@ def load_brain(
     attachments: Sequence[AttachmentSection] = (),
     fill_holes: bool = False,
 ) -> Brain:
-    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK), merges its vertices, and places it.
+    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK, mm), merges its vertices, and places it.
 
-    Args:
-        path: the file, coordinates in mm.
-        craniotomy: point and direction in the file's axes.
-        attachments: in the file's axes.
-        fill_holes: as in `read_brain`.
-
-    Raises:
-        UserError: the file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
+    `craniotomy` and `attachments` are in the file's axes; `fill_holes` as in `read_brain`. UserError: the
+    file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
     """
     assert craniotomy.point is not None  # the job requires both with a mesh
     assert craniotomy.direction is not None

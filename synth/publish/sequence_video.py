@@ -50,16 +50,9 @@ def write_videos(
     overlays: Several[str] = ("flow", "force"),
     interval_s: tuple[float, float] | None = None,
 ) -> None:
-    """Writes `NNNNNN.mp4` for each sequence.
+    """Writes `NNNNNN.mp4` per sequence, with some of `OVERLAYS`; `interval_s`: first and last time [s].
 
-    Args:
-        dataset: the sequences.
-        target: the folder.
-        overlays: names in `OVERLAYS`.
-        interval_s: first and last time [s]; None: the whole sequence.
-
-    Raises:
-        UserError: an unknown overlay, no frame in the interval, or a sequence without the field.
+    Raises UserError for an unknown overlay, no frame in the interval, or a sequence without the field.
     """
     unknown = [name for name in overlays if name not in OVERLAYS]
     if unknown:
