@@ -59,11 +59,16 @@ def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: di
     assert "readable" in bad(dataset)
 
 
-def test_an_edited_attribute_is_refused_by_all_but_verify(dataset: Path) -> None:
+def test_edited_attributes_and_sides_are_refused_and_found(dataset: Path) -> None:
+    assert CliRunner().invoke(app, ["split", str(dataset), "--by", "sequence"]).exit_code == 0
+    assert "splits" not in bad(dataset)
+    found = index.read_index(dataset).to_pylist()
+    next(row for row in found if row["split"] == "test")["split"] = "train"
+    index.save_rows(dataset, found)
     foreign.edit_attributes(dataset / FIRST, reseal=False, young_kpa=2.0)
+    assert {"splits", "seal"} <= bad(dataset)
     with pytest.raises(UserError):
         export_dataset(dataset, dataset / "to", "folder")
-    assert "seal" in bad(dataset)
 
 
 @pytest.mark.parametrize("text", ['{"by": 7}', "\x00"])
@@ -75,15 +80,6 @@ def test_an_index_of_another_program_and_a_damaged_split_are_refused(dataset: Pa
     (dataset / "split.json").write_text(text)
     with pytest.raises(UserError, match="split"):
         split.read_stored(dataset)
-
-
-def test_a_side_edited_in_the_index_is_found(dataset: Path) -> None:
-    assert CliRunner().invoke(app, ["split", str(dataset), "--by", "sequence"]).exit_code == 0
-    assert "splits" not in bad(dataset)
-    found = index.read_index(dataset).to_pylist()
-    next(row for row in found if row["split"] == "test")["split"] = "train"
-    index.save_rows(dataset, found)
-    assert "splits" in bad(dataset)
 
 
 def test_no_run_follows_a_link(dataset: Path, tmp_path: Path) -> None:

@@ -23,29 +23,21 @@ def test_a_missing_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (None, "is neither local, dask://host:port, tls://host:port nor a file"),
-        ("cores: 4\nmemory: 8GB\n", "contain `jobs`"),
-        ("jobs: 4\n", "cores and memory"),
-        ("jobs: [", "not YAML"),
-    ],
+    ("text", "named"),
+    [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: 4\n", "cores"), ("jobs: [", "YAML")],
 )
-def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
-    if text is not None:
-        (tmp_path / "slurm.yaml").write_text(text)
-    with pytest.raises(UserError, match=message):
+def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / "slurm.yaml").write_text(text)
+    with pytest.raises(UserError, match=named):
         read_slurm(tmp_path / "slurm.yaml")
 
 
 @pytest.mark.parametrize(
     ("cluster", "warning"),
     [
-        ("dask://127.0.0.1:8786", ""),
         ("dask://localhost:8786", ""),
         ("dask://node7:8786", "node7 is reached unencrypted"),
         ("tls://node7:8786", ""),
-        ({"cores": 1}, "every interface"),
         ({"cores": 1, "security": True}, "every interface"),
         ({"interface": "ib0"}, "unencrypted"),
         ({"scheduler_options": {"host": "10.0.0.1"}}, "unencrypted"),

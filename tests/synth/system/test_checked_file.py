@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from synth.errors import UserError
 from synth.system import checked_file
@@ -25,16 +25,10 @@ class Malicious:
 
 
 def png(width: int, height: int) -> bytes:
-    """A picture of zeros: one of 32,000 x 32,000 pixels has a megabyte."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    squeezed = zlib.compressobj(9)
-    row = bytes(1 + (width + 7) // 8)
-    data = b"".join(squeezed.compress(row) for _ in range(height)) + squeezed.flush()
-    head = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    """A black picture; one of 32,000 x 32,000 pixels has a megabyte."""
+    file = io.BytesIO()
+    Image.new("1", (width, height)).save(file, "png")
+    return file.getvalue()
 
 
 @pytest.mark.parametrize("name", ["pipe", "folder", "hole", "none"])
@@ -47,22 +41,14 @@ def test_only_regular_files_of_a_bounded_size_are_opened(tmp_path: Path, name: s
         checked_file.open_file(tmp_path / name, 1 << 20)
 
 
-def save_code(path: Path) -> None:
-    with path.open("wb") as file:
-        np.savez(file, a=np.array([Malicious()], object), allow_pickle=True)
-
-
 @pytest.mark.parametrize(
     ("read", "write"),
     [
-        (checked_file.read_yaml, lambda path: path.write_text("seed: [")),
         (checked_file.read_yaml, lambda path: path.write_text("d: !!python/object/apply:os.mkdir [ran]")),
-        (checked_file.read_json, lambda path: path.write_bytes(b"\xff\xfe")),
         (checked_file.read_json, lambda path: path.write_text("{")),
-        (checked_file.read_arrays, save_code),
+        (checked_file.read_arrays, lambda path: np.array([Malicious()], object).dump(path)),
         (checked_file.read_arrays, lambda path: path.write_bytes(pickle.dumps(Malicious()))),
         (checked_file.read_arrays, lambda path: path.write_bytes(b"PK cut")),
-        (checked_file.read_picture, lambda path: path.write_bytes(b"GIF89a")),
         (checked_file.read_picture, lambda path: path.write_bytes(png(32_000, 32_000))),
         (checked_file.read_storage, lambda path: path.write_text("")),
     ],
