@@ -1,14 +1,16 @@
 """Training losses: squared error, R², and a penalty on off-target force.
 
 Prediction and target are force density at a reference stiffness of 1 kPa [mN/mm²], as are two constants of
-the training data: `unit`, the target's 99.9th percentile, defines a low force; `spread`, its root mean square
-over tissue cells, is the unit of errors. The squared-error and the R² term are then of similar size. (In the
-published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of the gradient.)
+the training data: `unit`, the target's 99.9th percentile, against which a force is low; `spread`, its root
+mean square over tissue cells, by which errors are divided. The squared-error and the R² term are then of
+similar size. (In the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of
+the gradient.)
 
 Off-target force is force on contact-free tissue. Heraoui et al. penalise it by a larger weight on the squared
 error, their loss `antighost`; but the gradient of a squared penalty fades with the false force, so small ones
-remain. The loss `off-target` adds a linear penalty: where the best estimate in squared error is q (in units
-of `spread`) on tissue that is free with probability p, the minimum is at q − p·OFF_TARGET/2, at least 0.
+remain. The loss `off-target` adds a linear penalty: for one component with squared error alone, where the
+conditional mean is q (in units of `spread`) on tissue that is free with probability p, the minimum is at
+q − p·OFF_TARGET/2, at least 0.
 Cells in certain contact (p = 0) don't change. The penalty costs R² on weak presses, whose forces are of its
 size; R² by frame makes up for that, as it divides an error by its own frame's force.
 """
@@ -68,8 +70,8 @@ def loss(
 ) -> Terms:
     """The loss over all masked cells of a batch, at a point 0..1 of the run.
 
-    `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: the same
-    unit. Raises UserError if the mask is empty.
+    `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: in
+    mN/mm² too. Raises UserError if the mask is empty.
     """
     cells = mask.sum()
     if cells == 0:

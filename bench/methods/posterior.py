@@ -3,13 +3,14 @@
     d = C f / E + N a + e
 
 d: displacement at P points, C: the compliance. Loads f are smooth loads spread over the opening, plus one
-contact of unknown position and width; the sizes of both follow from the marginal likelihood of each frame.
-N a is the tissue's own motion, six polynomials of second degree per component with given sizes, marginalised.
-e has the flow's stated deviations, enlarged because its errors are correlated, and a share of the
-displacement, which the compliance cannot explain because it is computed for another shape than the tissue's.
+contact of unknown position and width. N a is the tissue's own motion: the six monomials up to degree 2 per
+component, with given prior standard deviations. e has the flow's stated deviations, enlarged because its
+errors are correlated, and a model error in proportion to the local displacement, since the compliance is that
+of a generic shape, not of the tissue's own.
 
-Everything is Gaussian except position, width and sizes, which are summed over a grid (Bishop, Pattern
-Recognition and Machine Learning, 2006, ch. 3; rank-3 updates of evidence by the matrix determinant lemma).
+Everything is Gaussian except position, width and prior standard deviations of the loads, which are
+marginalised over a grid by each frame's likelihood (Bishop, Pattern Recognition and Machine Learning, 2006,
+ch. 3; rank-3 updates of evidence by the matrix determinant lemma).
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ class ModelConstants:
     radii_mm: tuple[float, ...] = (2.4, 3.4, 4.8)  # of contacts, whose load falls as (1 - r^2 / R^2)^2
     reach_mm: float = 9.5  # largest distance of a contact from the centre of the opening, whose radius is 12
     contacts: tuple[Axes, ...] = ((1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
-    """Deviations of a contact's force along x, y, z [mN/kPa]: F / (E a^2) of 0.03 to 0.3."""
+    """Standard deviations of a contact's force along x, y, z [mN/kPa]."""
     presses: tuple[Axes, ...] = ((0.2, 0.2, 5.0), (0.05, 0.05, 5.0))
     """With one camera also these, along the optical axis: without them 107 of 120 drawn presses lay outside
     their interval, with them 10 (docs/design.md)."""
     correlated: float = 3.0  # factor of flow's variances: errors at neighbouring points are correlated
-    misfit: float = 0.1  # share of the local displacement that the compliance cannot explain
+    misfit: float = 0.1  # model error, as a share of the local displacement
     around_mm: float = 1.5  # range of "local": with each point alone coverage is 80%, not 90% (design.md)
-    unmet: float = 2.0  # factor of the tissue's own motion: few frames miss parts of a rhythm (science.md)
+    unmet: float = 2.0  # inflates the tissue's own motion: short spans miss parts of a cycle (science.md)
     least_mm: float = 0.005  # lower limit of flow's deviation
     draws: int = 128  # of hypotheses in a posterior
 

@@ -40,8 +40,8 @@ class Headline:
 def headline(result: Result) -> Headline:
     """The main method's most important scores for this recording.
 
-    Scores after the gain of a separate press come first. Then, without a known E, scores that no gain
-    changes. There are none if too many frames were lost.
+    First, scores after scaling by the gain found on `press_s`. Then those in newtons; if E is unknown, the
+    scale-invariant ones instead. There are none if too many frames were lost.
     """
     odd = tuple(one.message for one in result.findings if one.state == "odd")
     if result.refused:
@@ -77,7 +77,9 @@ def _trust(result: Result) -> str:
     meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
     parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
     network = MAIN if result.main == FUSION else result.main
-    scored = result.methods.get(network)  # without intervals its training distribution is unknown
+    scored = result.methods.get(
+        network
+    )  # networks without intervals have no check of their training distribution
     if network in result.settings.get("networks", {}) and scored is not None and scored.low_mn is not None:
         unlike = any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes)
         parts.append(f"the motion is {'unlike' if unlike else 'like'} that of the network's training data")

@@ -8,9 +8,9 @@ Minimises over the flow w = (u, v), with I_0 the rest frame and I_1 the frame no
 psi(s^2) = sqrt(s^2 + epsilon^2) is the robust data term on brightness and gradient (Brox et al., High
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
-rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h
-as in a membrane. lambda holds for little noise: it falls with the square of the median residual, like the
-weight of a measurement with its noise, and rises where the initial flow is steep. The solver works coarse to
+rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h,
+that is, smoothed quadratically. lambda is scaled by (reference / median residual)^2, limited to 0.45-1.5, and
+rises where the initial flow is steep. The solver works coarse to
 fine with repeated warping (Brox); each warp is solved by the primal-dual algorithm 1 of Chambolle and Pock
 (J. Math. Imaging Vis. 40, 2011) with lagged weights.
 """
@@ -45,11 +45,11 @@ class TVL1Settings:
     with two values of lambda, then the solution on the fine levels. A warm start solves on all levels."""
 
     weight: float = 0.36  # lambda: data against smoothness
-    noise: float = 0.115  # median residual for which lambda holds [local deviations]; 0: lambda is constant
+    noise: float = 0.115  # reference median residual [local standard deviations]; 0: lambda is constant
     gradient: float = 1.0  # gamma: weight of gradient constancy
     huber: float = 0.15  # h [px/px]: smaller flow gradients are smoothed quadratically, larger ones linearly
     hidden_huber: float = 0.3  # added to h where nothing is visible: the flow has no steps there
-    epsilon: float = 0.01  # residuals below it count quadratically [local deviations]
+    epsilon: float = 0.01  # residuals below it count quadratically [local std]
     coarsest_px: int = 12  # shorter side of the coarsest level, about
     warps: int = 6  # linearisations per level
     steps: int = 16  # primal-dual steps per warp
@@ -81,7 +81,7 @@ class Tvl1:
         Args:
             settings: energy and solver; None: the defaults.
             corrected: whether a network corrects the flow and gives its confidence, which otherwise is the
-                agreement of the pictures; see `synth.flow.correction`.
+                local correlation of the rest and the warped frame; see `synth.flow.correction`.
         """
         self.settings = settings or TVL1Settings()
         self.correction = correction.load() if corrected else None
@@ -164,7 +164,8 @@ def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor,
 def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
     """The first stage of a cold start with two values of lambda; returns the better flow (B, 2, H, W) px.
 
-    Little smoothness follows large motion but loses small areas between the tines; much does the reverse.
+    A large lambda follows large motion but fails on small areas between forceps tips; a small one does the
+    opposite.
     """
     weights = s.small_motion_weight, s.large_motion_weight
     small, large = (solve(levels, None, s.first_stage(weight)) for weight in weights)
@@ -298,7 +299,7 @@ def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, number
 
 def new_state(height: int, width: int) -> Map:
     """Planes of `primal_dual`: w (2), its extrapolation (2), the dual of grad w by x (2) and y (2), both 0,
-    the proximal map: straight (2), cross (1), shift (2), and 1 / (1 + sigma h).
+    the proximal map's 2x2 matrix: diagonal (2), off-diagonal (1), offset (2); and 1 / (1 + sigma h).
 
     Rows are aligned and padded to whole vectors: without, loops take 1.6 times as long. The dual is shifted
     down by one row, its x part right by `_LANES`, so that zeros precede it.

@@ -3,8 +3,9 @@
 It is as large as the motion by a gentle contact and would be taken for force. Unlike contacts, heart and
 breath are periodic, move the whole surface, and continue without contact. A rhythm is therefore a smooth
 motion of the surface (polynomials in x and y) times harmonics of one phase, whose rate may vary. It is fitted
-to frames without contact, by least trimmed squares (Rousseeuw, J. Amer. Stat. Assoc. 79, 1984) where these
-are unknown, and must predict held-out frames. A phase that varies by more than a radian is not found.
+to frames without contact and must predict held-out frames. If these frames are not given, they are found by
+iterative trimming (compare least trimmed squares: Rousseeuw, J. Amer. Stat. Assoc. 79, 1984). A phase that
+varies by more than a radian is not found.
 
 Measured by `evidence.scoring.pulse` and `tests/synth/recording_flow/test_pulse.py`.
 """
@@ -31,11 +32,11 @@ class CellConstants:
     columns: int = 20  # cells across the picture
     degree: int = 4  # of the polynomials in x and y
     visible: float = 0.3  # least visible share of a cell
-    frames: int = 30  # least number of frames without contact: a contact alone, 2.5 s at 10 Hz, has no rhythm
+    frames: int = 30  # least frames without contact: more than one contact's, 2.5 s at 10 Hz
     rest_noise_px: float = 0.15  # largest displacement of a cell by noise of the rest frame
     smoothest: float = 0.2  # share of the frames that is assumed to be without contact
-    smooth: float = 2.0  # misfit over the largest of these up to which other frames are smooth
-    explained: float = 2.5  # misfit over the median of smooth frames up to which rhythms explain a frame
+    smooth: float = 2.0  # a frame is smooth if its misfit is below this times their largest
+    explained: float = 2.5  # explained by rhythms: below this times the smooth frames' median
     noise_px: float = 1e-3  # added to both limits
 
 

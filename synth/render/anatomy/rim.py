@@ -1,7 +1,7 @@
 """Rim of the opening, outwards: the dura's cut edge, folded dura, gutter, wall of bone or muscle, drapes.
 
 Distances are from the opening's edge [mm], albedos linear RGB, absorptions optical depths in each channel.
-No measurement depends on these layers: all were chosen by eye on an intra-operative photograph.
+No number here was measured: all were chosen by eye on an intra-operative photograph.
 """
 
 from __future__ import annotations
@@ -38,30 +38,30 @@ class CutEdge:
     lip: float = 0.5  # overhang over the brain
     inside: tuple[float, ...] = (1.0, 0.96, 0.72, 0.44, 0.2, 0.04)  # its rings, as shares of the lip
     height: tuple[float, ...] = (-1.8, -0.12, 0.10, 0.26, 0.38, 0.46)  # of its rings over the brain
-    painted: tuple[float, ...] = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)  # its rings on the maps: wider apart
+    painted: tuple[float, ...] = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)  # radii of its rings in the texture
     fold: tuple[float, float] = 0.12, 0.5  # start of the folded dura: outwards, over the brain
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
 
 @dataclass(frozen=True)
 class FoldedDura:
-    """The dura folded back over the rim [mm]; pairs are mean and spread around the opening, see `_uneven`."""
+    """The dura folded back over the rim [mm]; `width`: mean and spread around the opening, see `_uneven`."""
 
     width: tuple[float, float] = 3.1, 0.7
-    pleats: tuple[float, float] = 3.0, 1.2  # scales the fold's height and shifts the pleats' phase
+    pleats: tuple[float, float] = 3.0, 1.2  # factor of the fold's height, phase of the pleats; no lengths
     pulled: tuple[float, float] = 1.3, 1.6  # added width at a stitch, and over what distance aside
     vessel: Rgb = (0.35, 1.0, 0.95)  # absorption of its vessels
 
 
 @dataclass(frozen=True)
 class Wound:
-    """Gutter behind the dura, and the wall that rises in two steps beyond [mm]; pairs are mean and spread."""
+    """Gutter behind the dura, and the wall beyond that rises in two steps [mm]."""
 
-    gutter: tuple[float, float] = 1.7, 0.6  # width
+    gutter: tuple[float, float] = 1.7, 0.6  # width: mean and spread
     floor: float = 1.3  # height over the brain
-    rise: tuple[float, float] = 1.5, 0.8  # of each step
+    rise: tuple[float, float] = 1.5, 0.8  # height of the first and second step
     first: float = 0.4  # from the wall's foot to the first step
-    second: tuple[float, float] = 2.4, 0.7  # from the wall's foot to the second step
+    second: tuple[float, float] = 2.4, 0.7  # to the second step: mean and spread
     shadow: Rgb = (0.8, 1.1, 1.1)  # absorption that darkens the gutter
     fat: Rgb = (0.72, 0.46, 0.22)  # albedo
     blood: Rgb = (0.26, 2.4, 2.8)  # absorption
@@ -94,7 +94,9 @@ class Rim:
     uv: npt.NDArray[np.float32]  # (V, 2)
     extent_mm: float  # side of the square that uv spans
     edge: Floats  # (A,) mm: radius of the opening's edge at even angles
-    cotton: tuple[Patty, ...]  # painted on the maps; one in their middle serves the patties over the edge
+    cotton: tuple[
+        Patty, ...
+    ]  # drawn in the texture; one in its unused middle is the felt of the patties over the edge
     stitches: Floats  # (n,) rad: angles of threads that hold the dura
     dura: Floats  # (A,) mm beyond the edge: end of the folded dura, start of the gutter
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
