@@ -1,4 +1,4 @@
-"""An egg for a brain: a surface as users have it, in every format that is read."""
+"""An egg for a brain: a surface as users have it, as .obj, .stl or .vtk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ def written(path: Path, corner: np.ndarray) -> Path:
     """Triangles (F, 3, 3) as a file of the format that its name says, vertices unmerged."""
     flat = [f"{x:.6f} {y:.6f} {z:.6f}" for x, y, z in corner.reshape(-1, 3)]
     three = np.arange(len(flat)).reshape(-1, 3)
-    rows = [f"3 {a} {b} {c}" for a, b, c in three]
     if path.suffix == ".obj":
         lines = [f"v {v}" for v in flat] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in three]
     elif path.suffix == ".stl":
@@ -32,12 +31,8 @@ def written(path: Path, corner: np.ndarray) -> Path:
             corners = [f"vertex {flat[i]}" for i in triple]
             lines += ["facet normal 0 0 0", "outer loop", *corners, "endloop", "endfacet"]
         lines.append("endsolid egg")
-    elif path.suffix == ".ply":
-        lines = ["ply", "format ascii 1.0", f"element vertex {len(flat)}"]
-        lines += [f"property float {axis}" for axis in "xyz"]
-        lines += [f"element face {len(rows)}", "property list uchar int vertex_indices", "end_header"]
-        lines += [*flat, *rows]
     else:
+        rows = [f"3 {a} {b} {c}" for a, b, c in three]
         lines = ["# vtk DataFile Version 3.0", "egg", "ASCII", "DATASET POLYDATA"]
         lines += [f"POINTS {len(flat)} float", *flat, f"POLYGONS {len(rows)} {4 * len(rows)}", *rows]
     path.write_text("\n".join(lines) + "\n")

@@ -152,7 +152,7 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
         gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
         writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
         writer.put_frame("flow", t, flow)
-        covered = _block(tool, rows, height) if fault == "visibility" else tool
+        covered = tool | (np.abs(rows - height / 2) < 8) if fault == "visibility" else tool
         writer.put_frame("visible", t, ~gone)
         writer.put_frame("tool", t, covered)
         writer.put_frame("glare", t, np.zeros_like(tissue))
@@ -212,10 +212,6 @@ def _texture(rng: np.random.Generator) -> Callable[..., Any]:
         return np.clip(128 + 15 * total, 0, 255)
 
     return brightness
-
-
-def _block(tool: Any, rows: Any, height: int) -> Any:
-    return tool | (np.abs(rows - height / 2) < 8)
 
 
 def wrong(fault: str) -> Callable[[Job, int, Path, ProgressCallback], None]:

@@ -132,14 +132,7 @@ def moving_recording(work: Path) -> tuple[Numbers, dict[str, str]]:
 Case = Callable[[Path], tuple[Numbers, dict[str, str]]]
 CASES: dict[str, Case] = {
     case.__name__: case
-    for case in (
-        default_sequence,
-        stereo_sequence,
-        epoch,
-        mono_recording,
-        stereo_recording,
-        moving_recording,
-    )
+    for case in (default_sequence, stereo_sequence, epoch, mono_recording, stereo_recording, moving_recording)
 }
 
 

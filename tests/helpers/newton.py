@@ -13,17 +13,10 @@ Floats = NDArray[np.float64]
 
 
 def newton(system: System, load: Floats, start: Floats, tolerance: float = 1e-8, steps: int = 60) -> Floats:
-    """Equilibrium from a starting state whose fixed degrees of freedom stay as they are.
+    """Equilibrium (N, 3) mm under `load` (N, 3) mN for E = 1 kPa; what is fixed stays as in `start`.
 
-    Args:
-        system: the equations.
-        load: (N, 3) mN for E = 1 kPa.
-        start: (N, 3) mm.
-        tolerance: largest force out of balance, as a part of the largest nodal force there is.
-        steps: at most so many factorisations.
-
-    Raises:
-        NoEquilibrium: not reached.
+    `tolerance`: largest force out of balance, as a part of the largest nodal force. Raises NoEquilibrium if
+    it is not reached in `steps` factorisations.
     """
     u, free = start.copy(), system.free
     for _ in range(steps):

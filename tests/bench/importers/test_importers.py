@@ -69,14 +69,8 @@ def mcap(path: Path, unstamped: str = "") -> Path:
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = store.types
-    image, wrench, pose = (
-        kind[name]
-        for name in (
-            "sensor_msgs/msg/Image",
-            "geometry_msgs/msg/WrenchStamped",
-            "geometry_msgs/msg/PoseStamped",
-        )
-    )
+    names = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped"
+    image, wrench, pose = (kind[name] for name in names)
     vector, point = kind["geometry_msgs/msg/Vector3"], kind["geometry_msgs/msg/Point"]
     turn = kind["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:

@@ -91,18 +91,16 @@ def write_bag(
         vector = kind["geometry_msgs/msg/Vector3"]
         for arm, topic in enumerate(ARMS):
             for k, newtons in enumerate(force_n):
-                wrench = kind["geometry_msgs/msg/Wrench"](
-                    vector(*(newtons * (arm == 0))), vector(0.0, 0.0, 0.0)
-                )
+                parts = vector(*(newtons * (arm == 0))), vector(0.0, 0.0, 0.0)
+                wrench = kind["geometry_msgs/msg/Wrench"](*parts)
                 put(topic, "geometry_msgs/msg/WrenchStamped", 1 + k / FPS / 10, wrench)
     return path
 
 
 def bring_in(source: Path, out: Path) -> Any:
     words = ["import", str(source), "-o", str(out), "--scale", str(AWAY_MM / FOCAL), "--json"]
-    return CliRunner().invoke(
-        app, [*words, "--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}"]
-    )
+    words += ["--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}"]
+    return CliRunner().invoke(app, words)
 
 
 def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:
@@ -137,14 +135,11 @@ def test_depth_equals_the_bags(tmp_path: Path, kind: type) -> None:
     depth_mm = np.add.outer(np.arange(SIZE[1]), np.arange(500, 500 + SIZE[0]))
     video = [{"left": np.zeros((*SIZE[::-1], 3), np.uint8)}]
     depth = (depth_mm / (1000 if kind is np.float32 else 1)).astype(kind)
-    source = write_bag(
-        tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]), (depth,)
-    )
+    straight = lenses(PARALLEL, 2 * [np.zeros(5)])
+    source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), straight, (depth,))
     found = registry.read_source(source, {"depth": DEPTH, "force": ARMS[0]})
-    about = {"scale_mm_per_px": AWAY_MM / FOCAL}
-    recording = open_recording(
-        registry.write_recording(found, tmp_path / "rec", 1.0, about, lambda done: None)
-    )
+    out = registry.write_recording(found, tmp_path / "rec", 1.0, {"scale_mm_per_px": 0.1}, lambda done: None)
+    recording = open_recording(out)
     path = recording.depths[0]
     got = np.load(path) if kind is np.float32 else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert got == pytest.approx(depth_mm, abs=1e-3)
@@ -154,13 +149,8 @@ def test_depth_equals_the_bags(tmp_path: Path, kind: type) -> None:
 
 def test_partners_are_each_others_nearest() -> None:
     frames = np.arange(6) / FPS
-    assert partners(frames[[0, 1, 1, 3, 5]] + [0.0, 0.01, 0.04, -0.02, 0.06], frames).tolist() == [
-        0,
-        1,
-        -1,
-        3,
-        -1,
-    ]
+    found = partners(frames[[0, 1, 1, 3, 5]] + [0.0, 0.01, 0.04, -0.02, 0.06], frames)
+    assert found.tolist() == [0, 1, -1, 3, -1]
 
 
 @pytest.mark.parametrize(
@@ -173,9 +163,8 @@ def test_partners_are_each_others_nearest() -> None:
     ],
 )
 def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, str]) -> None:
-    video = [
-        {camera: np.zeros((270, 480, 3), np.uint8) for camera in CAMERAS}
-    ]  # another size than the calibration's
+    # Of another size than the calibration's.
+    video = [{camera: np.zeros((270, 480, 3), np.uint8) for camera in CAMERAS}]
     source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]))
     for further in ({}, {"right": CAMERAS["right"]}):
         with pytest.raises(UserError):

@@ -110,13 +110,12 @@ def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
         bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
 
 
-def test_a_plug_in_cannot_have_a_reserved_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(tmp_path, monkeypatch, physics="Push")
-    with pytest.raises(UserError, match="physics"):
-        comparison.simpler_methods(None, None)
-
-
-def test_the_fusion_cannot_be_replaced(recording: Path) -> None:
+def test_no_method_takes_the_name_of_another(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     own = {"network and physics": lambda *inputs: bench.ForceEstimate(np.zeros(3))}
     with pytest.raises(UserError):
         bench.score(recording, methods=own)
+    installed(tmp_path, monkeypatch, physics="Push")
+    with pytest.raises(UserError, match="physics"):
+        comparison.simpler_methods(None, None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -32,11 +31,9 @@ def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
     times = 1.7e9 + np.array([0.0, 0.04, 0.080001])
     writer.write_frames(tmp_path, times)
     writer.write_force(tmp_path, times, np.eye(3))
-    assert csv_table.read_csv(tmp_path / "frames.csv", ("t_s",))["t_s"] == pytest.approx(
-        times, abs=1e-6, rel=0
-    )
-    read = csv_table.read_csv(tmp_path / "force.csv", ("t_s", "fy_n"))
-    assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
+    for name in ("frames", "force"):
+        read = csv_table.read_csv(tmp_path / f"{name}.csv", ("t_s",) + ("fy_n",) * (name == "force"))
+        assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
     assert read["fy_n"].tolist() == [0, 1, 0]
 
 
@@ -73,18 +70,14 @@ def test_force_in_mn_sign_and_gaps(make: Maker) -> None:
     assert len(recording.notes) == 2
 
 
-def test_a_quoted_cell_is_one_cell_in_every_row(tmp_path: Path) -> None:
+def test_quoted_cells_and_unambiguous_decimal_commas_are_read(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
-    file.write_text('note,t_s,fx_n\n"a, then b",1,2\nc,3,4\n"say ""x"", y",5,"6"\n')
-    got = csv_table.read_csv(file, ("t_s", "fx_n"))
-    assert got["t_s"].tolist() == [1, 3, 5]
-    assert got["fx_n"].tolist() == [2, 4, 6]
-
-
-def test_decimal_commas_are_read_where_unambiguous(tmp_path: Path) -> None:
-    file = tmp_path / "t.csv"
-    file.write_text("t_s;fx_n\n0,5;-1,25\n")
-    assert [float(one[0]) for one in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == [0.5, -1.25]
+    for text, expected in (
+        ('note,t_s,fx_n\n"a, then b",1,2\nc,3,4\n"say ""x"", y",5,"6"\n', [[1, 3, 5], [2, 4, 6]]),
+        ("t_s;fx_n\n0,5;-1,25\n", [[0.5], [-1.25]]),
+    ):
+        file.write_text(text)
+        assert [one.tolist() for one in csv_table.read_csv(file, ("t_s", "fx_n")).values()] == expected
     file.write_text("t_s,fx_n\n0,5,-1,25\n")
     with pytest.raises(UserError, match=r"t\.csv:2"):
         csv_table.read_csv(file, ("t_s", "fx_n"))
@@ -169,6 +162,5 @@ def test_frames_are_counted_if_the_container_does_not_state_their_number(tmp_pat
 def test_a_written_meta_is_read_back_as_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "meta.yaml").write_text(meta.commented())
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
-    assert set(meta.Stereo.model_fields) <= set(re.findall(r"\w+", meta.commented()))
     stills = Maker(tmp_path)(frames=4) / "frames"
     assert [one.time_s for one in video.read_frames(stills, 10.0)] == pytest.approx([0, 0.1, 0.2, 0.3])

@@ -16,20 +16,13 @@ from synth.errors import UserError
 
 def score(name: str, mae: float, specimen: str = "", **networks: str) -> dict[str, Any]:
     def method(value: float) -> dict[str, Any]:
-        return {
-            "scores": dict.fromkeys(pool.SCORES) | {"mae_mn": value, "r": 0.9},
-            "calibrated": {},
-        }
+        return {"scores": dict.fromkeys(pool.SCORES) | {"mae_mn": value, "r": 0.9}, "calibrated": {}}
 
-    return {
-        "format": "sulcus-score", "recording": name, "main": "net", "frames": 10,
-        "scores": {"mae_mn": mae}, "methods": {"net": method(mae), "zero": method(4.0)} | {
-            name: method(mae) for name in networks
-        },
-        "settings": {"meta": {"specimen": specimen}, "networks": {
-            name: {"hash": one} for name, one in networks.items()
-        }},
-    }  # fmt: skip
+    hashes = {network: {"hash": one} for network, one in networks.items()}
+    methods = {"net": method(mae), "zero": method(4.0)} | {network: method(mae) for network in networks}
+    settings = {"meta": {"specimen": specimen}, "networks": hashes}
+    about = {"format": "sulcus-score", "recording": name, "main": "net", "frames": 10}
+    return about | {"scores": {"mae_mn": mae}, "methods": methods, "settings": settings}
 
 
 def test_means_and_intervals_over_specimens() -> None:

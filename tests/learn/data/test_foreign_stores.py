@@ -72,7 +72,7 @@ def test_a_copied_hash_does_not_fill_the_cache(own: Path, tmp_path: Path) -> Non
         with pytest.raises(UserError, match=r"000005\.zarr"):
             load_clips(own, GRID, ("ideal",), cache=place)
     # All attributes of the other, with seals: only the values differ.
-    foreign.write_attributes(own / "000005.zarr", attrs, reseal=False)
+    foreign.edit_attributes(own / "000005.zarr", reseal=False, **attrs)
     for path in own.glob("00000[!5].zarr"):
         shutil.rmtree(path)
     with pytest.raises(UserError):

@@ -1,4 +1,4 @@
-"""Untrusted datasets: attributes, index, split and links are read unchanged since the seal, or refused."""
+"""Untrusted datasets: read unchanged since the seal and in a known format, or refused."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from synth.dataset import index, split
 from synth.dataset.folder import Folder, claim
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
-from synth.formats import FOLDER
+from synth.formats import FIRST, FOLDER, check_format
 from synth.job.reader import parse_job
 from synth.job.schema import Job
 from synth.publish.export.registry import export_dataset
 
 JOB = Job(seed=1, sequences=3, frames=3, render={"size": (64, 48)}, flow={"backend": "ideal"})
-FIRST = "000000.zarr"
+SEQUENCE = "000000.zarr"
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +53,9 @@ def bad(dataset: Path) -> set[str]:
     [{"young_kpa": np.nan}, {"frames": 10**9}, {"scenario": {"gesture": "pull"}}, {"format_version": 1}],
 )
 def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: dict[str, Any]) -> None:
-    foreign.edit_attributes(dataset / FIRST, **changes)
+    foreign.edit_attributes(dataset / SEQUENCE, **changes)
     with pytest.raises(UserError):
-        open_sequence(dataset / FIRST)
+        open_sequence(dataset / SEQUENCE)
     assert "readable" in bad(dataset)
 
 
@@ -65,7 +65,7 @@ def test_edited_attributes_and_sides_are_refused_and_found(dataset: Path) -> Non
     found = index.read_index(dataset).to_pylist()
     next(row for row in found if row["split"] == "test")["split"] = "train"
     index.save_rows(dataset, found)
-    foreign.edit_attributes(dataset / FIRST, reseal=False, young_kpa=2.0)
+    foreign.edit_attributes(dataset / SEQUENCE, reseal=False, young_kpa=2.0)
     assert {"splits", "seal"} <= bad(dataset)
     with pytest.raises(UserError):
         export_dataset(dataset, dataset / "to", "folder")
@@ -100,3 +100,19 @@ def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> 
     assert (read.flow.backend, read.fem.law) == ("gone", "gone")
     with pytest.raises(UserError, match=r"flow\.backend"):
         parse_job(json.dumps(job), "job.yaml", tmp_path)
+
+
+def test_a_reader_accepts_its_format_and_the_previous_but_none_before_the_first() -> None:
+    newest = FIRST + 2
+    for found in (newest, newest - 1):
+        check_format(found, newest, "x")
+    for found, current in ((newest - 2, newest), (newest + 1, newest), (FIRST - 1, FIRST), (None, FIRST)):
+        with pytest.raises(UserError, match=f"written by format {found}; this version reads {current}"):
+            check_format(found, current, "x")
+
+
+def test_a_dataset_without_a_format_version_is_refused(tmp_path: Path) -> None:
+    before = {"identity": "", "job": {"fem": {"tip": "flat"}}, "generators": []}
+    (tmp_path / "dataset.json").write_text(json.dumps(before))
+    with pytest.raises(UserError, match=f"written by format 1; this version reads {FOLDER}"):
+        Folder(tmp_path).job()

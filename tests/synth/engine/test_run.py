@@ -1,21 +1,26 @@
-"""The engine: order and interruption change nothing, a fault costs only the sequence that causes it."""
+"""The engine: order, faults and interruption change no byte; status and forecasts agree with what is."""
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 from pathlib import Path
 
 import pytest
 from fake_run import Silent, options, start, wait_for
+from typer.testing import CliRunner
 
-from synth.dataset import index, provenance
+from synth.cli import app
+from synth.dataset import index, provenance, size_forecast
 from synth.dataset.folder import Folder
-from synth.engine import machine
+from synth.engine import machine, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup
+from synth.engine.journal import Journal
 from synth.engine.run import Summary
 from synth.errors import UserError
+from synth.job import reader
 from synth.job.schema import Job
 
 JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backend": "ideal"})
@@ -178,3 +183,83 @@ def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: int, undist
     assert (resumed.already, resumed.done) == (left, 6 - left)
     assert resumed.content_hash == undisturbed
     assert not list((tmp_path / "out").glob("*.part"))
+
+
+@pytest.mark.slow
+def test_status_during_and_after_a_run(tmp_path: Path) -> None:
+    root = tmp_path / "out"
+    other = start(root, JOB, "slow")
+    wait_for(lambda: bool(root.exists() and (root / ".run/progress.json").exists()))
+    wait_for(lambda: bool(status.read_status(root).in_flight) or status.read_status(root).done == 6)
+    during = status.read_status(root)
+    assert during.total == 6
+    assert during.running or during.done == 6
+    assert other.wait(timeout=60) == 0
+    after = status.read_status(root)
+    assert (after.done, after.failed, after.running, after.in_flight) == (6, {}, False, {})
+    assert after.ahead.sequences == 0
+    assert after.stages_cpu_s["render"] > 0
+
+
+@pytest.mark.slow
+def test_failures_are_counted_by_reason_and_retried(tmp_path: Path) -> None:
+    job = JOB.model_copy(update={"sequences": 7})
+    engine.run_job(job, tmp_path / "out", options("trying"), Silent())
+    found = status.read_status(tmp_path / "out")
+    assert (found.done, found.failed) == (5, {"the load is past the material's range": 2})
+    shown = CliRunner().invoke(app, ["status", str(tmp_path / "out"), "--json"]).stdout
+    assert json.loads(shown)["done"] == 5
+
+
+def test_the_time_left_is_estimated_from_the_latest_sequences(tmp_path: Path) -> None:
+    def left(workers: int, todo: int, *ends: float) -> float | None:
+        journal = Journal(Folder(tmp_path), workers, Silent().account)
+        journal._left = todo
+        for at in ends:
+            journal.pace(at)
+        return journal.left_s()
+
+    assert left(2, 10, 20.0, 21.0) is None, "the first sequence of each worker includes compilation"
+    assert left(2, 10, 20.0, 21.0, 25.0, 26.0) == pytest.approx(10 * 2.5)
+    slow, fast = [10.0 * k for k in range(1, 101)], [1000.0 + 2.0 * k for k in range(1, 101)]
+    assert left(1, 50, *slow, *fast) == pytest.approx(100)
+
+
+# Imported by every Python process, workers too: each reading of the clock is years from the previous one.
+JUMPING = """
+import itertools, time
+real, jumps = time.time, itertools.cycle((-40, 0, 40, 7))
+time.time = lambda: real() + next(jumps) * 365 * 86400.0
+time.time_ns = lambda: int(time.time() * 1e9)
+"""
+
+
+@pytest.mark.slow
+def test_an_unusual_name_and_a_jumping_clock_change_nothing(tmp_path: Path, undisturbed: str) -> None:
+    assert run(tmp_path / "größe μm 脳 'out'").content_hash == undisturbed
+    (tmp_path / "sitecustomize.py").write_text(JUMPING)
+    other = start(tmp_path / "clock", JOB, "sequence", PYTHONPATH=str(tmp_path))
+    assert other.wait() == 0
+    assert index.dataset_hash(index.read_index(tmp_path / "clock").to_pylist()) == undisturbed
+
+
+@pytest.mark.parametrize(
+    ("keys", "measured_mb"),
+    [
+        (["frames=10", "anatomy.vertices=12000", "render.size=[64, 48]", "flow.backend=ideal"], 603),
+        (["frames=300", "anatomy.vertices=12000", "render.size=[64, 48]", "flow.backend=ideal"], 803),
+        (["frames=200", "anatomy.vertices=2500", "render.size=[320, 240]", "flow.backend=ideal"], 919),
+        (["frames=100", "anatomy.vertices=2500", "render.size=[320, 240]"], 949),
+    ],
+)
+def test_memory_is_what_was_measured(keys: list[str], measured_mb: float) -> None:
+    estimate_mb = size_forecast.estimate_memory(reader.load_job("demo", keys)) / 1e6
+    assert measured_mb < estimate_mb < 1.5 * measured_mb
+
+
+def test_a_sequence_too_large_for_a_worker_is_refused_before_it_begins(tmp_path: Path) -> None:
+    job = reader.load_job("demo", ["sequences=1", "frames=10000"])
+    with pytest.raises(UserError, match=r"10000 frames needs about .* GB of memory .* --workers 1"):
+        engine.run_job(job, tmp_path / "out", engine.Options(workers=2, memory_gb=4), Silent())
+    assert not (tmp_path / "out").exists()
+    size_forecast.refuse_if_too_long(job, None, 1)  # memory is unknown: nothing is refused

@@ -1,4 +1,4 @@
-"""Job files: they are read as written, and every error is reported with its place."""
+"""Job files: read as written, errors reported with their place; named jobs can all be drawn."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from synth.errors import UserError
 from synth.job import identity, reader, writer
 from synth.job.schema import Job
+from synth.sequence import scenario
 
 BAD = """\
 seed: -1
@@ -66,3 +67,26 @@ def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
 def test_the_identity_does_not_depend_on_the_number_of_sequences() -> None:
     assert identity.identify_job(Job(sequences=3)) == identity.identify_job(Job(sequences=30))
     assert identity.identify_job(Job(seed=1)) != identity.identify_job(Job(seed=2))
+
+
+HOME = Path(__file__).resolve().parents[3]
+PAGE = (HOME / "docs" / "recipes.md").read_text("utf-8")
+CURVES = HOME / "evidence" / "curves"
+
+
+@pytest.mark.parametrize("name", reader.names())
+def test_it_is_read_drawn_and_on_the_page(name: str) -> None:
+    job = reader.load_job(name)
+    for index in range(min(job.sequences, 5)):
+        assert scenario.draw_scenario(job, index).gestures
+    assert f"| `{name}` |" in PAGE
+
+
+def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data() -> None:
+    paths = ("mission", f"{CURVES}/mission-bench.yaml", f"{CURVES}/mission-ood.yaml")
+    train, bench, ood = map(reader.load_job, paths)
+    assert not set(ood.appearance.families) & {*train.appearance.families, *bench.appearance.families}
+    assert ood.anatomy.gyrus_mm[1] <= train.anatomy.gyrus_mm[0]
+    assert ood.anatomy.sulcus_mm[1] <= train.anatomy.sulcus_mm[0]
+    assert ood.fem == train.fem == bench.fem
+    assert len({job.seed for job in (train, bench, ood)}) == 3

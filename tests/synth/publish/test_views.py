@@ -1,15 +1,30 @@
-"""The recording for the viewer rerun."""
+"""Views of a job and of a dataset: contact sheet, and the recording for the viewer rerun."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 from typer.testing import CliRunner
 
 from synth.cli import app
+
+
+@pytest.mark.slow
+def test_preview_draws_scenarios_and_prints_their_cost(tmp_path: Path) -> None:
+    sheet = tmp_path / "sheet.png"
+    small = ["render.size=[80, 64]", "sequences=40", "frames=6", "render.spp=4", "anatomy.vertices=900"]
+    done = CliRunner().invoke(app, ["preview", "tiny", *small, "-n", "3", "-o", str(sheet), "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert cv2.imread(str(sheet)).shape == (128, 160, 3)  # three tiles in a square of four
+    assert found["render_cpu_s"] > 0.1
+    assert found["cpu_s"] == pytest.approx(sum(found["stages_cpu_s"].values()))
+    assert found["disk_bytes"] > 40 * 6 * 80 * 64 * 3 / 2
 
 
 @pytest.mark.slow

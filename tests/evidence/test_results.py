@@ -1,0 +1,110 @@
+"""Stored results: their provenance and charts, whether they are up to date, making all of them again."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import typer
+
+from evidence import all as everything
+from evidence import report, status
+from evidence.report import Chart, Curve, Page, Panel, bars
+from evidence.steps import run_steps
+
+PANEL = Panel("cost", "ms", "error [%]", (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("a", "b")),))
+CHART = Chart("error", "mN", bars({"ours": 1.0, "theirs": 2.0}, {"ours": (0.5, 1.5)}))
+ROWS = [{"law": "<linear>", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a | b"}]
+
+
+def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["x", "/some/where.csv", "--cache=/a/b", "-o", "/tmp/o", "--seeds", "3"])
+    report.save(tmp_path, "found.json", {"third": 1 / 3, "rows": ROWS}, Page("Title", {}, [PANEL, CHART]))
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert list(found) == ["command", "commit", "machine", "cpu_hours", "third", "rows"]
+    assert found["command"].endswith("where.csv --cache=b --seeds 3")
+    assert found["third"] == 0.333333
+    again = found | {"commit": "1234567"}
+    report.save(tmp_path, "found.json", again)
+    assert json.loads((tmp_path / "found.json").read_text()) == again
+    for name, values in (("chart.svg", {"error [%]", "P2 <fast>"}), ("intervals.svg", {"mN", "theirs"})):
+        text = " ".join(ElementTree.fromstring((tmp_path / name).read_text()).itertext())
+        assert all(value in text for value in values)
+
+
+def test_pareto_front() -> None:
+    assert report.front([(2.0, 1.0), (1.0, 3.0), (3.0, 2.0), (1.0, 2.0)]) == [3, 0]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A checkout with a script, an imported module, another module, data, and the script's result."""
+    files = {
+        "evidence/flow/pareto.py": "from synth import flow",
+        "synth/__init__.py": "",
+        "synth/flow.py": "import synth.job",
+        "synth/job.py": "SIZE = 1",
+        "synth/other.py": "",
+        "data/job.yaml": "frames: 3",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", "-A")
+    git(tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "first")
+    found = {
+        "command": "python -m evidence.flow.pareto --seeds 3",
+        "commit": git(tmp_path, "rev-parse", "--short", "HEAD").strip(),
+        "cpu_hours": 1.5,
+        "data": status.data(tmp_path / "data/job.yaml", home=tmp_path),
+    }
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/pareto.json").write_text(json.dumps(found))
+    return tmp_path
+
+
+def git(folder: Path, *words: str) -> str:
+    return subprocess.run(["git", "-C", folder, *words], check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [("synth/other.py", ()), *((name, (name,)) for name in ("synth/job.py", "data/job.yaml"))],
+)
+def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple[str, ...]) -> None:
+    assert [one.changed for one in status.gather(home / "results", home)] == [()]
+    (home / changed).write_text((home / changed).read_text() + "\n")
+    (one,) = status.gather(home / "results", home)
+    assert (one.changed, one.cpu_hours) == (found, 1.5)
+
+
+PYTHON = Path("python")
+
+
+def test_every_script_accepts_the_arguments_of_its_step(tmp_path: Path) -> None:
+    steps = [*everything.standalone(tmp_path), *everything.photograph(PYTHON)]
+    steps += [*everything.exvivo(tmp_path, PYTHON), *everything.shared(tmp_path)]
+    steps += everything.foreign(tmp_path, PYTHON, PYTHON)
+    scripts = [words[1:] for _, words in steps if words[1].startswith("evidence.")]
+    assert len({name for name, _ in steps}) == len(steps) > len(scripts) > 25  # logs are named by step
+    for module, *words in scripts:
+        app = typer.Typer()
+        app.command()(import_module(module).main)
+        typer.main.get_command(app).make_context(module, words)  # a UsageError where one is unknown
+
+
+def test_only_failed_steps_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evidence.report.commit", lambda: "abc")
+    write = "open('{}', 'a').write('x'){}"
+    steps = [("good", ("-c", write.format("good", ""))), ("bad", ("-c", write.format("bad", "; 1 / 0")))]
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        rows = run_steps(steps, tmp_path / "steps.json", tmp_path)
+    assert [row["exit_code"] for row in sorted(rows, key=lambda row: row["name"])] == [1, 0]
+    assert [(tmp_path / name).read_text() for name in ("good", "bad")] == ["x", "xx"]
