@@ -60,6 +60,7 @@ def test_colours_of_the_same_tissue_are_recovered() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.trial
 def test_the_camera_of_a_photograph_of_another_brain_is_recovered() -> None:
     frame = fitting.render("pale", 400, MM, 7)
     rgb = frame.record({"vignette": 0.4, "blur": 1.0, "full_well": 3000.0, "read_noise": 6.0})

@@ -50,7 +50,8 @@ def test_the_croissant_validator_finds_no_issue_and_reads_the_records(root: Path
 
     dataset = mlcroissant.Dataset(jsonld=str(root / croissant.NAME))
     assert not dataset.metadata.issues.errors
-    assert not dataset.metadata.issues.warnings
+    # The day of publication is for the person who publishes; it would make two equal datasets differ.
+    assert all("datePublished" in warning for warning in dataset.metadata.issues.warnings)
     records = list(dataset.records("sequences"))
     assert [record["sequences/content_hash"].decode() for record in records] == [
         row["content_hash"] for row in index.read_index(root).to_pylist()
