@@ -106,7 +106,7 @@ def test_few_paths_have_the_mean_of_many() -> None:
 def test_tissue_is_visible_through_the_opening_only() -> None:
     """The wound's floor lies lower than the dura in front of it, and over the brain."""
     for seed in range(3):
-        job = Job(seed=seed, anatomy=AnatomySection(vertices=6000))
+        job = Job(seed=seed, anatomy=AnatomySection(vertices=6000), render={"size": (320, 240)})
         scene = at_rest(job)
         rest, edge = scene.renderer.rest, scene.renderer._rim.edge
         points = scene.view.rotation.T @ (rest.points[rest.tissue.ravel()] - scene.view.translation).T
