@@ -172,7 +172,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
                 folder.invalidate_workers()
                 if fresh and not folder.sealed() and not folder.failures():
                     folder.discard()
-                    if created:
+                    if created and not any(root.iterdir()):  # an interrupted sequence may be left
                         root.rmdir()
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR):
