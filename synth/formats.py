@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from synth.errors import UserError
 
-STORE, FOLDER, MODEL = 2, 2, 2
-"""Of a sequence store, of a dataset's `dataset.json`, of a model's `config.json`."""
+STORE, FOLDER, MODEL, SCORE = 2, 2, 2, 2
+"""Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
 FIRST = 2  # written by 0.2, the first release: nothing older is read
 
 

@@ -159,9 +159,11 @@ def _refuse_elsewhere(folder: Path) -> None:
     names = about.get("relative_file_paths") if isinstance(about, dict) else None
     if not isinstance(names, list):
         raise UserError(f"{path}: relative_file_paths is missing")
-    for name in map(str, names):
-        if name != Path(name).name:
-            raise UserError(f"{path}: {name} is not in the bag's folder")
+    for name in names:
+        if not isinstance(name, str) or name != Path(name).name:
+            raise UserError(
+                f"{path}: {str(name)[:80] if isinstance(name, str) else 'a file'} is not in the bag's folder"
+            )
         checked_file.check_file(folder / name, _LARGEST_BYTES)
 
 

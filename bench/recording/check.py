@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Force, Recording, open_recording
-from bench.recording.meta import Meta
-from bench.recording.right_camera import RightCamera, StereoQuality
+from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
+from bench.recording.right_camera import LATE, RightCamera, StereoQuality
 from bench.recording.tracking_picture import draw_tracking
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
@@ -73,7 +73,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         ("pictures", _check_video),
         ("times", _check_times),
         ("sensor", _check_sensor),
-        ("press", _check_press),
+        ("spans", _check_spans),
     ):
         try:
             check(recording, found)
@@ -139,7 +139,7 @@ def judge_stereo(stereo: StereoQuality, mm_per_px: float) -> list[Finding]:
         rows = f"rows of left and right picture are {stereo.epipolar_px:.2g} px off"
         message = f"{rows}: is the calibration of this camera pair?"
         found.append(Finding("bad", "stereo", message))
-    elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM:
+    elif stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM or stereo.lag > LATE:
         found.append(Finding("odd", "stereo", stereo.describe()))
     off = abs(np.log(stereo.mm_per_px / mm_per_px))
     if off > _OTHER_SCALE:
@@ -259,11 +259,25 @@ def _check_sensor(recording: Recording, found: _Checked) -> None:
         found.add("ok" if share > 0.9 and not other else "odd", "clocks", message)
 
 
-def _check_press(recording: Recording, found: _Checked) -> None:
-    """Length of the press; the searches for clock and axes check their own spans."""
-    span, times = recording.meta.press_s, found.time_s
-    if span is not None and len(times) > 1:
-        needed_s = _LEAST_PRESS / min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
-        inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
-        message = f"press_s covers {inside_s:.3g} s of video; at least {needed_s:.3g} s are needed"
-        found.add("ok" if inside_s >= needed_s else "odd", "press", message)
+def _check_spans(recording: Recording, found: _Checked) -> None:
+    """Whether the spans for calibration are long enough and covered by the force record."""
+    meta, times = recording.meta, found.time_s
+    if len(times) < 2:
+        return
+    rate = min((len(times) - 1) / (times[-1] - times[0]), _RATE_HZ)
+    clock = meta.sync.calibration_s if meta.sync.method == "correlate" else None
+    for part, name, span, frames in (
+        ("clocks", "sync.calibration_s", clock, LEAST_INTERVALS),
+        ("sensor", "sensor.turn_s", meta.sensor.turn_s, LEAST_TURNING),
+        ("press", "press_s", meta.press_s, _LEAST_PRESS),
+    ):
+        if span is not None:
+            inside_s = max(min(span[1], times[-1]) - max(span[0], times[0]), 0.0)
+            message = f"{name} covers {inside_s:.3g} s of video; at least {frames / rate:.3g} s are needed"
+            found.add("ok" if inside_s >= frames / rate else "odd", part, message)
+    if clock is not None and recording.force is not None:
+        t, margin = recording.force.time_s, meta.sync.search_s
+        lacks = max(t[0] - (clock[0] - margin), (clock[1] + margin) - t[-1], 0.0)
+        if lacks > 0:
+            message = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
+            found.add("odd", "clocks", message)

@@ -51,13 +51,12 @@ def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) 
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
     writer.write_force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
     writer.write_frames(part, time)
-    anatomy = (sequence.attrs.get("scenario") or {}).get("anatomy", sequence.index)
     about: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "rest_frame": 0,
-        "specimen": f"anatomy {anatomy}",
+        "specimen": f"anatomy {sequence.attrs.get('anatomy_id', sequence.index)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }
     if "rgb_right" in sequence:

@@ -37,6 +37,10 @@ def _must_not_fall(span: tuple[float, float]) -> tuple[float, float]:
 Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
 
 
+LEAST_INTERVALS, LEAST_TURNING = 20, 20
+"""Least frame intervals in `sync.calibration_s` to align the clocks, least frames in `sensor.turn_s`."""
+
+
 class ScaleCalibration(Section):
     """Ways to find the scale if it isn't stated. Give exactly one of them."""
 

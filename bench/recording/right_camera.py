@@ -28,6 +28,9 @@ from synth.video.read import Picture
 
 _LARGEST_BYTES = 1 << 30  # of an array of points
 
+LATE = 0.22  # share of the motion that the right camera lacks, from which it is out of sync
+_MOVED_PX = 0.5  # less motion has no information on timing
+
 
 @dataclass(frozen=True)
 class StereoQuality:
@@ -37,6 +40,7 @@ class StereoQuality:
     epipolar_px: float  # median row error of stereo matches, at flow's resolution; NaN for a depth camera
     mm_per_px: float  # of the recording's own pixels at the tissue in the rest frame, by stereo or depth
     noise_mm: float  # median stated deviation of depth motion over tissue and frames
+    lag: float = 0.0  # share of the motion that the right camera lacks: its pictures are of another moment
     fault: str = ""  # why the right pictures don't belong to the left ones; empty if they do
 
     def describe(self) -> str:
@@ -44,7 +48,10 @@ class StereoQuality:
         noise = f"depth motion has a standard deviation of {self.noise_mm:.2g} mm"
         if np.isnan(self.baseline_mm):
             return f"depth camera; {noise}"
-        return f"baseline {self.baseline_mm:.3g} mm, rows {self.epipolar_px:.2g} px off; {noise}"
+        late = f"; the right camera lacks {100 * self.lag:.0f}% of the motion: out of sync" * (
+            self.lag > LATE
+        )
+        return f"baseline {self.baseline_mm:.3g} mm, rows {self.epipolar_px:.2g} px off; {noise}{late}"
 
 
 class RightCamera:
@@ -59,6 +66,7 @@ class RightCamera:
         self._rights: Iterator[Picture] = iter(recording.right_frames()) if recording.right else iter(())
         self._shrink = 1
         self._noise: list[float] = []
+        self._lags: list[float] = []
         self._pairing = StereoPairing()
         self._timing: StereoTiming | None = None
         self._pair: tuple[Rgb, Rgb] | None = None  # of the last tracked frame
@@ -76,7 +84,8 @@ class RightCamera:
         r, rest = self._stereo.rectified, self._stereo.rest
         scale = self._stereo.distance_mm / r.focal / self._shrink
         fault = self._pairing.fault(r) or ("" if self._timing is None else self._timing.fault())
-        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, fault)
+        lag = float(np.percentile(np.abs(self._lags), 90)) if self._lags else 0.0
+        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, noise, lag, fault)
 
     def follow(self, frame: FrameMotion, video: VideoFlow) -> Moved | None:
         """Motion in three dimensions of a frame since rest; None if its right or depth picture is missing.
@@ -108,6 +117,8 @@ class RightCamera:
             if view is not None:
                 hidden |= view.outside(tissue.shape)
             moved = self._stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
+            if np.percentile(np.abs(frame.flow[tissue]), 98) > _MOVED_PX:
+                self._lags.append(self._stereo.lag)
             self._pairing.add(frame.rgb, right, masked)
             if self._timing is not None:
                 self._timing.add(frame.rgb, right, frame.time_s or 0.0)

@@ -18,6 +18,7 @@ from bench.scoring.metrics import METRICS
 from bench.scoring.result import MOST_LOST
 from learn.evaluation.statistics import LEAST_GROUPS, over_groups
 from synth.errors import UserError
+from synth.formats import SCORE, check_format
 from synth.publish.svg import svg
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
@@ -50,6 +51,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
             raise UserError(f"{path}: no readable score.json ({error})") from None
         if not isinstance(tree, dict) or tree.get("format") != "sulcus-score":
             raise UserError(f"{path}: not written by `bench score`")
+        check_format(tree.get("format_version", 1), SCORE, str(path))
         found.append(tree)
     if not found:
         raise UserError("no scores to pool")

@@ -16,6 +16,7 @@ from bench.recording.pixel_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
+from synth.formats import SCORE
 from synth.recording_flow.finding import Finding, first_fault
 from synth.system import packages
 
@@ -138,7 +139,7 @@ def as_json(result: Result) -> dict[str, Any]:
     }
     tree = {
         "format": "sulcus-score",
-        "version": 1,
+        "format_version": SCORE,
         "recording": result.recording,
         "findings": result.findings,
         "fault": result.fault,

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench import bootstrap
+from bench.recording.meta import LEAST_INTERVALS
 
 Curve = NDArray[np.float64]
 
-_LEAST_INTERVALS = 20  # between frames
 _STEPS_PER_FRAME = 8
 _LEAST_R = 0.4
 _RESAMPLES = 300
@@ -55,8 +55,8 @@ def find_offset(
     good = np.isfinite(force_mn).all(axis=1)
     t, force = sensor_s[good], force_mn[good]
     widths = np.diff(frame_s)
-    if len(widths) < _LEAST_INTERVALS:
-        return _none(f"only {len(widths)} frame intervals in the calibration span, {_LEAST_INTERVALS} needed")
+    if len(widths) < LEAST_INTERVALS:
+        return _none(f"only {len(widths)} frame intervals in the calibration span, {LEAST_INTERVALS} needed")
     frame = float(np.median(widths))
     step = frame / _STEPS_PER_FRAME
     offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
@@ -64,12 +64,12 @@ def find_offset(
     moved = speed[1:]
     usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
     followed = int(np.isfinite(moved).sum())
-    if followed < _LEAST_INTERVALS:
+    if followed < LEAST_INTERVALS:
         return _none(
             f"only {followed} of {len(widths)} frame intervals in the calibration span could be tracked, "
-            f"{_LEAST_INTERVALS} needed"
+            f"{LEAST_INTERVALS} needed"
         )
-    if usable.sum() < _LEAST_INTERVALS:
+    if usable.sum() < LEAST_INTERVALS:
         return _none("the sensor doesn't cover the calibration span with the search's margin on both sides")
     change, moved = change[:, usable], moved[usable]
     r = _correlations(np.ones((1, len(moved))), change, moved)[0]

@@ -32,6 +32,7 @@ class Thresholds:
     disagree: float = 0.2  # cosine between sensor and methods: largest in the stated axes,
     agree: float = 0.7  # least in the proposed axes,
     apart: float = 0.5  # least difference between the two
+    rates: tuple[float, ...] = (0.9, 0.92, 0.95, 0.97, 1.03, 1.05, 1.08, 1.1)  # of a drifting clock
     late_s: float = 1.5  # largest clock error tried, in both directions
     sure: float = 0.96  # correlation of force and motion from which the clock is right
     left: float = 0.3  # share of (1 - correlation) that may remain with the proposed clock
@@ -132,12 +133,18 @@ def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
     """Possible faults of the clock, and the frames' times (T,) [s] that follow."""
     frame = float(np.median(np.diff(time_s)))
     yield "the video runs backwards", time_s[0] + time_s[-1] - time_s
+    for rate in LIMITS.rates:
+        what = f"the sensor's clock runs {1 / rate:.2f} times as fast"
+        yield what, time_s[0] + (time_s - time_s[0]) * rate
     most = round(LIMITS.late_s / frame)
     for k in range(-most, most + 1, max(1, 2 * most // LIMITS.tried)):
         if k == 0:
             continue
         if abs(k) > 1:  # creep delays the tissue by as much as one frame
             yield f"the sensor's clock is shifted by {k * frame:+.2f} s", time_s - k * frame
+            for rate in LIMITS.rates:
+                what = f"the sensor's clock is {k * frame:+.2f} s off and runs {1 / rate:.2f} times as fast"
+                yield what, time_s[0] + (time_s - time_s[0]) * rate - k * frame
         what = f"{abs(k) * frame:.2f} s of the video are {'missing' if k < 0 else 'repeated'}"
         for start in time_s[LIMITS.part : -LIMITS.part : max(1, len(time_s) // LIMITS.tried)]:
             yield f"{what} at {start:.2f} s", np.where(time_s < start, time_s, time_s - k * frame)

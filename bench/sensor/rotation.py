@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from bench import bootstrap
+from bench.recording.meta import LEAST_TURNING
 
 Floats = NDArray[np.float64]
 
-_LEAST_TURNING = 20  # frames
 _FLAT = 0.1  # least standard deviation of force in any direction, as a share of the largest
 _EXPLAINED = 0.5  # least share of the motion's variance
 _SURE_DEG = 15.0
@@ -52,12 +52,12 @@ def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRot
         force_mn: (T, 3) in the sensor's axes, tared; frames with NaN are left out.
 
     Returns:
-        The rotation; refused for fewer than `_LEAST_TURNING` frames, forces in a plane, less than half of the
+        The rotation; refused for fewer than `LEAST_TURNING` frames, forces in a plane, less than half of the
         motion explained, or an angle with a standard deviation above 15°.
     """
     good = np.isfinite(force_mn).all(axis=1)
-    if good.sum() < _LEAST_TURNING:
-        return _none(f"only {good.sum()} tracked frames with force, {_LEAST_TURNING} needed")
+    if good.sum() < LEAST_TURNING:
+        return _none(f"only {good.sum()} tracked frames with force, {LEAST_TURNING} needed")
     force, shift = force_mn[good], _shift(moved[good], visible[good])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
     if spread[2] < _FLAT * spread[0] or not shift.any():

@@ -110,7 +110,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         | {part: report.percent(row[f"covered_{part}"]) for part in ("size", "x", "y", "z")}
         | {"width, of the peak": f"{row['width_of_peak']:.0%}"}
         | {"widths of x, y, z [mN]": ", ".join(f"{row[f'width_{axis}_mn']:.1f}" for axis in "xyz")}
-        | {"frames out of distribution": f"{row['unseen']:.0%}"}
+        | {"frames out of distribution": f"{row['out_of_distribution']:.0%}"}
         for row in found["rows"]
     ]
     sections = [
@@ -134,7 +134,11 @@ def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> report.Ch
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Coverage of 90% intervals", "covered_size"))
-_WIDTHS = ("width_mn", "width_of_peak", "width_x_mn", "width_y_mn", "width_z_mn", "unseen", "distance")
+_WIDTHS = (
+    *(f"width_{one}" for one in ("mn", "of_peak", "x_mn", "y_mn", "z_mn")),
+    "out_of_distribution",
+    "distance",
+)
 _PARTS = ("whole", "membrane_known", "across", "along", "force_size", "bare")
 _ERRORS = {key.removeprefix("force_").replace("_", " "): key for key in _PARTS}
 _ERRORS_ARE = (

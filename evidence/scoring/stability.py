@@ -228,7 +228,7 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             | {key: f"{100 * np.median(e):.0f}%" if e else "none" for key, e in errors.items()}
             | {
                 "worse": f"{sum(row['worse'] for row in own)} of {len(own)}",
-                "covered": f"{sum((row['held'] or 0) >= _COVERED for row in own)} of {len(own)}",
+                "covered": f"{sum((row['coverage'] or 0) >= _COVERED for row in own)} of {len(own)}",
                 "named": f"{sum(named)} of {len(named)}" if named else None,
                 "silently wrong": sum(row["silently_wrong"] for row in own),
                 "message": max(messages, key=lambda one: bool(re.search(cause, one)), default="")[:90],

@@ -118,13 +118,13 @@ def agreements(moments: Floats) -> dict[str, NDArray[np.float64]]:
         var_t, var_p = np.maximum(tt / n - mean_t**2, 0), np.maximum(pp / n - mean_p**2, 0)
         cov = tp / n - mean_t * mean_p
         mse = np.maximum((pp - 2 * tp + tt) / n, 0)
-        varies = var_t > 1e-12 * np.maximum(tt / n, 1e-300)
+        varies, moves = (v > 1e-12 * np.maximum(s / n, 1e-300) for v, s in ((var_t, tt), (var_p, pp)))
         return {
             "r2": np.where(varies, 1 - mse / var_t, np.nan),
             "mae": absolute / n,
             "rmse": np.sqrt(mse),
             "bias": mean_p - mean_t,
-            "r": np.where(varies & (var_p > 0), cov / np.sqrt(var_t * var_p), np.nan),
+            "r": np.where(varies & moves, cov / np.sqrt(var_t * var_p), np.nan),
             "ccc": np.where(varies, 2 * cov / (var_t + var_p + (mean_t - mean_p) ** 2), np.nan),
         }
 

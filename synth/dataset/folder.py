@@ -57,12 +57,12 @@ class Folder:
         if not os.path.lexists(self.root / _NAME):
             raise UserError(f"{self.root}: is not a dataset ({_NAME} is missing)")
         found = checked_file.read_json(self.root / _NAME)
+        if isinstance(found, dict):
+            check_format(found.get("format_version", 1), FOLDER, str(self.root / _NAME))
         try:
-            described = _Described.model_validate(found)
+            return _Described.model_validate(found).model_dump()
         except ValidationError as error:
             raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
-        check_format(described.format_version, FOLDER, str(self.root / _NAME))
-        return described.model_dump()
 
     def job(self) -> Job:
         """The dataset's job; its plug-ins need not be installed."""

@@ -110,7 +110,11 @@ def _find_mistakes(
 ) -> Iterator[Mistake]:
     """pydantic's messages with their paths in `values`; for an unknown key with a suggestion."""
     found: dict[Loc, list[str]] = {}
-    for one in error.errors(include_url=False):
+    errors = error.errors(include_url=False)
+    for one in errors:
+        inner = [other["loc"] for other in errors if other["loc"][:-1] == one["loc"]]
+        if one["type"] == "too_short" and inner:  # what is wrong is an item, not their number
+            continue
         block: Any = values
         at: Loc = ()
         for step in one["loc"]:  # in which pydantic includes names of validators and members of unions

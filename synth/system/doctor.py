@@ -57,7 +57,12 @@ def diagnose(folder: Path) -> list[Diagnosis]:
         *_lacking(),
         _kernels(),
     ]
-    return found + [Diagnosis(name, version) for name, version in packages.versions().items()]
+    found += [Diagnosis(name, version) for name, version in packages.versions().items()]
+    for name in ("mitsuba", "cv2", "torch", "trimesh", "av"):
+        if importlib.util.find_spec(name) is None:
+            advice = "pip install -c constraints.txt . in the project's folder"
+            found.append(Diagnosis(name, "missing", False, advice))
+    return found
 
 
 def lines(found: Sequence[Diagnosis]) -> list[str]:

@@ -13,10 +13,11 @@ from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope, scatter, shape
 from synth.job import schema
 
+FIRM_PER_MM = 2.0  # springs of skull, dura and attachments, in E per mm: 10 times as stiff as the tissue
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_FIRM_PER_MM = 2.0  # traction per displacement, in E per mm, as of the skull
 
 _FINE = 9
 _GRID = np.array([i for i in product(range(_FINE), repeat=4) if sum(i) == _FINE - 1], np.float64)
@@ -53,7 +54,7 @@ def springs(points: Floats, cells: Ints, attachments: Sequence[schema.Attachment
             raise UserError(f"anatomy.attachments: number {k} holds no tissue; check its point and radius_mm")
         held, mine = held[touched], cells[chosen[touched]]
         across = attachment.radius_mm if attachment.normal is None else attachment.thickness_mm
-        weight = held * (_FIRM_PER_MM / across * share[chosen[touched]])[:, None]
+        weight = held * (FIRM_PER_MM / across * share[chosen[touched]])[:, None]
         local = np.einsum("mq,qi,qj->mij", weight, value, value, optimize=True)
         total = total + scatter(local, mine, len(points))
     return sp.csr_array(total)

@@ -29,7 +29,6 @@ BLOCK_MM = 100.0, 100.0, 60.0
 """Width, height, depth of a procedural block; below 70 mm the fixed walls would take 10-16% of the peak."""
 RIM_MM = 3.0
 """Width over which the skull's hold on the brain grows from none in the opening to firm."""
-_FIRM_PER_MM = 2.0  # springs of skull and dura, in E per mm: 10 times stiffer than the tissue under a contact
 _EVEN = 0.5  # part of a contact's radius under which elements have one size
 _DEPTH = 1.5  # weight of depth against distance: strain fades faster downwards than sideways
 _ALL_MM = 25.0  # lattice this near to the opening is refined inside and outside alike
@@ -263,7 +262,7 @@ def _springs(
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1
     value = face_shape(TRI_POINTS)
-    pressed = _FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
+    pressed = attachments.FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
 
     def gathered(part: Floats) -> sp.csr_array:
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))

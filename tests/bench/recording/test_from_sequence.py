@@ -39,7 +39,7 @@ def sealed(folder: Path, index: int = 0, frames: int = 4) -> Sequence:
         writer.put_frame("flow", t, np.zeros((*SIZE, 2), np.float32))
         writer.put_frame("depth", t, np.full(SIZE, 300, np.float32))
         writer.put_frame("traction", t, np.zeros((*SIZE, 3), np.float32))
-    about = {"scenario": {"anatomy": 7}, "scale_mm_per_px": 0.07, "young_kpa": 1.4, "poisson": 0.4}
+    about = {"anatomy_id": "seed-7", "scale_mm_per_px": 0.07, "young_kpa": 1.4, "poisson": 0.4}
     return open_sequence(writer.seal(**about))
 
 
@@ -56,7 +56,7 @@ def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path
     assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
     assert recording.meta.scale_mm_per_px == pytest.approx(0.07)
     assert recording.meta.young_kpa == pytest.approx(1.4)
-    assert recording.meta.specimen == "anatomy 7"
+    assert recording.meta.specimen == "anatomy seed-7"
     assert np.array_equal(recording.tissue_mask(SIZE), sequence["tissue"][:])
     assert recording.masks.read(0, SIZE) is None
     mask = recording.masks.read(2, SIZE)

@@ -69,6 +69,7 @@ SENSORS = {
     "constant": (0 * PRESS + 2.0, "bad"),
     "saturated": (PRESS.clip(-9, 2.0), "odd"),
     "0.6 s late": (np.roll(PRESS, 6, axis=0), "odd"),
+    "a clock 8% slow": (np.stack([np.interp(0.92 * TIME, TIME, axis) for axis in PRESS.T], axis=1), "odd"),
     "backwards": (PRESS[::-1], "odd"),
     "0.5 s of the video missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "odd"),
 }

@@ -21,7 +21,7 @@ def score(name: str, mae: float, specimen: str = "", **networks: str) -> dict[st
     hashes = {network: {"hash": one} for network, one in networks.items()}
     methods = {"net": method(mae), "zero": method(4.0)} | {network: method(mae) for network in networks}
     settings = {"meta": {"specimen": specimen}, "networks": hashes}
-    about = {"format": "sulcus-score", "recording": name, "main": "net", "frames": 10}
+    about = {"format": "sulcus-score", "format_version": 2, "recording": name, "main": "net", "frames": 10}
     return about | {"scores": {"mae_mn": mae}, "methods": methods, "settings": settings}
 
 
