@@ -143,7 +143,13 @@ shipped.MODELS = Path("packed")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["README", "docs/tutorial", *(f"docs/howto/{one}" for one in HOWTO)])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(one, marks=[pytest.mark.trial] * (Path(one).name in PLUG_INS))  # they install a package
+        for one in ("README", "docs/tutorial", *(f"docs/howto/{name}" for name in HOWTO))
+    ],
+)
 def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None:
     """Its scripts run with the files that it shows; its package installs and its entry point loads."""
     page = ROOT / f"{name}.md"

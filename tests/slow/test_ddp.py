@@ -8,9 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from learn.inference.predict import load_model
 
 
+@pytest.mark.trial
 def test_two_processes_train_one_model(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "model"
     train = ["-m", "learn", "train", str(dataset), "-o", str(out), "--preset", "tiny", "size=32"]

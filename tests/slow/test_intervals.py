@@ -57,6 +57,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.trial
 def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     model: Path, dataset: Path, foreign: Path
 ) -> None:

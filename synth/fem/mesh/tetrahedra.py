@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from synth.errors import UserError
 from synth.fem.mesh import attachments, winding
+from synth.fem.mesh.attachments import FIRM_PER_MM
 from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape, scatter
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
@@ -262,7 +263,7 @@ def _springs(
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1
     value = face_shape(TRI_POINTS)
-    pressed = attachments.FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
+    pressed = FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
 
     def gathered(part: Floats) -> sp.csr_array:
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))

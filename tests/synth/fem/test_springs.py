@@ -38,7 +38,7 @@ def compared(free: Tets, held: Tets, region: schema.AttachmentSection, edge_mm: 
 
 @pytest.mark.slow
 def test_an_attachment_holds_its_region_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attachments, "_FIRM_PER_MM", 20.0)
+    monkeypatch.setattr(attachments, "FIRM_PER_MM", 20.0)
     free = tetrahedra.block(schema.AnatomySection(), 2500)
     held = tetrahedra.block(schema.AnatomySection(attachments=(FALX,)), 2500)
     inside, beyond = compared(free, held, FALX, 8.0)
