@@ -1,7 +1,7 @@
 # No set-up is needed: `make demo` and `make test` make the virtual environment first.
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
-#   make test    lint, types, all tests but trials: five minutes on two cores
+#   make test    lint, types, all tests but trials: six minutes on two cores
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
 #   make docs    the pages in site/; open site/index.html
