@@ -112,9 +112,8 @@ def _find_mistakes(
     found: dict[Loc, list[str]] = {}
     errors = error.errors(include_url=False)
     for one in errors:
-        inner = [other["loc"] for other in errors if other["loc"][:-1] == one["loc"]]
-        if one["type"] == "too_short" and inner:  # what is wrong is an item, not their number
-            continue
+        if one["type"] == "too_short" and any(other["loc"][:-1] == one["loc"] for other in errors):
+            continue  # what is wrong is an item, not their number
         block: Any = values
         at: Loc = ()
         for step in one["loc"]:  # in which pydantic includes names of validators and members of unions
