@@ -295,7 +295,7 @@ def live(
     from bench.tracking import flow_process, live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
-    from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, everywhere
+    from synth.recording_flow.decode import Footage, RecordingFlowSettings, everywhere
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
     from synth.video.read import FPS, read_mask, read_video
@@ -317,7 +317,7 @@ def live(
     threadpool_limits(set_threads(None))
     with flow_process.open_flow_process() as process:
         stream = live.stream_video(
-            Footage(read_video(video, FPS), str(video), tissue, files.read if files else None),
+            Footage(partial(read_video, video, FPS), str(video), tissue, files.read if files else None),
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
             method=method,
             scale_mm_per_px=read_scale(scale),

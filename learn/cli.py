@@ -260,7 +260,7 @@ def predict_command(
     from learn.inference.prediction_file import write_overlay, write_prediction
     from learn.inference.shipped import NONE, choose_model, shipped
     from learn.training.threads import set_threads
-    from synth.recording_flow.video_flow import RecordingFlowSettings
+    from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
     from synth.video.read import is_video

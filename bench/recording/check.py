@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from bench.recording import clocks, pixel_scale
 from bench.recording.folder import Force, Recording, open_recording
+from bench.recording.footage import as_footage
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING, Meta
-from bench.recording.right_camera import LATE, RightCamera, StereoQuality
+from bench.recording.right_pictures import LATE, RightPictures, StereoQuality
 from bench.recording.tracking_picture import draw_tracking
 from synth.errors import UserError
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding, judge_scale, judge_young, worth_saying
-from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
+from synth.recording_flow.passes import VideoPass
 from synth.system.checked_file import write_picture
 from synth.video.read import Picture
 
@@ -84,7 +86,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
 
 
 def judge(
-    recording: Recording, mm_per_px: float, video: VideoFlow, stereo: StereoQuality | None
+    recording: Recording, mm_per_px: float, video: VideoPass, stereo: StereoQuality | None
 ) -> list[Finding]:
     """Findings on a tracked recording, the same in `bench check` and `bench score`.
 
@@ -95,9 +97,14 @@ def judge(
         stereo: quality of its right or depth camera, if it has one.
     """
     meta = recording.meta
-    found = [*judge_young(meta.young_kpa, meta.tissue == "phantom"), *judge_scale(mm_per_px, video.size[1])]
+    found = [
+        *judge_young(meta.young_kpa, meta.tissue == "phantom"),
+        *judge_scale(mm_per_px, video.rest.size[1]),
+    ]
     found += video.findings if stereo is None else [*video.findings, *judge_stereo(stereo, mm_per_px)]
-    return found if recording.force is None else [*found, *judge_zero(recording.force, meta, video.rest_s)]
+    return (
+        found if recording.force is None else [*found, *judge_zero(recording.force, meta, video.rest.time_s)]
+    )
 
 
 def judge_zero(force: Force, meta: Meta, rest_s: float | None) -> list[Finding]:
@@ -174,14 +181,19 @@ def _check_video(recording: Recording, found: _Checked) -> None:
     first = recording.meta.rest_frame
     numbers = [number for number in recording.numbers() or range(_TRIED) if number >= first] or [first]
     only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _TRIED).astype(int))
-    second = RightCamera(recording, found.mm_per_px or 1.0) if recording.has_stereo else None
     pictures = _counted(recording, found)
-    footage = replace(recording.as_footage(pictures), only=only)
-    video = VideoFlow(footage, RecordingFlowSettings(rate_hz=None, pulse=False), depth=second)
+    whole = as_footage(recording, found.mm_per_px or 1.0)
+    footage = replace(whole, pictures=lambda: pictures, only=only)
+    stereo, video = None, None
     try:
-        tracked = list(video.frames())
-        if found.picture is not None and tracked:
-            write_picture(found.picture, draw_tracking(tracked, video.tissue, video.shrink))
+        video = VideoPass(footage, RecordingFlowSettings(rate_hz=None, pulse=False))
+        right, tracked = RightPictures(video), []
+        for frame in video.frames():
+            right.add(frame)
+            tracked.append(frame)
+        stereo = right.quality
+        if found.picture is not None:
+            write_picture(found.picture, draw_tracking(tracked, video.rest.tissue, video.rest.shrink))
     except UserError as error:
         found.add("bad", "tracking", str(error))
     for _ in pictures:
@@ -194,9 +206,10 @@ def _check_video(recording: Recording, found: _Checked) -> None:
     if recording.tissue is None:
         found.add("lack", "tissue", "no tissue.png: the whole picture is assumed to be tissue")
     found.add("ok" if recording.masks else "lack", "tool", recording.describe_tool(found.frames))
+    if video is None:
+        return
     if video.summary.frames:
         found.add("odd" if video.summary.is_odd else "ok", "tracking", video.summary.describe())
-    stereo = None if second is None else second.quality
     if stereo is not None and not judge_stereo(stereo, found.mm_per_px or stereo.mm_per_px):
         found.add("ok", "stereo", stereo.describe())
     found.findings += judge(recording, found.mm_per_px or 0.0, video, stereo)

@@ -16,7 +16,7 @@ Files of one moment have the same number, in a picture's name and in frames.csv;
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta, Span
 from synth.errors import UserError
-from synth.recording_flow.video_flow import Footage
 from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
@@ -87,12 +86,6 @@ class Recording:
         first = next(iter(self.numbers()), 0)
         for picture in _pictures(self.footage):
             yield self._timed(picture, first)
-
-    def as_footage(self, pictures: Iterable[Picture] | None = None) -> Footage:
-        """The recording as input of a `VideoFlow`. `pictures`: some of its frames; None: all."""
-        tool = self.masks.read if self.masks else None
-        frames = self.frames() if pictures is None else pictures
-        return Footage(frames, str(self.folder), self.tissue_mask, tool, self.meta.rest_frame)
 
     def right_frames(self) -> Iterator[Picture]:
         """The right camera's frames in order, with the left frames' numbers. UserError: unreadable."""

@@ -25,9 +25,9 @@ from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.sensor.plausibility import judge_sensor
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding, first_fault, worth_saying
-from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.flow import LocalFlow
 
 Flags = NDArray[np.bool_]
 _MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones

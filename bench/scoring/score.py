@@ -25,8 +25,8 @@ from bench.tracking.tracking import Progress
 from learn import Predictor
 from learn.inference.shipped import find_model, require_model
 from synth.errors import UserError, as_path
-from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
+from synth.recording_flow.flow import LocalFlow
 from synth.system import checked_file
 from synth.system.terminal import counting
 

@@ -18,8 +18,8 @@ from multiprocessing import get_context, parent_process
 
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal
+from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.local_flow import LocalFlow
 
 
 class FlowProcess(LocalFlow):

@@ -16,9 +16,10 @@ import numpy as np
 
 from bench.methods.protocol import Method, MethodContext
 from synth.errors import UserError
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, worth_saying
-from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.flow import LocalFlow
+from synth.recording_flow.passes import VideoPass
 from synth.system.checked_file import write_whole
 from synth.system.packages import machine
 from synth.video.pixel_scale import StatedScale, pixel_mm
@@ -87,16 +88,14 @@ def stream_video(
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model requires --scale (mm per pixel, or unknown): forces depend on it")
-    stream, pace = Stream(), _VideoClock(paced)
-    video = VideoFlow(footage, settings, flow, pace=pace)
-    scene: MethodContext | None = None
+    pace = _VideoClock(paced)
+    video = VideoPass(footage, settings, flow=flow, pace=pace)
+    stream = Stream(size=(video.rest.tissue.shape[0], video.rest.tissue.shape[1]))
+    mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.rest.size[1]) * video.rest.shrink
+    young = None if scale_mm_per_px == "unknown" else young_kpa
+    scene = MethodContext(video.rest.tissue, mm_per_px, young)
     for found in video.frames():
-        if scene is None:
-            stream.size = video.tissue.shape
-            mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.size[1]) * video.shrink
-            scene = MethodContext(
-                video.tissue, mm_per_px, None if scale_mm_per_px == "unknown" else young_kpa
-            )
+        if found.is_rest:
             continue
         began, force = time.perf_counter(), None
         if method is not None and found.trusted:

@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from bench.methods.protocol import ForceEstimate, FusedEstimate, Method, MethodContext, Revising, Uses3D
 from bench.recording import check
 from bench.recording.folder import Recording
-from bench.recording.meta import Meta
-from bench.recording.right_camera import RightCamera, StereoQuality
+from bench.recording.footage import as_footage
+from bench.recording.meta import Meta, Span
+from bench.recording.right_pictures import RightPictures, StereoQuality
 from synth.errors import UserError
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding, first_fault
-from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
-from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.pulse import PulseSearch, SurfaceMotion
-from synth.recording_flow.video_flow import RecordingFlowSettings, VideoFlow
+from synth.recording_flow.flow import LocalFlow
+from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
+from synth.recording_flow.passes import VideoPass, passes
+from synth.recording_flow.pulse import SurfaceMotion
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
@@ -101,60 +103,52 @@ def track_recording(
     """
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
-
-    def one_pass(pulse: PulseSearch | None) -> tuple[TrackedRecording, PulseSearch | None]:
-        depth = RightCamera(recording, scale_mm_per_px) if recording.has_stereo else None
-        video = VideoFlow(recording.as_footage(), settings, flow, pulse, depth, watch=watch)
-        forces = _Forces(methods, pictured, watch)
-        for frame in video.frames(progress):
-            if frame.is_rest:
-                mm_per_px = scale_mm_per_px * video.shrink
-                forces.begin(frame.rgb, _context(about, video.tissue, mm_per_px))
+    footage, free_s = as_footage(recording, scale_mm_per_px), about.pulse.free_s
+    for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
+        mm_per_px = scale_mm_per_px * video.rest.shrink
+        forces = _Forces(methods, pictured, watch, video.rest, _context(about, video.rest.tissue, mm_per_px))
+        pictures = RightPictures(video)
+        for frame in video.frames():
+            pictures.add(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
-                span = about.sensor.turn_s
-                if span is not None and span[0] <= frame.time_s <= span[1] and frame.trusted:
-                    forces.out.turning = forces.out.turning or SurfaceMotion(video.tissue)
-                    forces.out.turning.add(frame.time_s, frame.flow, frame.confidence)
-        out = forces.out
-        if not out.time_s:
-            if video.decoded <= about.rest_frame:
-                raise UserError(
-                    f"{recording.folder}: rest_frame {about.rest_frame}, but {video.decoded} frames"
-                )
-            raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-        found = video.find_pulse(about.pulse.free_s)
-        if pulse is not None or found is None:  # otherwise a second pass follows
-            forces.finish(about)
-        out.stereo = None if depth is None else depth.quality
-        _describe(out, video, recording, methods, scale_mm_per_px * video.shrink)
-        return out, found
+                _gather_turning(forces.out, frame, about.sensor.turn_s, video.rest.tissue)
+    if not forces.out.time_s:
+        raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
+    forces.finish(about)  # of the last pass
+    forces.out.stereo = pictures.quality
+    _describe(forces.out, video, recording, methods, mm_per_px)
+    forces.out.timings |= watch.report()  # of all passes
+    return forces.out
 
-    out, pulse = one_pass(None)
-    if pulse is not None:
-        # Forces refer to tissue without pulsation: a second pass removes it.
-        out, _ = one_pass(pulse)
-    # Times of both passes.
-    out.timings |= watch.report()
-    return out
+
+def _gather_turning(
+    out: TrackedRecording, frame: FrameMotion, span_s: Span | None, tissue: NDArray[np.bool_]
+) -> None:
+    """Adds a frame to the motion over `sensor.turn_s`, if it is in that span."""
+    if span_s is None or frame.time_s is None or not frame.trusted:
+        return
+    if span_s[0] <= frame.time_s <= span_s[1]:
+        out.turning = out.turning or SurfaceMotion(tissue)
+        out.turning.add(frame.time_s, frame.flow, frame.confidence)
 
 
 def _describe(
     out: TrackedRecording,
-    video: VideoFlow,
+    video: VideoPass,
     recording: Recording,
     methods: Mapping[str, Method],
     mm_per_px: float,
 ) -> None:
     """Adds summary, findings and notes after the last frame."""
-    out.summary, out.size, out.notes = video.summary, video.size, video.notes
-    out.findings = check.judge(recording, mm_per_px / video.shrink, video, out.stereo)
-    if video.faults is not None:
-        out.repeats = video.faults.repeats()
+    rest, decoder = video.rest, video.decoder
+    out.summary, out.size, out.notes = video.summary, rest.size, video.notes
+    out.findings = check.judge(recording, mm_per_px / rest.shrink, video, out.stereo)
+    out.repeats = decoder.faults.repeats()
     if out.fault:
         out.trusted = [False] * len(out.time_s)
         out.notes.append(f"nothing can be measured: {out.fault}")
-    out.notes.append(recording.describe_tool(video.decoded))
+    out.notes.append(recording.describe_tool(decoder.decoded))
     for name, method in methods.items():
         out.notes += [f"{name}: {note}" for note in getattr(method, "notes", ())]
     if out.summary.is_odd:
@@ -163,11 +157,11 @@ def _describe(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
         out.notes.append(out.stereo.describe())
-    if video.removed is not None:
-        out.notes.append(video.removed.describe(mm_per_px))
+    if (removed := video.removed) is not None:
+        out.notes.append(removed.describe(mm_per_px))
         out.pulse = [
             {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
-            for rhythm, size in zip(video.removed.rhythms, video.removed.amplitudes_px, strict=True)
+            for rhythm, size in zip(removed.rhythms, removed.amplitudes_px, strict=True)
         ]
 
 
@@ -180,19 +174,23 @@ def _context(about: Meta, tissue: NDArray[np.bool_], mm_per_px: float) -> Method
 class _Forces:
     """Applies every method to every frame."""
 
-    def __init__(self, methods: Mapping[str, Method], pictured: str | None, watch: Stopwatch) -> None:
+    def __init__(
+        self,
+        methods: Mapping[str, Method],
+        pictured: str | None,
+        watch: Stopwatch,
+        rest: RestFrame,
+        scene: MethodContext,
+    ) -> None:
+        """Starts with the rest frame and the constants of the recording."""
         shown = methods.get(pictured) if pictured is not None else None
         self.pictured = shown.parts[0] if isinstance(shown, FusedEstimate) else pictured
-        self.methods, self.watch = methods, watch
-        self.out = TrackedRecording(pictured=self.pictured or "")
+        self.methods, self.watch, self.scene = methods, watch, scene
+        self.out = TrackedRecording(pictured=self.pictured or "", rest=_shrunk(rest.rgb))
+        self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: NDArray[np.float32] | None = None
         self.stride, self.cameras = 1, 1
-
-    def begin(self, rest: NDArray[np.uint8], scene: MethodContext) -> None:
-        """Starts with the rest frame (h, w, 3) and the constants of the recording."""
-        self.scene, self.out.rest = scene, _shrunk(rest)
-        self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
         """Adds the forces of a frame at its time [s]."""

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from evidence import report
 from evidence.flow.foreign_scenes import Frame, Recipe, recipes, video
 from evidence.flow.measure import epe
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
 
 _MASKS = ("auto", "both", "none")  # selected, all detected, none
@@ -79,8 +80,8 @@ def _follow(shown: Sequence[Frame], masks: str) -> tuple[NDArray[Any], ...]:
         Mean endpoint error over visible tissue [px], whether flow is trusted, share of unobstructed tissue
         that is masked; (T - 1,) each, NaN without such tissue.
     """
-    pictures = (Picture(k, k / _FPS, one.rgb) for k, one in enumerate(shown))
-    flow = VideoFlow(Footage(pictures, "video"), RecordingFlowSettings(rate_hz=None, masks=masks))
+    pictures = [Picture(k, k / _FPS, one.rgb) for k, one in enumerate(shown)]
+    flow = VideoPass(Footage(lambda: pictures, "video"), RecordingFlowSettings(rate_hz=None, masks=masks))
     rows = []
     for one, found in zip(shown, flow.frames(), strict=True):
         if not found.is_rest:

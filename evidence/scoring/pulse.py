@@ -25,7 +25,7 @@ from bench.scoring.result import Result
 from evidence import report
 from evidence.flow.scenes import inverse
 from evidence.scoring.cost import texture
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
 
 Floats = NDArray[np.float64]
 

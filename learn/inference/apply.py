@@ -34,23 +34,21 @@ def apply(
     young = young_kpa if young_kpa is not None else motion.young_kpa
     if not motion.scale_known:
         young = None
-    estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
-    numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
-    for frame in motion.frames:
-        numbers.append(frame.index)
-        times.append(math.nan if frame.time_s is None else frame.time_s)
-        followed.append(frame.trusted)
-        found.append(estimator.estimate(frame))
-    without_pulse = motion.again()
-    if without_pulse is not None:
-        return apply(predictor, without_pulse, young_kpa, membrane)
-    findings = worth_saying([*judge_young(young), *motion.findings()])
+    for one in motion.passes:  # the last one counts
+        estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
+        numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
+        for frame in one.frames:
+            numbers.append(frame.index)
+            times.append(math.nan if frame.time_s is None else frame.time_s)
+            followed.append(frame.trusted)
+            found.append(estimator.estimate(frame))
+    findings = worth_saying([*judge_young(young), *one.findings()])
     fault = first_fault(findings)
     trusted = np.array(followed) & (not fault)
-    force = np.where(trusted[:, None], [one.force_mn for one in found], np.nan)
+    force = np.where(trusted[:, None], [each.force_mn for each in found], np.nan)
     last = found[-1].map
     # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-    centres = motion.shrink * (np.array([one.map.view.resample.centre_px for one in found]) + 0.5) - 0.5
+    centres = motion.shrink * (np.array([each.map.view.resample.centre_px for each in found]) + 0.5) - 0.5
     out: dict[str, Any] = {
         "density": np.stack([one.map.density for one in found]),
         "total_force_mn": np.where(trusted, force_size(force), np.nan),
@@ -68,7 +66,8 @@ def apply(
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = force
-    notes = [one.message for one in findings if one.state == "odd"] + motion.notes() + estimator.notes
+    notes = [finding.message for finding in findings if finding.state == "odd"]
+    notes += one.notes() + estimator.notes
     if motion.scale_known:
         notes += estimator.interval_notes
         out |= _ends(found, trusted)
@@ -102,8 +101,9 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     """Young's modulus [kPa] from one press. Raises UserError if its force is not known."""
     if press.force_mn is None:
         raise UserError(f"{press.name}: needs a known force (force_mn in an .npz)")
+    frames = next(press.passes).frames
     view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
-    inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in press.frames]
+    inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in frames]
     known = [confidence for _, confidence in inputs if confidence is not None]
     displacement, confidence = np.stack([shift for shift, _ in inputs]), np.stack(known) if known else None
     return stiffness(predictor, displacement, view.mask, press.force_mn, confidence)

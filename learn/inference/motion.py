@@ -17,10 +17,10 @@ from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
+from synth.recording_flow.decode import Footage, RecordingFlowSettings, everywhere
 from synth.recording_flow.finding import Finding, judge_scale
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.pulse import PulseSearch
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow, everywhere
+from synth.recording_flow.passes import VideoPass, passes
 from synth.system import checked_file
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
@@ -28,20 +28,27 @@ from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 
 @dataclass(frozen=True)
+class MotionPass:
+    """The frames of one pass over a video, to be taken to the end, and what was found in them."""
+
+    frames: Iterator[FrameMotion]  # in order
+    notes: Callable[[], list[str]] = list  # on its processing, after the last frame
+    findings: Callable[[], list[Finding]] = list  # its faults, after the last frame
+
+
+@dataclass(frozen=True)
 class Motion:
-    """Motion of one video. The functions need its frames to be exhausted."""
+    """Motion of one video."""
 
     name: str
-    frames: Iterator[FrameMotion]  # in order
+    # One pass, or for a video with heartbeat and breathing a second one without them: the last one counts.
+    passes: Iterator[MotionPass]
     tissue: NDArray[np.bool_]  # (H, W) in the rest frame
     scale_mm_per_px: float
     young_kpa: float | None
     force_mn: NDArray[np.float64] | None = None  # (T,) size of the true force, if known
     shrink: int = 1  # factor by which pictures were shrunk before flow
-    notes: Callable[[], list[str]] = list  # what its user should know about its processing
-    findings: Callable[[], list[Finding]] = list  # its faults
     scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
-    again: Callable[[], Motion | None] = lambda: None  # its motion without heartbeat and breathing, if any
 
 
 @dataclass(frozen=True)
@@ -106,7 +113,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
 
     return Motion(
         name=sequence.path.stem,
-        frames=frames(),
+        passes=iter([MotionPass(frames())]),
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
         young_kpa=young,
@@ -114,41 +121,38 @@ def _stored(sequence: Sequence, source: str) -> Motion:
     )
 
 
-def _video(path: Path, options: VideoOptions, pulse: PulseSearch | None = None) -> Motion:
+def _video(path: Path, options: VideoOptions) -> Motion:
     if options.scale_mm_per_px is None:
         raise UserError(f"{path}: a video needs its scale: give --scale in mm/px, or --scale unknown")
     scale_known = options.scale_mm_per_px != "unknown"
     tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
-    taken: list[str] = []
-    frames_there = range(0 if path.is_dir() else video.count_frames(path) or 0)
-    tool = options.tool.of_frames(frames_there, taken).read if options.tool else None
-    footage = Footage(video.read_frames(path, video.FPS), str(path), tissue, tool)
-    following = VideoFlow(footage, options.settings, pulse=pulse)
-    frames = (replace(one, time_s=one.time_s or 0.0) for one in following.frames())
-    rest = next(frames)
-    mm_per_px = pixel_mm(options.scale_mm_per_px, following.size[1]) * following.shrink
+    taken: list[str] = [] if scale_known else [UNKNOWN_NOTE]
+    if path.is_dir():
+        taken.append(f"the pictures have no times: {video.FPS:g} per second are assumed")
+    count = range(0 if path.is_dir() else video.count_frames(path) or 0)
+    tool = options.tool.of_frames(count, taken).read if options.tool else None
+    footage = Footage(partial(video.read_frames, path, video.FPS), str(path), tissue, tool)
+    every = passes(footage, options.settings)
+    first = next(every)
+    rest = first.rest
+    scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
 
-    def again() -> Motion | None:
-        found = following.find_pulse()
-        return None if found is None else _video(path, options, found)
+    def described(one: VideoPass) -> MotionPass:
+        def notes() -> list[str]:
+            removed = [] if one.removed is None else [one.removed.describe(scale * rest.shrink)]
+            return [*taken, *one.notes, *removed]
 
-    def notes() -> list[str]:
-        found = [*taken, *([] if scale_known else [UNKNOWN_NOTE]), *following.notes]
-        if path.is_dir():
-            found = [f"the pictures have no times: {video.FPS:g} per second are assumed", *found]
-        return found if following.removed is None else [*found, following.removed.describe(mm_per_px)]
+        frames = (replace(frame, time_s=frame.time_s or 0.0) for frame in one.frames())
+        return MotionPass(frames, notes, lambda: [*judge_scale(scale, rest.size[1]), *one.findings])
 
     return Motion(
         name=path.stem,
-        frames=chain([rest], frames),
-        tissue=following.tissue,
-        scale_mm_per_px=mm_per_px,
+        passes=map(described, chain([first], every)),
+        tissue=rest.tissue,
+        scale_mm_per_px=scale * rest.shrink,
         young_kpa=None,
-        shrink=following.shrink,
-        notes=notes,
-        findings=lambda: [*judge_scale(mm_per_px / following.shrink, following.size[1]), *following.findings],
+        shrink=rest.shrink,
         scale_known=scale_known,
-        again=again,
     )
 
 
@@ -179,7 +183,7 @@ def _arrays(path: Path) -> Motion:
 
     return Motion(
         name=path.stem,
-        frames=frames(),
+        passes=iter([MotionPass(frames())]),
         tissue=tissue,
         scale_mm_per_px=scale,
         young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,

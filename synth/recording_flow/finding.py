@@ -1,6 +1,6 @@
 """Findings on a video or its metadata, for reports.
 
-A `VideoFlow` collects those on pictures, and the check of a recording those on the consistency of its files.
+A `VideoPass` collects those on pictures, and the check of a recording those on the consistency of its files.
 They are reported first. If one is `bad`, no number is reported.
 """
 

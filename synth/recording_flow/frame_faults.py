@@ -84,7 +84,8 @@ class VideoFaults:
 
     def __init__(self, rgb: NDArray[np.uint8], small: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> None:
         """Starts with the rest frame (H, W, 3), also downsampled (h, w, 3), and its tissue mask (h, w)."""
-        self._tissue, self._last = tissue, rgb[::_STRIDE, ::_STRIDE]
+        self._tissue, self._rest_rgb, self._last = tissue, small, rgb[::_STRIDE, ::_STRIDE]
+        self.changes = False  # whether a tracked picture differs from the rest frame
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         self._fine = _detail(grey, 0, 1)[tissue].std()
         self._numbers: list[int] = []
@@ -121,6 +122,7 @@ class VideoFaults:
 
     def add_tracked(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
         """Adds a picture that is tracked, and the same downsampled."""
+        self.changes = self.changes or not np.array_equal(small, self._rest_rgb)
         fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
         if fine < LIMITS.blurred * self._fine:
             self._blurred.append(time_s)

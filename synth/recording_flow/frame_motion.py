@@ -8,15 +8,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.flow.estimator import Flags, Rgb
+from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import Similarity
+from synth.recording_flow.finding import Finding
+
+Size = tuple[int, int]  # height, width [px]
 
 _ODD = 0.2  # share of the tissue masked, or of the frames lost, above which a recording should be checked
 
 
 @dataclass(frozen=True, eq=False)
+class RestFrame:
+    """The frame to which all motion refers; with it every later stage starts."""
+
+    rgb: Rgb  # (h, w, 3), downsampled
+    tissue: Flags  # (h, w)
+    size: Size  # of the video's own pictures
+    shrink: int  # factor of downsampling
+    time_s: float | None  # on the clock of the video, if known
+    fault: str  # why nothing can be tracked; empty if it can
+    findings: tuple[Finding, ...] = ()  # on the tissue mask and black bars
+
+
+@dataclass(frozen=True, eq=False)
 class FrameMotion:
-    """Motion of the tissue from the rest frame to one frame, on the pixels of the rest frame."""
+    """One frame and the motion of the tissue to it from the rest frame, on the pixels of the rest frame.
+
+    Each stage of a `VideoPass` fills in its part: picture, camera motion, mask proposals, flow and motion in
+    three dimensions; the last one subtracts pulsation.
+    """
 
     flow: NDArray[np.float32]  # (h, w, 2) px
     confidence: NDArray[np.float32]  # (h, w) in 0..1
@@ -31,6 +52,8 @@ class FrameMotion:
     time_s: float | None = None  # on the clock of the video; only that of the rest frame may be unknown
     # (h, w, 3) the downsampled picture without camera motion.
     rgb: Rgb = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
+    right: Rgb | None = None  # (h, w, 3) the right camera's picture, likewise; None: no such camera
+    proposal: Proposal | None = None  # masks proposed for the picture; None: not yet
     cpu_s: float = 0.0  # of the flow
     wall_s: float = 0.0  # of the flow
     masking_s: float = 0.0  # wall time of downsampling, masking and the estimate of camera motion

@@ -14,7 +14,7 @@ from bench.tracking.tracking import track_recording
 from evidence.end_to_end import models
 from evidence.scoring import exvivo
 from evidence.scoring import pulse as experiment
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.tune.grid import changed
 
 

@@ -17,7 +17,7 @@ from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
 from evidence.scoring import cost as phantom
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
 
 GAIN_MN_PER_PX = 40.0
 SENSOR_HZ = 100.0

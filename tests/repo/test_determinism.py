@@ -14,8 +14,8 @@ MAY_READ_CLOCKS = {
     "synth/engine/journal.py",
     "synth/dataset/folder.py",
     # Flow of a user's recording: not part of any dataset.
-    "synth/recording_flow/local_flow.py",
-    "synth/recording_flow/video_flow.py",
+    "synth/recording_flow/flow.py",
+    "synth/recording_flow/passes.py",
 }
 CLOCKS = {"time", "datetime", "uuid", "secrets"}
 RANDOM_CLASSES = {"Generator", "SeedSequence", "default_rng", "PCG64", "BitGenerator"}

@@ -12,7 +12,7 @@ from fake_recording import Bump, Maker
 
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import picture_masks, track_recording
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.video import read as video
 
 _SIZE = (96, 128)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
+from synth.recording_flow.local_flow import LocalFlow
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.protocol import ForceEstimate, Method, MethodContext
@@ -17,7 +18,6 @@ from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
 from synth.flow.estimator import Flags, Rgb
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.local_flow import LocalFlow
 
 SIZE = (96, 128)
 

@@ -17,7 +17,8 @@ from fake_recording import texture
 from bench.tracking.flow_process import FlowProcess
 from synth.errors import UserError
 from synth.flow.mask_selection import Proposal
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
 
 
@@ -39,8 +40,9 @@ def test_errors_and_the_end_of_the_process_are_reported(elsewhere: FlowProcess) 
     worker = elsewhere._pool.submit(os.getpid).result()
     os.kill(worker, signal.SIGINT)  # Ctrl-C in a terminal reaches every process; it must not end this one
     assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
-    footage = Footage([Picture(k, k / 25, one) for k, one in enumerate((rest, moved))], "video")
-    frames = VideoFlow(footage, RecordingFlowSettings("dis", 1, None, masks="none"), elsewhere).frames()
+    pictures = [Picture(k, k / 25, one) for k, one in enumerate((rest, moved))]
+    settings = RecordingFlowSettings("dis", 1, None, masks="none")
+    frames = VideoPass(Footage(lambda: pictures, "video"), settings, flow=elsewhere).frames()
     assert next(frames).is_rest
     os.kill(worker, signal.SIGKILL)
     with pytest.raises(UserError, match="ended"):

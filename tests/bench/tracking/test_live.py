@@ -24,9 +24,10 @@ from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
 from synth.flow.estimator import Rgb
 from synth.flow.mask_selection import Proposal
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.local_flow import LocalFlow
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture, read_video
 
 
@@ -38,7 +39,8 @@ def pictures(frames: int) -> list[Picture]:
 def test_flow_in_another_process_gives_the_same_results_in_order() -> None:
     def watched(flow: LocalFlow | None) -> list[live.LiveFrame]:
         results: list[live.LiveFrame] = []
-        footage, settings = Footage(pictures(5), "test"), RecordingFlowSettings("dis", 1, None, False, "none")
+        footage = Footage(lambda: pictures(5), "test")
+        settings = RecordingFlowSettings("dis", 1, None, False, "none")
         live.stream_video(footage, settings, paced=False, report=results.append, flow=flow)
         return results
 
@@ -91,7 +93,8 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
             return 0.04
 
     settings = RecordingFlowSettings("dis", 1, rate_hz=None, pulse=False, masks="none")
-    for frame in VideoFlow(Footage(pictures(4), "test"), settings, Later(), pace=Clock()).frames():
+    footage = Footage(lambda: pictures(4), "test")
+    for frame in VideoPass(footage, settings, flow=Later(), pace=Clock()).frames():
         if not frame.is_rest:
             log.append(f"out {frame.index}")
     assert log == expected
@@ -116,7 +119,7 @@ def test_live_estimates_the_same_forces_as_score(tmp_path: Path) -> None:
     def streamed(scale: float | str, young: float | None) -> list[float | None]:
         frames: list[live.LiveFrame] = []
         live.stream_video(
-            Footage(read_video(folder / "video.mp4"), "video"),
+            Footage(lambda: read_video(folder / "video.mp4"), "video"),
             replace(settings, pulse=False),
             method=Model(model),
             scale_mm_per_px=scale,  # type: ignore[arg-type]

@@ -26,7 +26,8 @@ from learn.settings import preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
 from synth.errors import UserError
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.passes import VideoPass
 from synth.system.config_file import override
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import read_video
@@ -121,8 +122,8 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
         assert found["trusted"].all()
-    footage = Footage(read_video(tmp_path / "video.mp4"), "video", lambda size: marked > 0)
-    flows = [frame.flow for frame in VideoFlow(footage, RecordingFlowSettings("dis", rate_hz=None)).frames()]
+    footage = Footage(lambda: read_video(tmp_path / "video.mp4"), "video", lambda size: marked > 0)
+    flows = [frame.flow for frame in VideoPass(footage, RecordingFlowSettings("dis", rate_hz=None)).frames()]
     assert np.abs(flows[0]).max() == 0
     np.testing.assert_allclose(flows[2][16:32, 16:48].mean((0, 1)), [2, 0], atol=0.3)
 

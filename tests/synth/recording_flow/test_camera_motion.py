@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from synth.flow.confidence import add_deviation, deviation, of_deviation
 from synth.recording_flow.camera_motion import CameraTracker
-from synth.recording_flow.video_flow import Footage, RecordingFlowSettings, VideoFlow
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
 
 HEIGHT, WIDTH = 120, 160
@@ -53,7 +54,7 @@ def test_a_similarity_is_estimated_and_undone(motion: tuple[float, ...]) -> None
 def test_a_camera_bump_is_removed_from_the_motion_and_reported() -> None:
     pictures = [Picture(t, t / 8, texture(*moved(0, 5 * (t > 2)))) for t in range(6)]
     settings = RecordingFlowSettings("dis", 1, None, False, "none")
-    video = VideoFlow(Footage(pictures, "video", lambda size: OPENING), settings)
+    video = VideoPass(Footage(lambda: pictures, "video", lambda size: OPENING), settings)
     frames = list(video.frames())
     assert all(np.array_equal(one.rgb, two.rgb) for one, two in zip(frames[:3], pictures[:3], strict=True))
     assert max(np.median(np.abs(one.flow[OPENING])) for one in frames) < 0.05

@@ -17,12 +17,12 @@ from bench.methods.protocol import ForceEstimate, MethodContext
 from bench.recording import writer
 from bench.recording.check import judge_stereo
 from bench.recording.folder import open_recording
-from bench.recording.right_camera import StereoQuality
+from bench.recording.right_pictures import StereoQuality
 from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import track_recording
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
-from synth.recording_flow.video_flow import RecordingFlowSettings
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.render.camera.camera import Camera
 
 SIZE = (160, 120)

@@ -1,17 +1,19 @@
-"""Flow of one video, computed in this process."""
+"""Third stage of a video: flow from the rest frame, with the masks that it selects."""
 
 from __future__ import annotations
 
 import time
 from concurrent.futures import Future
+from dataclasses import replace
 
+from synth.flow.confidence import add_deviation
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal, SelectingTracker
 from synth.recording_flow.frame_motion import FrameMotion
 
 
 class LocalFlow:
-    """Computes flow from the rest frame, frame by frame; subclasses use another process."""
+    """Computes flow frame by frame in this process; subclasses use another process."""
 
     ahead = 0  # number of frames that may be submitted before the first result is awaited
 
@@ -37,3 +39,20 @@ class LocalFlow:
             )
         )
         return done
+
+
+def with_flow(frame: FrameMotion, found: FrameMotion) -> FrameMotion:
+    """A frame with the flow `found` for it, whose uncertainty includes that of the camera's motion."""
+    confidence = found.confidence
+    if frame.camera is not None:
+        confidence = add_deviation(confidence, frame.camera.deviation_px)
+    return replace(
+        found,
+        confidence=confidence,
+        trusted=found.trusted and frame.trusted,
+        index=frame.index,
+        time_s=frame.time_s,
+        rgb=frame.rgb,
+        camera=frame.camera,
+        masking_s=frame.masking_s,
+    )
