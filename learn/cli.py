@@ -174,8 +174,8 @@ def eval_command(
     other = None if against is None else load_model(against)
     if other is not None:
         other.readable(source)
-        if other.grid != predictor.grid or other.card.settings.target != predictor.card.settings.target:
-            raise UserError(f"{against}: differs from {model} in grid or target; choose another --against")
+        if other.grid != predictor.grid:
+            raise UserError(f"{against}: differs from {model} in its grid; choose another --against")
     cards = [one.card for one in (predictor, other) if one is not None]
     chosen = choose_unseen(clips, dataset, cards, _console.print)
     with counting("Evaluating") as progress:
@@ -197,7 +197,7 @@ def eval_command(
     if covered and all:
         screen.print(coverage_table(covered))
     if second is not None:
-        screen.print(paired_table(pairs, f"against {against}, paired by sequence", predictor.card, all))
+        screen.print(paired_table(pairs, f"against {against}, paired by sequence", all))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
-from learn.data.clips import Input, Target, has_depth
+from learn.data.clips import Input, has_depth
 from learn.data.grid import Grid
 from learn.loss import Loss
 from learn.network.d2fnet import Architecture
@@ -32,7 +32,6 @@ class TrainingSettings(Section):
     """Displacement to train on. `mixed`: each frame is drawn ideal or recovered, with odds that move from all
     ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: stereo
     motion, recovered, true or mixed; they need `arch.depth`."""
-    target: Target = "density"
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
     learning_rate: Positive = 5e-4
@@ -52,8 +51,6 @@ class TrainingSettings(Section):
 
     @model_validator(mode="after")
     def _goes_together(self) -> TrainingSettings:
-        if self.target == "intensity" and self.arch.output != "magnitude":
-            raise ValueError("target 'intensity' has no direction: it needs output 'magnitude'")
         if self.arch.depth != has_depth(self.input):
             raise ValueError(f"input {self.input!r} needs arch.depth {str(not self.arch.depth).lower()}")
         halved = self.arch.stem * 2**self.arch.levels

@@ -48,7 +48,6 @@ class Model:
             "width": settings.arch.width,
             "stem": settings.arch.stem,
             "input": settings.input,
-            "target": settings.target,
             "force_gain": self.predictor.card.force_gain,
         }
 

@@ -28,7 +28,6 @@ from synth.system.terminal import ProgressCallback
 
 Input = Literal["ideal", "recovered", "noisy", "mixed", "motion", "motion-ideal", "motion-mixed"]
 INPUTS = get_args(Input)
-Target = Literal["density", "intensity"]
 FIELDS = {
     "ideal": "flow",
     "recovered": "flow_recovered",
@@ -284,37 +283,27 @@ def _checksum(values: NDArray[Any]) -> int:
     return zlib.crc32(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
 
 
-def target(clip: Clip, frame: int, kind: Target, components: int) -> NDArray[np.float32]:
-    """Training target of a frame, (C, N, N) [mN/mm² or, for intensity, mN; at E = 1 kPa].
+def target(clip: Clip, frame: int, components: int) -> NDArray[np.float32]:
+    """Training target of a frame: force density, or with one component its length.
 
-    `density`: the true force density; with one component its length. `intensity`: the published map, the
-    density scaled so that its peak is the total force; its integral has no meaning.
+    Returns (C, N, N) mN/mm² at E = 1 kPa.
     """
-    density = clip.density[frame]
-    if kind == "density" and components == 3:
-        return np.asarray(density)
+    density = np.asarray(clip.density[frame])
+    if components == 3:
+        return density
     length: NDArray[np.float32] = np.sqrt(np.square(density).sum(0, keepdims=True))
-    if kind == "intensity":
-        if components != 1:
-            raise UserError("target 'intensity' has no direction: use output 'magnitude'")
-        peak = float(length.max())
-        total = float(np.linalg.norm(clip.force[frame])) / clip.young_kpa
-        length = length * np.float32(total / peak) if peak > 0 else length
     return length
 
 
-def amount(clip: Clip, kind: Target, components: int, pitch_mm: float) -> NDArray[np.float64]:
-    """True total force that a map of this kind is compared with, (T, C) [mN at E = 1 kPa].
+def amount(clip: Clip, components: int, pitch_mm: float) -> NDArray[np.float64]:
+    """True total force that a map of C components is compared with, (T, C) [mN at E = 1 kPa].
 
-    A vector map sums to the force on the tissue, and an intensity map peaks at its size. In a map of lengths
-    two jaws that pull against each other add up, so it is compared with the sum of lengths (C = 1), which is
-    the force's size where all of it points one way.
+    A vector map sums to the force on the tissue. In a map of lengths two jaws that pull against each other
+    add up, so it is compared with the sum of lengths, which is the force's size where all of it points one
+    way.
     """
     if components == 3:
         return clip.force / clip.young_kpa
-    if kind == "intensity":
-        size: NDArray[np.float64] = np.linalg.norm(clip.force, axis=1, keepdims=True) / clip.young_kpa
-        return size
     length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
     total: NDArray[np.float64] = length.sum((1, 2))[:, None] * pitch_mm**2
     return total

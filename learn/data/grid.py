@@ -51,7 +51,7 @@ class Scales:
 
     displacement_mm: Positive
     divergence: Positive
-    target: Positive  # force density per unit stiffness [mN/mm² at E = 1 kPa], or intensity [mN at E = 1 kPa]
+    target: Positive  # force density per unit stiffness [mN/mm² at E = 1 kPa]
     force: Positive  # total force per unit stiffness [mN at E = 1 kPa]
     spread: Positive  # root mean square of the target over tissue cells and components, unit of `target`
 

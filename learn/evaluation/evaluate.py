@@ -36,7 +36,7 @@ YOUNG = ("known", "half", "double", "unknown")
 
 @dataclass(frozen=True)
 class ClipScore:
-    """Scores of one sequence. Forces in mN, densities in mN/mm² (intensity in mN)."""
+    """Scores of one sequence. Forces in mN, densities in mN/mm²."""
 
     name: str
     young_kpa: float
@@ -54,20 +54,18 @@ class ClipScore:
 
 def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipScore:
     """Scores the prediction of one sequence. `predicted`: (T, C, N, N), physical."""
-    grid, kind, parts = card.settings.grid, card.settings.target, predicted.shape[1]
-    young, pitch = clip.young_kpa, grid.pitch_mm
-    true = np.stack([target(clip, t, kind, parts) for t in range(clip.frames)]) * np.float32(young)
+    grid, parts, young = card.settings.grid, predicted.shape[1], clip.young_kpa
+    pitch = grid.pitch_mm
+    true = np.stack([target(clip, t, parts) for t in range(clip.frames)]) * np.float32(young)
     inside = np.broadcast_to(np.asarray(clip.mask) > 0, (clip.frames, *clip.mask.shape))
     size, true_size = length(predicted), length(true)
     unit = card.scales.target * young
     contact = true_size >= FREE * unit
     free = inside & ~contact
-    total = total_force(predicted, kind, grid)
+    total = total_force(predicted, grid)
     predicted_mn = force_size(total)
-    true_mn: NDArray[np.float64] = np.linalg.norm(amount(clip, kind, parts, pitch) * young, axis=1)
+    true_mn: NDArray[np.float64] = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
-    patch = size * (1.0 if kind == "intensity" else PATCH_MM2)
-    cell = 1.0 / grid.size**2 if kind == "intensity" else pitch**2
     centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
     off = [d for d in (float(np.linalg.norm(one)) for one in centres) if math.isfinite(d)]
     peak = float(true_mn.max())
@@ -78,10 +76,10 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
         others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
     others |= {
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
-        "false_positive": false_positive_share(patch, free, FALSE_POSITIVE_MN),
+        "false_positive": false_positive_share(size * PATCH_MM2, free, FALSE_POSITIVE_MN),
         "false_positive_relative": false_positive_share(size, free, LOW * unit),
         "false_positive_far": false_positive_share(size, inside & _off_contact(contact, grid), LOW * unit),
-        "off_target_mn": float((size * free).sum((1, 2)).mean() * cell),
+        "off_target_mn": float((size * free).sum((1, 2)).mean() * pitch**2),
         "localisation_mm": float(np.median(off)) if off else math.nan,
         "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
     }

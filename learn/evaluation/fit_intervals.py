@@ -136,12 +136,11 @@ def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
     """A sequence's forces per unit stiffness, the estimate at rest subtracted as in `ForceEstimator`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
     confidence, young = clip.confidence_of(source), clip.young_kpa
-    kind = predictor.card.settings.target
     density = predictor.density(shift, mask, young, confidence)
     at_rest = predictor.density(np.zeros_like(shift[:1]), mask, young)
     return Prediction(
         motion=motion_features(shift, mask, confidence, grid.extent_mm),
-        force=net_force(density, at_rest, kind, grid) / young,
+        force=net_force(density, at_rest, grid) / young,
         magnitude=length(density) / np.float32(young),
         pitch_mm=grid.pitch_mm,
     )

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from learn.checkpoint import ModelCard
 from learn.evaluation.coverage import Coverage
 from learn.evaluation.evaluate import YOUNG, EvaluationReport
 from learn.evaluation.metrics import METRICS, Metric
@@ -27,7 +26,7 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
         cells = [_cell(metric, c.get(key)) for c in columns]
         if key in sure and sure[key].low == sure[key].low:
             cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
-        table.add_row(_label(metric, report.card), *cells)
+        table.add_row(metric.heading, *cells)
     return table
 
 
@@ -45,14 +44,14 @@ def coverage_table(covered: Sequence[Coverage]) -> Table:
     return table
 
 
-def paired_table(pairs: Mapping[str, Paired], title: str, card: ModelCard, all: bool) -> Table:
+def paired_table(pairs: Mapping[str, Paired], title: str, all: bool) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
     table = _open_table(title, "difference [95%]", "p", "larger on")
     for key, metric in METRICS.items():
         if (metric.listed if all else key in FIRST) and key in pairs:
             d, pair = pairs[key].difference, pairs[key]
             difference = f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]"
-            table.add_row(_label(metric, card), difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")
+            table.add_row(metric.heading, difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")
     return table
 
 
@@ -63,10 +62,6 @@ def _open_table(title: str, *heads: str) -> Table:
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     return table
-
-
-def _label(metric: Metric, card: ModelCard) -> str:
-    return metric.heading.replace("mN/mm²", "mN") if card.settings.target == "intensity" else metric.heading
 
 
 def _cell(metric: Metric, value: float | None) -> str:

@@ -136,7 +136,7 @@ def stiffness(
     young = predictor.card.typical_young_kpa
     density = predictor.density(displacement, mask, young, confidence)
     at_rest = predictor.density(np.zeros_like(displacement[:1]), mask, young, None)
-    size = force_size(net_force(density, at_rest, predictor.card.settings.target, predictor.grid))
+    size = force_size(net_force(density, at_rest, predictor.grid))
     fit = float(size @ force_mn), float(size @ size)
     if not (np.isfinite(fit).all() and min(fit) > 0):
         raise UserError("calibration press: the known force or the model's estimate of it is zero")

@@ -96,7 +96,7 @@ def export(predictor: Predictor, file: Path) -> float:
 def describe(card: ModelCard, difference: float) -> dict[str, Any]:
     """Contents of the .json: shapes, units and preprocessing."""
     grid, arch = card.settings.grid, card.settings.arch
-    output = f"{card.settings.target} per unit stiffness, one component"
+    output = "density per unit stiffness, one component"
     if arch.components == 3:
         output = "force density per unit stiffness [mN/mm2 at E = 1 kPa]; components x, y, z in camera axes"
     inputs = ["flow [px] times the picture's scale [mm/px] is displacement [mm]; x right, y down"]

@@ -120,7 +120,7 @@ class ForceEstimator:
         if found.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
             self._tracked.append(found.motion)
         density, at_rest = found.density[None], self._at_rest[place].density[None]
-        force = net_force(density, at_rest, found.kind, found.grid)[0]
+        force = net_force(density, at_rest, found.grid)[0]
         return FrameForce(force, found, self._bound(force, found))
 
     @property

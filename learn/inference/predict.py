@@ -106,8 +106,7 @@ class Predictor:
         motion = None
         if self.card.intervals is not None:
             motion = motion_features(displacement[None], view.mask, known, self.grid.extent_mm)[0]
-        kind = self.card.settings.target
-        return ForceMap(density[0], self.grid, kind, young, young_kpa is not None, view, motion)
+        return ForceMap(density[0], self.grid, young, young_kpa is not None, view, motion)
 
     def on_grid(
         self,
@@ -192,10 +191,8 @@ class ForceMap:
 
     density: NDArray[np.float32]
     """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
-    camera axes; for a model of the paper's target the intensity [mN], C = 1."""
+    camera axes."""
     grid: Grid
-    kind: str
-    """`density` or `intensity`."""
     young_kpa: float
     """Young's modulus that the map is for: the one given, else the training data's typical one."""
     young_known: bool
@@ -205,18 +202,18 @@ class ForceMap:
 
     @property
     def magnitude(self) -> NDArray[np.float32]:
-        """(N, N), ≥ 0, in the unit of `density`."""
+        """(N, N), ≥ 0, in mN/mm²."""
         return length(self.density)
 
     @property
     def force_mn(self) -> NDArray[np.float64] | None:
         """(3,) total force on the tissue in camera axes [mN]; None if the model gives no direction."""
-        return total_force(self.density[None], self.kind, self.grid)[0] if len(self.density) == 3 else None
+        return total_force(self.density[None], self.grid)[0] if len(self.density) == 3 else None
 
     @property
     def total_force_mn(self) -> float:
         """Size of the total force [mN]."""
-        return float(force_size(total_force(self.density[None], self.kind, self.grid))[0])
+        return float(force_size(total_force(self.density[None], self.grid))[0])
 
     def to_image(self) -> NDArray[np.float32]:
         """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
@@ -231,24 +228,18 @@ def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
     return out
 
 
-def total_force(density: NDArray[np.float32], kind: str, grid: Grid) -> NDArray[np.float64]:
-    """Total force of maps (T, C, N, N), (T, 3) mN in camera axes: integral of a density, peak of an
-    intensity.
+def total_force(density: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]:
+    """Total force of maps (T, C, N, N) mN/mm², (T, 3) mN in camera axes.
 
     A map without direction gives the size in x, and NaN in y and z.
     """
-    if kind == "intensity":
-        total = density.max((2, 3)).astype(np.float64)
-    else:
-        total = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
+    total = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
     return total if total.shape[1] == 3 else np.pad(total, ((0, 0), (0, 2)), constant_values=np.nan)
 
 
-def net_force(
-    density: NDArray[np.float32], at_rest: NDArray[np.float32], kind: str, grid: Grid
-) -> NDArray[np.float64]:
+def net_force(density: NDArray[np.float32], at_rest: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]:
     """`total_force` minus that of `at_rest` (1, C, N, N), the prediction for no motion; a size is ≥ 0."""
-    net = total_force(density, kind, grid) - total_force(at_rest, kind, grid)
+    net = total_force(density, grid) - total_force(at_rest, grid)
     return net if density.shape[1] == 3 else np.maximum(net, 0.0)
 
 

@@ -44,8 +44,7 @@ FIELDS: dict[str, PredictedField] = {
     "density": PredictedField(
         "T, C, N, N",
         "mN/mm²",
-        "force density on the network's grid, nothing subtracted: its size (C = 1) or x, y, z; of a model of "
-        "the published target the intensity [mN]",
+        "force density on the network's grid, nothing subtracted: its size (C = 1) or x, y, z",
     ),
     "low_mn": PredictedField(
         "T", "mN", "lower end of the size's 90% interval; as the next five, of a model with intervals"

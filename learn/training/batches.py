@@ -141,7 +141,7 @@ class FrameDataset:
         frames = []
         for c, t, source, turn, known in items:
             clip = self.clips[c]
-            truth = target(clip, t, self.settings.target, self.settings.arch.components)
+            truth = target(clip, t, self.settings.arch.components)
             arrays = clip.displacement[source][t], clip.mask[None], clip.confidence_of(source)[t], truth
             code = np.float32(membrane_code(clip.membrane) if known else 0)
             one = Batch(*(torch.from_numpy(np.array(values))[None] for values in (*arrays, code)))
@@ -164,11 +164,11 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
                 u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
                 moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
                 strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))
-            truth = target(clip, int(t), settings.target, settings.arch.components)
+            truth = target(clip, int(t), settings.arch.components)
             wanted.append(np.linalg.norm(truth, axis=0)[inside])
             squares += float(np.square(truth[:, inside], dtype=np.float64).sum())
             cells += float(inside.sum() * len(truth))
-        total = amount(clip, settings.target, settings.arch.components, settings.grid.pitch_mm)
+        total = amount(clip, settings.arch.components, settings.grid.pitch_mm)
         force.append(np.linalg.norm(total, axis=1))
     found = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
     if min(found) <= 0:

@@ -38,9 +38,7 @@ class DeviceDataset(FrameDataset):
         self._confidence = None
         if settings.arch.confidence:
             self._confidence = {s: whole([c.confidence_of(s) for c in self.clips]) for s in self.sources}
-        self._true = whole(
-            [np.stack([target(c, t, settings.target, parts) for t in range(c.frames)]) for c in self.clips]
-        )
+        self._true = whole([np.stack([target(c, t, parts) for t in range(c.frames)]) for c in self.clips])
         self._device = device
 
     def batch(self, items: Sequence[FrameItem]) -> Batch:

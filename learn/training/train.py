@@ -220,7 +220,7 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
             predicted = forward(net, here, frames.settings, scales)
             sums = sums + moments(here.target[inside], predicted[inside])
             forces = forces + moments(
-                *(_amount(one * inside, frames.settings) for one in (here.target, predicted))
+                *((one * inside).sum((2, 3)).flatten() for one in (here.target, predicted))
             )
     result = agreement(sums)
     return {
@@ -228,12 +228,6 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
         "select_rmse": result.rmse,
         "select_gain": _gain(forces, len({clip.group for clip in frames.clips})),
     }
-
-
-def _amount(maps: torch.Tensor, settings: TrainingSettings) -> torch.Tensor:
-    """(B C,) sum of a density or peak of an intensity, of maps (B, C, N, N), as in `total_force`."""
-    flat = maps.flatten(2)
-    return (flat.amax(2) if settings.target == "intensity" else flat.sum(2)).flatten()
 
 
 def _gain(forces: NDArray[np.float64], anatomies: int) -> float:

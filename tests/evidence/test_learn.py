@@ -42,8 +42,8 @@ def test_a_run_is_cached_by_settings_and_data(
     nothing = [replace_field(c, displacement={"ideal": 0 * c.displacement["ideal"]}) for c in clips]
     assert evaluate(predictor, nothing, "ideal").summary()["map_r2_pooled"] <= 0
     card = predictor.card
-    kind, parts = card.settings.target, card.settings.arch.components
-    truth = [np.stack([target(c, t, kind, parts) for t in range(c.frames)]) * c.young_kpa for c in clips]
+    parts = card.settings.arch.components
+    truth = [np.stack([target(c, t, parts) for t in range(c.frames)]) * c.young_kpa for c in clips]
     scores = [score(c, one.astype(np.float32), card) for c, one in zip(clips, truth, strict=True)]
     found = EvaluationReport({"known": scores}, card).summary()
     assert (found["map_rmse"], found["map_r2_pooled"]) == (0, 1)

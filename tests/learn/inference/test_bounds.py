@@ -90,7 +90,7 @@ def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> N
 def test_fitting_and_estimation_use_the_same_force(kind: str, request: pytest.FixtureRequest) -> None:
     folder = request.getfixturevalue(kind)
     moved, still = estimate(folder), estimate(folder, 0.0)
-    found = net_force(moved.map.density[None], still.map.density[None], moved.map.kind, moved.map.grid)
+    found = net_force(moved.map.density[None], still.map.density[None], moved.map.grid)
     assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
 
 
