@@ -6,12 +6,18 @@ import json as json_
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
+
+if TYPE_CHECKING:
+    from bench.scoring.result import Result
+    from bench.tracking.live import LiveFrame
+    from synth.recording_flow.decode import Footage
+    from synth.video.mask_files import MaskFiles
 
 app = typer.Typer(
     name="bench",
@@ -31,53 +37,56 @@ Masks = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
 
 
+ScoredRecording = Annotated[
+    Path, typer.Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")
+]
+ScoredModel = Annotated[
+    Path | None,
+    typer.Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
+]
+ScoreFolder = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
+]
+Shrink = Annotated[
+    int, typer.Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
+]
+Rate = Annotated[float, typer.Option(min=0.0, help="Largest number of frames a second; 0: all.")]
+Pulse = Annotated[
+    bool, typer.Option(help="Remove heartbeat and breathing from the motion before estimating force.")
+]
+Train = Annotated[
+    Path | None, typer.Option(help="The model's training data, to fit the baselines on it too.")
+]
+Region = Annotated[str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")]
+
+
 @app.command(epilog="Example: bench score recording --model model --also other=other-model")
 def score(
-    recording: Annotated[
-        Path, typer.Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")
-    ],
-    model: Annotated[
-        Path | None,
-        typer.Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
-    ] = None,
+    recording: ScoredRecording,
+    model: ScoredModel = None,
+    out: ScoreFolder = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[
-        int,
-        typer.Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns."),
-    ] = 0,
-    rate: Annotated[float, typer.Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
-    pulse: Annotated[
-        bool, typer.Option(help="Remove heartbeat and breathing from the motion before estimating force.")
-    ] = True,
+    shrink: Shrink = 0,
+    rate: Rate = 10.0,
+    pulse: Pulse = True,
     title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
-    train: Annotated[
-        Path | None,
-        typer.Option(help="The model's training data, to fit the baselines on it too."),
-    ] = None,
+    train: Train = None,
     also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
-    region: Annotated[
-        str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")
-    ] = "",
+    region: Region = "",
     json: Json = False,
 ) -> None:
     """Estimates force from a recording's video and scores it against the sensor: score.json, report.html.
 
     Prints no table and exits with code 2 if the recording can't be measured.
     """
-    from rich.console import Console
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
     from bench.recording.folder import open_recording
-    from bench.scoring import report
     from bench.scoring import score as scoring
-    from bench.scoring.headline import headline
     from bench.scoring.result import as_json
     from learn.inference.shipped import require_model
     from learn.training.threads import set_threads
@@ -103,17 +112,27 @@ def score(
     if json:
         print(json_.dumps(as_json(result), allow_nan=False))
     else:
-        console, first = Console(), headline(result)
-        for line in filter(None, (first.refused, *first.warnings)):
-            console.print(line, style="bold red", markup=False, highlight=False)
-        if not result.refused:
-            console.print(report.terminal_table(result))
-        for note in result.notes:
-            console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
-        # Never wrapped, so that the path can be copied.
-        console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
+        _print_result(result, folder)
     if result.refused:
         raise typer.Exit(2)
+
+
+def _print_result(result: Result, folder: Path) -> None:
+    """Prints warnings, the table, notes and the report's path."""
+    from rich.console import Console
+
+    from bench.scoring.headline import headline
+    from bench.scoring.report import terminal_table
+
+    console, first = Console(), headline(result)
+    for line in filter(None, (first.refused, *first.warnings)):
+        console.print(line, style="bold red", markup=False, highlight=False)
+    if not result.refused:
+        console.print(terminal_table(result))
+    for note in result.notes:
+        console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    # Never wrapped, so that the path can be copied.
+    console.print(f"report: {folder / 'report.html'}", markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
@@ -264,15 +283,21 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
     return named
 
 
+LiveModel = Annotated[
+    Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
+]
+LiveFolder = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
+]
+
+
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
     video: Annotated[
         Path,
         typer.Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
     ],
-    model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
-    ] = None,
+    model: LiveModel = None,
     scale: Annotated[
         str | None, typer.Option(help="mm per pixel of the video, or unknown; needed with a model.")
     ] = None,
@@ -281,49 +306,33 @@ def live(
     shrink: Annotated[int, typer.Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
     every: Annotated[bool, typer.Option("--every", help="Process every frame, however late.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
-    ] = None,
+    out: LiveFolder = None,
     json: Json = False,
 ) -> None:
     """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""
-    from functools import partial
-
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
     from bench.tracking import flow_process, live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
-    from synth.recording_flow.decode import Footage, RecordingFlowSettings, everywhere
+    from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
-    from synth.video.read import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
-    drawn = video.parent / "tissue.png"
-    tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
-    method = None if model is None else Model(model)
-
-    def show(frame: live.LiveFrame) -> None:
-        force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
-        mark = "" if frame.trusted else "  not trusted"
-        typer.echo(
-            f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}"
-        )
-
     threadpool_limits(set_threads(None))
     with flow_process.open_flow_process() as process:
         stream = live.stream_video(
-            Footage(partial(read_video, video, FPS), str(video), tissue, files.read if files else None),
+            _open_footage(video, files),
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
-            method=method,
+            method=None if model is None else Model(model),
             scale_mm_per_px=read_scale(scale),
             young_kpa=young,
             paced=not every,
-            report=(lambda frame: None) if json else show,
+            report=(lambda frame: None) if json else _print_frame,
             flow=process,
         )
     summary = stream.summary()
@@ -334,10 +343,25 @@ def live(
     if out is not None:
         how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
         live.write_live(out, summary, **how, paced=not every, model=model is not None)
-    if json:
-        typer.echo(json_.dumps(summary))
-    else:
-        typer.echo(", ".join(f"{name} {value:.4g}" for name, value in summary.items()))
+    print(json_.dumps(summary) if json else ", ".join(f"{name} {one:.4g}" for name, one in summary.items()))
+
+
+def _open_footage(path: Path, masks: MaskFiles | None) -> Footage:
+    """A video with the tissue mask next to it, if there is one, and tool masks."""
+    from functools import partial
+
+    from synth.recording_flow.decode import Footage, everywhere
+    from synth.video.read import FPS, read_mask, read_video
+
+    drawn = path.parent / "tissue.png"
+    tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
+    return Footage(read_video(path, FPS), str(path), tissue, masks.read if masks else None)
+
+
+def _print_frame(frame: LiveFrame) -> None:
+    force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
+    mark = "" if frame.trusted else "  not trusted"
+    print(f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}")
 
 
 def _rectangle(text: str) -> tuple[int, int, int, int] | None:

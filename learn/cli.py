@@ -200,53 +200,57 @@ def eval_command(
         screen.print(paired_table(pairs, f"against {against}, paired by sequence", all))
 
 
+ModelOrSource = Annotated[
+    Path, typer.Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
+]
+Source = Annotated[
+    Path | None,
+    typer.Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
+]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")]
+Young = Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")]
+Membrane = Annotated[
+    MembraneState, typer.Option(help="State of the membrane (pia), for a model with that input.")
+]
+Scale = Annotated[
+    str | None, typer.Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")
+]
+Tissue = Annotated[
+    Path | None,
+    typer.Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
+]
+Flow = Annotated[str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")]
+Shrink = Annotated[
+    int, typer.Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns.")
+]
+Rate = Annotated[float, typer.Option(min=0.0, help="Most frames per second read from a video; 0: all.")]
+Pulse = Annotated[bool, typer.Option(help="Subtract heartbeat and breathing from a video's motion first.")]
+Masks = Annotated[
+    str,
+    typer.Option(
+        help="Masks of a video: auto, none, glare, tool, both, or a folder of instrument masks "
+        "NNNNNN.png or mask.png."
+    ),
+]
+Overlay = Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the video.")]
+
+
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
-    model: Annotated[
-        Path, typer.Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
-    ],
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path(
-        "forces"
-    ),
+    model: ModelOrSource,
+    source: Source = None,
+    out: Out = Path("forces"),
     input: Input = None,
-    young: Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")] = None,
-    membrane: Annotated[
-        MembraneState, typer.Option(help="State of the membrane (pia), for a model with that input.")
-    ] = "unknown",
-    scale: Annotated[
-        str | None, typer.Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")
-    ] = None,
-    tissue: Annotated[
-        Path | None,
-        typer.Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
-    ] = None,
-    flow: Annotated[
-        str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")
-    ] = "tvl1",
-    shrink: Annotated[
-        int,
-        typer.Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns."),
-    ] = 0,
-    rate: Annotated[
-        float, typer.Option(min=0.0, help="Most frames per second read from a video; 0: all.")
-    ] = 10.0,
-    pulse: Annotated[
-        bool, typer.Option(help="Subtract heartbeat and breathing from a video's motion first.")
-    ] = True,
-    masks: Annotated[
-        str,
-        typer.Option(
-            help="Masks of a video: auto, none, glare, tool, both, or a folder of instrument masks "
-            "NNNNNN.png or mask.png."
-        ),
-    ] = "auto",
-    overlay: Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the video.")] = True,
+    young: Young = None,
+    membrane: Membrane = "unknown",
+    scale: Scale = None,
+    tissue: Tissue = None,
+    flow: Flow = "tvl1",
+    shrink: Shrink = 0,
+    rate: Rate = 10.0,
+    pulse: Pulse = True,
+    masks: Masks = "auto",
+    overlay: Overlay = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -254,51 +258,36 @@ def predict_command(
 
     Exit code 2 if no frame has a force.
     """
-    from learn.inference.apply import apply
-    from learn.inference.motion import VideoOptions, has_right_camera, motions
+    from learn.inference.motion import VideoOptions, has_right_camera
     from learn.inference.predict import load_model
-    from learn.inference.prediction_file import write_overlay, write_prediction
-    from learn.inference.shipped import NONE, choose_model, shipped
+    from learn.inference.prediction_file import predict_files
+    from learn.inference.shipped import require_model
     from learn.training.threads import set_threads
     from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
-    from synth.video.read import is_video
 
     set_threads(threads)
     if source is None:
-        source = model
-        chosen = choose_model(has_right_camera(source)) if shipped() else None
-        if chosen is None:
-            raise UserError(f"{source}: give a model folder before it: {NONE}")
-        model = chosen
-    predictor = load_model(model, quick=True)
+        model, source = require_model(has_right_camera(model)), model
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
-    options = VideoOptions(read_scale(scale), tissue, settings, files)
-    peaks: dict[str, float | None] = {}
-    notes: dict[str, list[str]] = {}
-    for motion in motions(source, predictor.stored(input), options):
-        written = out / f"{motion.name}.npz"
-        if written.exists() and written.samefile(source):
-            raise UserError(f"{written}: is the input and would be overwritten; choose another --out")
-        found = apply(predictor, motion, young, membrane)
-        write_prediction(found, out / motion.name)
-        if overlay:
-            one = source.is_file() or source.suffix == ".zarr" or is_video(source)
-            write_overlay(found, source if one else source / f"{motion.name}.zarr", out / motion.name)
-        size = found["total_force_mn"][found["trusted"]]
-        peak = peaks[motion.name] = float(size.max()) if len(size) else None
-        notes[motion.name] = found["notes"].tolist()
-        if json:
-            continue
-        what = "no frame has a force" if peak is None else f"peak force {peak:.3g} mN"
-        _console.print(f"{motion.name}: {len(found['trusted'])} frames, {what}")
-        for note in found["notes"]:
-            _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+    options, predictor = (
+        VideoOptions(read_scale(scale), tissue, settings, files),
+        load_model(model, quick=True),
+    )
+    found = []
+    for one in predict_files(predictor, source, out, options, input, young, membrane, overlay):
+        found.append(one)
+        if not json:
+            what = "no frame has a force" if one.peak_mn is None else f"peak force {one.peak_mn:.3g} mN"
+            _console.print(f"{one.name}: {one.frames} frames, {what}")
+            for note in one.notes:
+                _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     if json:
+        notes, peaks = {one.name: one.notes for one in found}, {one.name: one.peak_mn for one in found}
         print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
-    if all(peak is None for peak in peaks.values()):
+    if all(one.peak_mn is None for one in found):
         raise typer.Exit(2)
 
 

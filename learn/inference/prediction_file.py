@@ -12,8 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from learn.inference.predict import length
+from learn.inference.apply import apply
+from learn.inference.motion import VideoOptions, motions
+from learn.inference.predict import Predictor, length
 from synth.dataset.store import Sequence, open_sequence
+from synth.errors import UserError
+from synth.job.types import MembraneState
 from synth.publish import picture, sequence_video
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
@@ -68,6 +72,54 @@ FIELDS: dict[str, PredictedField] = {
 _ENDS = ("low_mn", "high_mn")
 COLUMNS = ("frame", "time_s", "trusted", "total_force_mn", "force_x_mn", "force_y_mn", "force_z_mn", *_ENDS)
 """Columns of NAME.force.csv; missing values are empty."""
+
+
+class PredictedFile(NamedTuple):
+    """What was written for one video."""
+
+    name: str
+    frames: int
+    peak_mn: float | None  # None: no frame has a force
+    notes: list[str]
+
+
+def predict_files(
+    predictor: Predictor,
+    source: Path,
+    out: Path,
+    options: VideoOptions,
+    input: str | None = None,
+    young_kpa: float | None = None,
+    membrane: MembraneState = "unknown",
+    overlay: bool = False,
+) -> Iterator[PredictedFile]:
+    """Estimates and writes the forces of each video of a source, one after the other.
+
+    Args:
+        predictor: the model.
+        source: as of `motions`.
+        out: folder for the files.
+        options: of a video.
+        input: displacement read from a store; None: as of `Predictor.stored`.
+        young_kpa: of the tissue, instead of the data's.
+        membrane: its state.
+        overlay: whether to write NAME.force.mp4 where the source has pictures.
+
+    Raises:
+        UserError: as `motions` and `apply`, or a file that would overwrite its source.
+    """
+    alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
+    for motion in motions(source, predictor.stored(input), options):
+        stem = out / motion.name
+        if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
+            raise UserError(f"{file}: is the input and would be overwritten; choose another --out")
+        found = apply(predictor, motion, young_kpa, membrane)
+        write_prediction(found, stem)
+        if overlay:
+            write_overlay(found, source if alone else source / f"{motion.name}.zarr", stem)
+        size = found["total_force_mn"][found["trusted"]]
+        peak = float(size.max()) if len(size) else None
+        yield PredictedFile(motion.name, len(found["trusted"]), peak, found["notes"].tolist())
 
 
 def write_prediction(found: dict[str, Any], stem: Path) -> None:

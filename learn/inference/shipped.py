@@ -46,7 +46,7 @@ def require_model(stereo: bool) -> Path:
     """As `choose_model`. Raises UserError if there is none."""
     found = choose_model(stereo)
     if found is None:
-        raise UserError(f"give a model (--model): {NONE}")
+        raise UserError(f"give a model: {NONE}")
     return found
 
 
