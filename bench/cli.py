@@ -355,7 +355,7 @@ def _open_footage(path: Path, masks: MaskFiles | None) -> Footage:
 
     drawn = path.parent / "tissue.png"
     tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
-    return Footage(read_video(path, FPS), str(path), tissue, masks.read if masks else None)
+    return Footage(partial(read_video, path, FPS), str(path), tissue, masks.read if masks else None)
 
 
 def _print_frame(frame: LiveFrame) -> None:

@@ -22,12 +22,12 @@ class Spring:
         """Length F/(E u) [mm]: force over Young's modulus and mean displacement."""
 
     def __call__(
-        self, flow: np.ndarray, confidence: np.ndarray, scene: bench.MethodContext, picture: bool
+        self, frame: bench.FrameMotion, scene: bench.MethodContext, picture: bool
     ) -> bench.ForceEstimate:
         """Force from flow (H, W, 2) px and its confidence (H, W), as in the bench's `Method`."""
-        moved_mm = np.linalg.norm(flow, axis=2) * scene.scale_mm_per_px
+        moved_mm = np.linalg.norm(frame.flow, axis=2) * scene.scale_mm_per_px
         young = scene.young_kpa or 1.0  # if unknown the bench scores only the curve's shape
-        size = young * self.mm * np.average(moved_mm, weights=confidence * scene.tissue + 1e-9)
+        size = young * self.mm * np.average(moved_mm, weights=frame.confidence * scene.tissue + 1e-9)
         return bench.ForceEstimate(np.array([size, np.nan, np.nan]))  # a magnitude: no direction
 
 

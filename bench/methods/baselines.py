@@ -6,7 +6,7 @@ force over E is a function of displacement.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,11 +17,10 @@ from sklearn.linear_model import Ridge
 from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
-from learn.data.clips import assumed_young, has_depth
+from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext
+from learn.data.clips import assumed_young
 from learn.data.grid import Grid, GridView, certainty
 from synth.errors import UserError
-from synth.flow.stereo.track import Moved
 
 if TYPE_CHECKING:
     from learn.data.clips import Clip
@@ -42,36 +41,24 @@ class Baseline:
 
     def __init__(self, rule: Rule, uses_3d: bool = False) -> None:
         """`uses_3d`: whether the rule requires motion in three dimensions."""
-        self._rule, self._space = rule, uses_3d
+        self._rule, self._uses_3d = rule, uses_3d
         self._view: tuple[MethodContext, GridView] | None = None
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        if self._space:
-            raise UserError("fitted on motion in three dimensions: needs a right camera or depth pictures")
-        return self._estimate(flow * np.float32(scene.scale_mm_per_px), confidence, scene)
-
-    def estimate_3d(
-        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        """See `Uses3D`."""
-        if not self._space:
-            return self(flow, confidence, scene, picture)
-        return self._estimate(moved.motion, certainty(moved.deviation), scene)
-
-    def _estimate(self, shift: Field, confidence: Field, scene: MethodContext) -> ForceEstimate:
-        """The force at displacement (H, W, C) mm with confidence ([2,] H, W)."""
+        shift, confidence = frame.flow * np.float32(scene.scale_mm_per_px), frame.confidence
+        if self._uses_3d:
+            if frame.motion is None:
+                raise UserError(
+                    "fitted on motion in three dimensions: needs a right camera or depth pictures"
+                )
+            shift, confidence = frame.motion.motion, certainty(frame.motion.deviation)
         if self._view is None or self._view[0] is not scene:
             self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         view = self._view[1]
         mean = view.resample.mean
         fields = mean(shift.transpose(2, 0, 1), scene.tissue), view.mask, mean(confidence, scene.tissue)
         return ForceEstimate(assumed_young(scene.young_kpa) * self._rule(*fields))
-
-
-def as_methods(rules: Mapping[str, Rule], source: str) -> dict[str, Method]:
-    """Rules fitted on a displacement `source`, as methods."""
-    return {name: Baseline(rule, has_depth(source)) for name, rule in rules.items()}
 
 
 def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import sklearn
+
 from bench.methods import baselines, plugins
-from bench.methods.baseline_cache import cached_rules
+from bench.methods.baselines import Baseline, Rule
 from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from learn.checkpoint import read_card
-from learn.data.clips import read_clip
+from learn.data.clips import has_depth, read_clip
+from synth.dataset import provenance
 from synth.dataset.store import Dataset
 from synth.errors import UserError
+from synth.system import cache
 
 # Names of the methods in tables, reports and score.json.
 MAIN = "D2FNet"  # the given model
@@ -48,8 +54,20 @@ def simpler_methods(train: Path | None, model: Path | None, stereo: bool = False
     if stereo and all("motion_recovered" in s for s in chosen):
         source = "motion"
 
-    def fit() -> dict[str, baselines.Rule]:
+    def fit() -> dict[str, Rule]:
         return baselines.fitted_rules([read_clip(s, baselines.GRID, (source,)) for s in chosen], source)
 
     rules = cached_rules([s.attrs["content_hash"] for s in chosen], source, fit)
-    return methods | baselines.as_methods(rules, source)
+    return methods | {name: Baseline(rule, has_depth(source)) for name, rule in rules.items()}
+
+
+def cached_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, Rule]]) -> dict[str, Rule]:
+    """The result of `fit`, from this user's cache if it was fitted before.
+
+    `hashes`: content hashes of the sequences in the order of fitting; `source`: the displacement.
+    """
+    code = provenance.source("synth", "learn", "bench/methods")
+    key = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
+    # Files that were cut off by a full disk, or written by another version of Python, are fitted again.
+    faults = EOFError, pickle.UnpicklingError, AttributeError, ImportError
+    return cache.cached("baselines/pickle", key, fit, pickle.dumps, pickle.loads, faults, most=8)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Field, ForceEstimate, MethodContext
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 
 PEAK_PERCENTILE = 98.0  # for the largest displacement, without outliers of flow at edges; by hand
 
@@ -27,10 +27,10 @@ class FlowSize:
         """`measure`: the statistic [mm] of at least one length, (P,) mm."""
         self._measure = measure
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`; NaN where no tissue is visible."""
-        lengths = np.linalg.norm(flow[scene.tissue].astype(np.float64), axis=1) * scene.scale_mm_per_px
-        visible = bool((confidence[scene.tissue] > 0).any())
+        lengths = np.linalg.norm(frame.flow[scene.tissue].astype(np.float64), axis=1) * scene.scale_mm_per_px
+        visible = bool((frame.confidence[scene.tissue] > 0).any())
         return ForceEstimate(np.array([self._measure(lengths) if visible else np.nan, np.nan, np.nan]))
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from bench.methods.force_mixture import size_interval
-from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from synth.errors import UserError
 
 # Both are chosen on even sequences of mission-ood; for the odd ones see docs/results/scoring/fusion.
@@ -24,18 +24,21 @@ class Fusion:
     """The fusion of two methods that state their errors; see the module."""
 
     def __init__(self, network: str, physics: str) -> None:
-        """Names of the two methods."""
+        """Names of the two methods; the network's `density` is shown."""
         self.parts = network, physics
         self._share, self._alone = 0.0, 0
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: a fusion needs the estimates of its parts."""
         raise UserError(f"a fusion of {' and '.join(self.parts)} needs their estimates: score it with them")
 
     def fuse(
         self, estimates: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, cameras: int
     ) -> list[ForceEstimate]:
-        """See `FusedEstimate`; the network's estimate alone where one of the two states no error."""
+        """Forces of a video's frames from the estimates by name of all other methods.
+
+        The network's estimate alone where one of the two states no error. `cameras`: 1 monocular, 2 stereo.
+        """
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in estimates:

@@ -9,13 +9,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from bench.methods.force_mixture import ForceMixture
-from bench.methods.protocol import Field, ForceEstimate, MethodContext
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from learn import Predictor, load_model
 from learn.inference.force_estimator import ForceEstimator
 from learn.inference.shipped import find_name
 from learn.uncertainty.intervals import LEVEL
-from synth.flow.stereo.track import Moved
-from synth.recording_flow.frame_motion import FrameMotion
 
 
 class Model:
@@ -56,18 +54,12 @@ class Model:
         """Notes on the estimates of the last recording."""
         return [] if self._estimator is None else self._estimator[1].notes + self._estimator[1].interval_notes
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """See `Method`."""
-        return self.estimate_3d(flow, confidence, None, scene, picture)
-
-    def estimate_3d(
-        self, flow: Field, confidence: Field, moved: Moved | None, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        """See `Uses3D`; a monocular network uses the flow only."""
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        """See `Method`; a monocular network uses the flow only."""
         if self._estimator is None or self._estimator[0] is not scene:
             about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
             self._estimator = scene, ForceEstimator(self.predictor, *about)
-        found = self._estimator[1].estimate(FrameMotion(flow, confidence, motion=moved))
+        found = self._estimator[1].estimate(frame)
         estimate = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
         if not found.bands:
             return estimate

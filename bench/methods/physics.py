@@ -21,11 +21,10 @@ from bench.methods.baselines import GRID
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
-from bench.methods.protocol import Field, ForceEstimate, MethodContext, widen_small_forces
+from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from learn.data.clips import assumed_young
 from learn.data.grid import GridView
 from synth.flow.confidence import deviation
-from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
 Floats = NDArray[np.float64]
@@ -69,17 +68,35 @@ class Physics:
     def __init__(self) -> None:
         self._scene: MethodContext | None = None
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """See `Method`."""
-        scale = np.float32(scene.scale_mm_per_px)
-        spread = np.repeat(scale * deviation(confidence)[..., None], 2, axis=2)
-        return self._add(flow * scale, spread, scene, picture)
+    def _begin(self, scene: MethodContext, components: int) -> None:
+        """Starts a video whose displacement has 2 or 3 components."""
+        self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
+        self._frames: list[Observation] = []
+        self._contact_free = 0
+        self._weighed_mm = 0.0  # motion at the last weighting
+        first, still = candidate_tissues(scene)[:1], np.zeros(components)
+        self._weights = TissueWeights(first, np.ones(1), still, TISSUES.intact)
 
-    def estimate_3d(
-        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        """See `Uses3D`."""
-        return self._add(moved.motion, moved.deviation, scene, picture)
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        """See `Method`."""
+        if frame.motion is None:
+            scale = np.float32(scene.scale_mm_per_px)
+            moved = frame.flow * scale
+            spread = np.repeat(scale * deviation(frame.confidence)[..., None], 2, axis=2)
+        else:
+            moved, spread = frame.motion.motion, frame.motion.deviation
+        if self._scene is not scene:
+            self._begin(scene, moved.shape[2])
+        mean = self._view.resample.mean
+        moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
+        observed = observe(moved, spread, self._view.mask)
+        self._frames.append(observed)
+        if not picture:
+            return ForceEstimate(np.full(3, np.nan))
+        if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
+            self._weighed_mm = observed.signal_mm
+            self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
+        return self._estimate(observed, picture)
 
     def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         """See `Revising`."""
@@ -104,24 +121,6 @@ class Physics:
                 "clocks are found by correlation): the tissue's own motion is attributed to loads"
             )
         return [describe(self._weights, self._scene), own]
-
-    def _add(self, moved: Field, spread: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        if self._scene is not scene:
-            self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
-            self._frames: list[Observation] = []
-            self._contact_free, self._weighed_mm = 0, 0.0
-            first, still = candidate_tissues(scene)[:1], np.zeros(moved.shape[2])
-            self._weights = TissueWeights(first, np.ones(1), still, TISSUES.intact)
-        mean = self._view.resample.mean
-        moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
-        frame = observe(moved, spread, self._view.mask)
-        self._frames.append(frame)
-        if not picture:
-            return ForceEstimate(np.full(3, np.nan))
-        if frame.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
-            self._weighed_mm = frame.signal_mm
-            self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
-        return self._estimate(frame, picture)
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext, Revising, Uses3D
+from bench.methods.protocol import ForceEstimate, FrameMotion, Method, MethodContext, Revising
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
@@ -25,10 +24,7 @@ class Plugged:
 
     def __init__(self, method: Any, label: str) -> None:
         self._method, self._label = method, label
-        # Set only where the method has them, for the protocols `Uses3D` and `Revising`.
-        if isinstance(method, Uses3D):
-            self.estimate_3d = partial(self._call, method.estimate_3d)
-        if isinstance(method, Revising):
+        if isinstance(method, Revising):  # set only then, so that this is one too
             self.revise = self._revise
 
     @property
@@ -37,9 +33,12 @@ class Plugged:
         with as_user_error(self._label):
             return [str(note) for note in getattr(self._method, "notes", ())]
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
-        return self._call(self._method, flow, confidence, scene, picture)
+        with as_user_error(self._label):
+            # A copy, so that a method that writes to its input does not change that of the next.
+            estimate = self._method(copy.deepcopy(frame), scene, picture)
+        return self._checked(estimate, frame.confidence.shape)
 
     def _revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
         with as_user_error(self._label):
@@ -47,12 +46,6 @@ class Plugged:
             if len(estimates) != len(contact_free):
                 raise TypeError(f"revises {len(estimates)} frames of {len(contact_free)}")
         return [self._checked(one, None) for one in estimates]
-
-    def _call(self, method: Any, *values: Any) -> ForceEstimate:
-        with as_user_error(self._label):
-            # A copy, so that a method that writes to its input does not change that of the next.
-            estimate = method(*copy.deepcopy(values[:-2]), *values[-2:])
-        return self._checked(estimate, values[0].shape[:2])
 
     def _checked(self, estimate: Any, size: tuple[int, ...] | None) -> ForceEstimate:
         """`size`: height and width that a density must have; None: a density is dropped."""

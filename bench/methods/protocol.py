@@ -1,9 +1,9 @@
-"""The protocol of methods (force estimators): displacement to force, frame by frame."""
+"""The seam between motion and force: the protocol `Method`, its input and its result."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.force_mixture import ForceMixture
-from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
+from synth.recording_flow.frame_motion import FrameMotion as FrameMotion
 
 Field = NDArray[np.float32]  # (H, W, ...) on the pixels that flow is computed on
 
@@ -69,28 +69,27 @@ def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) 
 
 
 class Method(Protocol):
-    """Displacement to force, frame by frame. The report shows its `notes: list[str]`, if it has any."""
+    """A force estimator: from the tissue's motion in a frame to the force on it.
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        """Force of one frame.
+    The simplest one takes the mean length of the motion for a force [mN]:
+
+        def mean_motion(frame, scene, picture):
+            moved_mm = scene.scale_mm_per_px * np.linalg.norm(frame.flow[scene.tissue], axis=1)
+            return ForceEstimate(np.array([moved_mm.mean(), np.nan, np.nan]))
+
+    A method with a list of strings `notes` has them shown in the report. One that has to see the whole video
+    first is `Revising`.
+    """
+
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        """Force of one frame; frames come in order.
 
         Args:
-            flow: (H, W, 2) px from the rest frame.
-            confidence: (H, W) in 0..1.
+            frame: motion from the rest frame: `flow` (H, W, 2) px and its `confidence` (H, W) in 0..1; of a
+                recording with a right or a depth camera also `motion`, in three dimensions [mm].
             scene: the recording's constants.
             picture: whether `density` is requested.
         """
-        ...
-
-
-@runtime_checkable
-class Uses3D(Protocol):
-    """A method that can use motion in three dimensions, if a recording has a right or a depth camera."""
-
-    def estimate_3d(
-        self, flow: Field, confidence: Field, moved: Moved, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        """As a `Method`; `moved`: motion [mm] in camera axes and its standard deviation, (H, W, 3) each."""
         ...
 
 
@@ -103,20 +102,4 @@ class Revising(Protocol):
 
         `contact_free`: (T,) whether the tissue is known to be without contact.
         """
-        ...
-
-
-@runtime_checkable
-class FusedEstimate(Protocol):
-    """A method that fuses the estimates of other methods."""
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """Their names; the first one's `density` is shown."""
-        ...
-
-    def fuse(
-        self, estimates: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, cameras: int
-    ) -> list[ForceEstimate]:
-        """Forces of a video's frames from the others' estimates; `cameras`: 1 monocular, 2 stereo."""
         ...

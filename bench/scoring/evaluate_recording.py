@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.protocol import FusedEstimate, Method
+from bench.methods.fusion import Fusion
+from bench.methods.protocol import Method
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta, Span
 from bench.recording.pixel_scale import PixelScale
@@ -140,7 +141,7 @@ def _against_sensor(
     forces = []
     if recording.meta.young_kpa is not None:
         # A fusion is not an independent estimate.
-        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, FusedEstimate))]
+        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Fusion))]
         every = [np.array(tracked.force_mn[name]) for name in alone]
         forces = [force[followed] for force in every if np.nan_to_num(force).any()]
     size = np.array(tracked.force_mn[moved])[followed, 0]

@@ -99,7 +99,7 @@ def stream_video(
             continue
         began, force = time.perf_counter(), None
         if method is not None and found.trusted:
-            force = method(found.flow, found.confidence, scene, False).size_mn
+            force = method(found, scene, False).size_mn
         end, visible = time.perf_counter(), found.confidence > 0
         frame = LiveFrame(
             index=found.index,

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import ForceEstimate, FusedEstimate, Method, MethodContext, Revising, Uses3D
+from bench.methods.fusion import Fusion
+from bench.methods.protocol import ForceEstimate, Method, MethodContext, Revising
 from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
@@ -184,7 +185,7 @@ class _Forces:
     ) -> None:
         """Starts with the rest frame and the constants of the recording."""
         shown = methods.get(pictured) if pictured is not None else None
-        self.pictured = shown.parts[0] if isinstance(shown, FusedEstimate) else pictured
+        self.pictured = shown.parts[0] if isinstance(shown, Fusion) else pictured
         self.methods, self.watch, self.scene = methods, watch, scene
         self.out = TrackedRecording(pictured=self.pictured or "", rest=_shrunk(rest.rgb))
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
@@ -194,21 +195,18 @@ class _Forces:
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
         """Adds the forces of a frame at its time [s]."""
-        out, scene, inside, moved = self.out, self.scene, self.scene.tissue, frame.motion
+        out, scene, inside = self.out, self.scene, self.scene.tissue
         position = len(out.time_s)
         wanted = position % self.stride == 0
-        self.cameras = 1 if moved is None else 2
+        self.cameras = 1 if frame.motion is None else 2
         estimates: dict[str, ForceEstimate] = {}
         density = None
         for name, method in self.methods.items():
-            if isinstance(method, FusedEstimate):
+            if isinstance(method, Fusion):
                 continue
             with self.watch.stage(name):
                 shown = wanted and name == self.pictured
-                if moved is not None and isinstance(method, Uses3D):
-                    estimate = method.estimate_3d(frame.flow, frame.confidence, moved, scene, shown)
-                else:
-                    estimate = method(frame.flow, frame.confidence, scene, shown)
+                estimate = method(frame, scene, shown)
             estimates[name] = replace(estimate, density=None)
             if name == self.pictured:
                 density = estimate.density
@@ -240,7 +238,7 @@ class _Forces:
                         frame[name] = estimate
         tracked = [frame for frame, known in zip(self.estimates, self.out.trusted, strict=True) if known]
         for name, method in self.methods.items():
-            if isinstance(method, FusedEstimate):
+            if isinstance(method, Fusion):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras)
                 for frame, estimate in zip(tracked, fused, strict=True):

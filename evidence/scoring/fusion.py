@@ -22,7 +22,7 @@ from bench.methods.comparison import FUSION, MAIN, PHYSICS
 from bench.methods.fusion import Fusion
 from bench.methods.network import Model
 from bench.methods.physics import Physics
-from bench.methods.protocol import ForceEstimate, MethodContext
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from evidence import cache, report, status
 from learn.evaluation.statistics import interval
 from learn.inference.shipped import find_model
@@ -86,12 +86,11 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
     for k in range(len(sequence["force"])):
         flow, sure = sequence["flow_recovered"][k], sequence["flow_confidence"][k].astype(np.float32)
         estimates: dict[str, ForceEstimate] = {}
+        moved = None
+        if case.cameras == 2:
+            moved = Moved(sequence["motion_recovered"][k], sequence["motion_deviation"][k])
         for name, method in ((MAIN, model), (PHYSICS, physics)):
-            if case.cameras == 1:
-                estimates[name] = method(flow, sure, scene, False)
-            else:
-                moved = Moved(sequence["motion_recovered"][k], sequence["motion_deviation"][k])
-                estimates[name] = method.estimate_3d(flow, sure, moved, scene, False)
+            estimates[name] = method(FrameMotion(flow, sure, motion=moved), scene, False)
         frames.append(estimates)
     for estimates, revised in zip(frames, physics.revise(np.zeros(len(frames), bool)), strict=True):
         estimates[PHYSICS] = revised

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import Field, ForceEstimate, Method, MethodContext
+from bench.methods.protocol import ForceEstimate, FrameMotion, Method, MethodContext
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
@@ -74,10 +74,10 @@ class Maker:
 class Bump:
     """The inverse of `phantom.pushed`: the exact force from the displacement at the centre."""
 
-    def __call__(self, flow: Field, confidence: Field, scene: MethodContext, picture: bool) -> ForceEstimate:
-        length = np.linalg.norm(flow, axis=-1)
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        length = np.linalg.norm(frame.flow, axis=-1)
         height, width = length.shape
-        middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
+        middle = frame.flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
         force = GAIN_MN_PER_PX * float(np.median(middle))
         return ForceEstimate(np.array([force, 0.0, 0.0]), length.astype(np.float32) if picture else None)
 

@@ -90,7 +90,7 @@ def test_a_model_estimates_force_and_the_bench_scores_it(out: Path, tmp_path: Pa
     np.testing.assert_allclose(unknown * about[2], force, rtol=1e-4, atol=1e-4)
 
     recording = bench.export_recording(sequence, tmp_path / "recording")
-    own = {"none": lambda flow, confidence, scene, picture: bench.ForceEstimate(np.zeros(3))}
+    own = {"none": lambda frame, scene, picture: bench.ForceEstimate(np.zeros(3))}
     every = bench.Settings(rate_hz=None)
     result = bench.score(recording, model, methods=own, settings=every, baselines=False)
     assert result.main == "D2FNet", "with baselines off, physics must not run"

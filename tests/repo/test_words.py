@@ -22,7 +22,7 @@ OLD = {
     r"seen": "observed, visible",
     r"beside": "next to, with",
     r"ghost(s|less)?|strays?": "false positive, off-target force",
-    r"inspace|allow creep": "Uses3D, widen_small_forces",
+    r"inspace|allow creep": "motion, widen_small_forces",
     r"forgive|vacate|pass turn": "clear_failures, discard, invalidate_workers",
     r"sway(s|ed)?": "camera motion, surface motion",
     r"blush|wine": "the name of what is coloured",

@@ -10,8 +10,8 @@ import pytest
 from made_clip import made_clip
 from numpy.typing import NDArray
 
-from bench.methods import baseline_cache, baselines
-from bench.methods.protocol import Method, MethodContext, Uses3D
+from bench.methods import baselines, comparison
+from bench.methods.protocol import FrameMotion, Method, MethodContext
 from learn.data.clips import Clip
 from synth.dataset import provenance
 from synth.errors import UserError
@@ -44,7 +44,8 @@ def clips(count: int = 12, frames: int = 5) -> list[Clip]:
 
 @pytest.fixture(scope="module")
 def methods() -> dict[str, Method]:
-    return baselines.as_methods(baselines.fitted_rules(clips(), "recovered"), "recovered")
+    rules = baselines.fitted_rules(clips(), "recovered")
+    return {name: baselines.Baseline(rule) for name, rule in rules.items()}
 
 
 def estimate(method: Method, force: NDArray[np.float64], young: float) -> float:
@@ -52,7 +53,7 @@ def estimate(method: Method, force: NDArray[np.float64], young: float) -> float:
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)
     flow = (0.05 * force[:2] * bump[..., None] / scene.scale_mm_per_px).astype(np.float32)
-    return method(flow, np.ones((96, 96), np.float32), scene, False).size_mn
+    return method(FrameMotion(flow, np.ones((96, 96), np.float32)), scene, False).size_mn
 
 
 def test_linear_solids_force_is_found_and_scales_with_stiffness(methods: dict[str, Method]) -> None:
@@ -94,18 +95,19 @@ def test_a_baseline_fitted_on_stereo_requires_stereo() -> None:
         moved = clip.displacement["recovered"]
         motion = np.concatenate([moved, 0.5 * moved[:, :1]], axis=1)
         stereo.append(replace(clip, displacement={"motion": motion}))
-    method = baselines.as_methods(baselines.fitted_rules(stereo, "motion"), "motion")[baselines.RIDGE]
+    rule = baselines.fitted_rules(stereo, "motion")[baselines.RIDGE]
+    method = baselines.Baseline(rule, uses_3d=True)
     force = np.array([6.0, 0, 0])
     scene = MethodContext(np.ones((96, 96), bool), 36 / 96, 1.0)
     axis = (np.arange(96) - 47.5) * 36 / 96
     bump = np.exp(-(axis[None] ** 2 + axis[:, None] ** 2) / 50)[..., None]
     motion = (0.05 * np.array([*force[:2], 0.5 * force[0]]) * bump).astype(np.float32)
     flow, sure = motion[..., :2] / np.float32(scene.scale_mm_per_px), np.ones((96, 96), np.float32)
-    assert isinstance(method, Uses3D)
-    found = method.estimate_3d(flow, sure, Moved(motion, np.full_like(motion, 0.01)), scene, False)
+    frame = FrameMotion(flow, sure, motion=Moved(motion, np.full_like(motion, 0.01)))
+    found = method(frame, scene, False)
     assert found.size_mn == pytest.approx(6, rel=0.12)
     with pytest.raises(UserError, match="right camera"):
-        method(flow, sure, scene, False)
+        method(FrameMotion(flow, sure), scene, False)
 
 
 def test_rules_are_fitted_once_for_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +121,7 @@ def test_rules_are_fitted_once_for_a_model(tmp_path: Path, monkeypatch: pytest.M
             times.append(1)
             return baselines.fitted_rules(fitted, "recovered")
 
-        return baseline_cache.cached_rules(list(hashes), source, fit)
+        return comparison.cached_rules(list(hashes), source, fit)
 
     first, again = cached("ab"), cached("ab")
     assert len(times) == 1

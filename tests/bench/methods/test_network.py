@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.methods.network import Model
-from bench.methods.protocol import MethodContext
+from bench.methods.protocol import FrameMotion, MethodContext
 from learn.data.grid import Grid, GridView
 from learn.inference.predict import ForceMap
 
@@ -26,16 +26,16 @@ def test_the_rest_frame_is_the_zero_and_unknown_tissue_has_1_kpa(
         per_kpa = np.array([2.0 + float(flow.sum()), 1.0, 0.0])[: 3 if vector else 1]
         density = np.zeros((len(per_kpa), 16, 16), np.float32)
         density[:, 8, 8] = (young or typical) * per_kpa / Grid(16).pitch_mm ** 2
-        return ForceMap(density, Grid(16), "density", young or typical, young is not None, view)
+        return ForceMap(density, Grid(16), young or typical, young is not None, view)
 
     predictor.grid = Grid(16)  # type: ignore[attr-defined]
     model = Model.__new__(Model)
     model.predictor, model._estimator = predictor, None  # type: ignore[assignment]
     scene = MethodContext(tissue, 0.1, young_kpa)
-    moved, sure = np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32)
+    frame = FrameMotion(np.zeros((4, 4, 2), np.float32), np.ones((4, 4), np.float32))
     young = young_kpa or 1.0
-    assert model(moved, sure, scene, False).size_mn == 0
-    moved[0, 0, 0] = 3
-    assert model(moved, sure, scene, False).size_mn == pytest.approx(3 * young)
-    moved[0, 0, 0] = -1
-    assert model(moved, sure, scene, False).force_mn[0] == pytest.approx(-young if vector else 0)
+    assert model(frame, scene, False).size_mn == 0
+    frame.flow[0, 0, 0] = 3
+    assert model(frame, scene, False).size_mn == pytest.approx(3 * young)
+    frame.flow[0, 0, 0] = -1
+    assert model(frame, scene, False).force_mn[0] == pytest.approx(-young if vector else 0)

@@ -24,9 +24,9 @@ import bench
 class Push:
     """The inverse of the recording's force law, with an error of 10%."""
 
-    def __call__(self, flow, confidence, scene, picture):
-        height, width = flow.shape[:2]
-        middle = flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
+    def __call__(self, frame, scene, picture):
+        height, width = frame.flow.shape[:2]
+        middle = frame.flow[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4, 0]
         return bench.ForceEstimate(np.array([44.0 * float(np.median(middle)), 0.0, 0.0]))
 
 
@@ -79,9 +79,9 @@ def test_errors_name_the_plug_in(
 
 
 def test_a_method_cannot_change_the_others_input(recording: Path) -> None:
-    def wipe(flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
-        force = bench.ForceEstimate(np.array([np.abs(flow).max(), 0.0, 0.0]))
-        flow[:] = confidence[:] = 0
+    def wipe(frame: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
+        force = bench.ForceEstimate(np.array([np.abs(frame.flow).max(), 0.0, 0.0]))
+        frame.flow[:] = frame.confidence[:] = 0
         assert not scene.tissue.flags.writeable
         return force
 
@@ -95,7 +95,7 @@ def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
     class Later:
         short = False
 
-        def __call__(self, flow: Any, confidence: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
+        def __call__(self, frame: Any, scene: Any, picture: bool) -> bench.ForceEstimate:
             return bench.ForceEstimate(np.zeros(3))
 
         def revise(self, contact_free: Any) -> list[bench.ForceEstimate]:

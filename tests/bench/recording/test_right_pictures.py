@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from skimage import data
 
-from bench.methods.protocol import ForceEstimate, MethodContext
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import writer
 from bench.recording.check import judge_stereo
 from bench.recording.folder import open_recording
@@ -100,14 +100,9 @@ class Recorder:
     def __init__(self) -> None:
         self.inputs: list[Moved] = []
 
-    def __call__(
-        self, flow: np.ndarray, confidence: np.ndarray, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
-        raise AssertionError("motion in three dimensions is available")
-
-    def estimate_3d(
-        self, flow: np.ndarray, confidence: np.ndarray, moved: Moved, scene: MethodContext, picture: bool
-    ) -> ForceEstimate:
+    def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        moved = frame.motion
+        assert moved is not None
         self.inputs.append(moved)
         return ForceEstimate(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
 

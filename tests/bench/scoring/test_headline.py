@@ -91,10 +91,11 @@ def test_mean_and_peak_length_of_a_flow() -> None:
     visible = np.ones((10, 20), np.float32)
     visible[5:] = 0
     scene = MethodContext(np.ones((10, 20), bool), 0.5, None)
-    sizes = {name: method(flow, visible, scene, False).force_mn[0] for name, method in flow_sizes().items()}
+    frame = FrameMotion(flow, visible)
+    sizes = {name: method(frame, scene, False).force_mn[0] for name, method in flow_sizes().items()}
     lengths = 0.5 * np.arange(200)  # hidden tissue counts with its filled-in flow
     assert sizes == pytest.approx({"mean |flow|": lengths.mean(), "peak |flow|": np.percentile(lengths, 98)})
-    nothing = flow_sizes()["mean |flow|"](flow, np.zeros_like(visible), scene, False)
+    nothing = flow_sizes()["mean |flow|"](FrameMotion(flow, np.zeros_like(visible)), scene, False)
     assert math.isnan(nothing.force_mn[0])
 
 
