@@ -88,7 +88,7 @@ def score(
     from bench.recording.folder import open_recording
     from bench.scoring import score as scoring
     from bench.scoring.result import as_json
-    from learn.inference.shipped import require_model
+    from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
     from synth.video.mask_files import read_choice
 
@@ -100,7 +100,7 @@ def score(
     threadpool_limits(set_threads(None))
     result = scoring.score(
         opened,
-        model or require_model(opened.has_stereo),
+        model or choose_model(opened.has_stereo),
         methods={name: Model(Path(at)) for name, at in others.items()},
         train=train,
         settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),

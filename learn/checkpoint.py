@@ -1,7 +1,6 @@
-"""A trained model on disk: a folder with config.json, weights.pt, history.jsonl and last.pt for resuming.
+"""A trained model on disk: config.json, weights.safetensors, history.jsonl and, for resuming, last.pt.
 
-A pretrained model has weights.safetensors instead, which any program can read. The card, config.json, holds a
-hash of the weights and one of itself, so that a change of either is detected.
+The card, config.json, holds a hash of the weights and one of itself, so that a change of either is detected.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from synth.system.config_file import first_mistake
 _FORMAT = "sulcus-model"
 _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequences: a million of them
 _LARGEST_WEIGHTS = 64 << 30
-_WEIGHTS, _NEXT, _SAFE = "weights.pt", "weights.next.pt", "weights.safetensors"
+_WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
 USED = ("fit", "select", "intervals")
 """Parts of `ModelCard.split` that the model must not be scored on."""
@@ -83,20 +82,14 @@ def write_card(folder: Path, card: ModelCard) -> None:
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
 
-def write_model(
-    folder: Path, card: ModelCard, state: Mapping[str, Tensor], *, safe: bool = False
-) -> ModelCard:
-    """Writes weights and card atomically and returns the card with the weights' hash.
-
-    `safe`: as weights.safetensors, into a folder that holds no model yet.
-    """
+def write_model(folder: Path, card: ModelCard, state: Mapping[str, Tensor]) -> ModelCard:
+    """Writes weights and card atomically and returns the card with the weights' hash."""
     folder.mkdir(parents=True, exist_ok=True)
-    data = safetensors.save({k: v.contiguous() for k, v in state.items()}) if safe else _packed(state)
+    data = safetensors.save({k: v.contiguous() for k, v in state.items()})
     card = replace(card, weights_hash=_hash(data))
-    _write(folder / (_SAFE if safe else _NEXT), data)
+    _write(folder / _NEXT, data)
     write_card(folder, card)
-    if not safe:
-        os.replace(folder / _NEXT, folder / _WEIGHTS)
+    os.replace(folder / _NEXT, folder / _WEIGHTS)
     return card
 
 
@@ -122,15 +115,15 @@ def read_card(folder: Path) -> ModelCard:
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
     """Writes tensors and plain values atomically. Raises UserError if the file can't be written."""
-    _write(file, _packed(tree))
+    buffer = io.BytesIO()
+    torch.save(dict(tree), buffer)
+    _write(file, buffer.getvalue())
 
 
 def load_tensors(file: Path) -> dict[str, Any]:
-    """Tensors and plain values of a file. Raises UserError if it is damaged or holds other objects."""
+    """What `save_tensors` wrote. Raises UserError if it is damaged or holds other objects."""
     checked_file.check_file(file, _LARGEST_WEIGHTS)
     with as_user_error(f"{file}: corrupt checkpoint"):
-        if file.suffix == ".safetensors":
-            return dict(safetensors.load_file(file))
         _check_archive(file)
         tree = torch.load(file, map_location="cpu", weights_only=True)
         if not isinstance(tree, dict):
@@ -144,27 +137,18 @@ def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     Raises UserError if card or weights are damaged, edited, or don't belong together.
     """
     card = read_card(folder)
-    state = load_tensors(_find_weights(folder, card))
-    model = build_network(state, card.settings.arch, folder)
+    file = _find_weights(folder, card)
+    with as_user_error(f"{file}: corrupt weights"):
+        state = safetensors.load_file(file)
+    with torch.device("meta"):  # without memory
+        expected = {name: value.shape for name, value in D2FNet(card.settings.arch).state_dict().items()}
+    if expected != {name: value.shape for name, value in state.items()}:
+        raise UserError(f"{file}: the weights are not those of the network in config.json")
     if not all(torch.isfinite(v).all() for v in state.values()):
-        raise UserError(f"{folder}: the weights hold NaN or infinity")
+        raise UserError(f"{file}: the weights hold NaN or infinity")
+    model = D2FNet(card.settings.arch)
+    model.load_state_dict(state)
     return model.eval(), card
-
-
-def build_network(state: Mapping[str, Any], arch: Architecture, where: Path) -> D2FNet:
-    """The network of `arch` with the weights of `state`.
-
-    Raises UserError if names or shapes don't match, before memory is allocated.
-    """
-    with torch.device("meta"):
-        expected = {name: value.shape for name, value in D2FNet(arch).state_dict().items()}
-    found = {name: value.shape for name, value in state.items() if isinstance(value, Tensor)}
-    if len(found) != len(state) or found != expected:
-        raise UserError(f"{where}: the weights are not those of the network in config.json")
-    model = D2FNet(arch)
-    with as_user_error(f"{where}: the weights can't be used"):
-        model.load_state_dict(state)
-    return model
 
 
 def disk_needed(folder: Path, arch: Architecture) -> int:
@@ -178,15 +162,13 @@ def disk_needed(folder: Path, arch: Architecture) -> int:
 
 
 def _find_weights(folder: Path, card: ModelCard) -> Path:
-    """The file whose hash the card holds; weights.next.pt if writing was interrupted."""
-    for file in (folder / _WEIGHTS, folder / _NEXT, folder / _SAFE):
+    """The file whose hash the card holds; the next one if writing was interrupted."""
+    for file in (folder / _WEIGHTS, folder / _NEXT):
         if file.is_file():
-            with file.open("rb") as opened:
+            with checked_file.open_file(file, _LARGEST_WEIGHTS) as opened:
                 if hashlib.file_digest(opened, _digest).hexdigest() == card.weights_hash:
                     return file
-    file = folder / (_SAFE if (folder / _SAFE).exists() else _WEIGHTS)
-    load_tensors(file)  # its error may be more specific
-    raise UserError(f"{file}: not the weights that config.json was written for, or damaged")
+    raise UserError(f"{folder / _WEIGHTS}: not the weights that config.json was written for, or damaged")
 
 
 def _check_archive(file: Path) -> None:
@@ -197,12 +179,6 @@ def _check_archive(file: Path) -> None:
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"a checksum of {damaged} does not match")
-
-
-def _packed(tree: Mapping[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    torch.save(dict(tree), buffer)
-    return buffer.getvalue()
 
 
 def _write(file: Path, data: bytes) -> None:

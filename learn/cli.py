@@ -137,10 +137,8 @@ def _describe(found: Intervals) -> str:
 
 
 def _log(numbers: Mapping[str, float]) -> None:
-    line = f"epoch {numbers['epoch']:.0f}: loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
-    if numbers["share_r2"]:
-        line += f", gradient {numbers['share_error']:.0%} squared error, {numbers['share_r2']:.0%} R²"
-    _console.print(line)
+    score = f"loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
+    _console.print(f"epoch {numbers['epoch']:.0f}: {score}")
 
 
 @app.command("eval", epilog="Example: learn eval model out --against other-model")
@@ -261,7 +259,7 @@ def predict_command(
     from learn.inference.motion import VideoOptions, has_right_camera
     from learn.inference.predict import load_model
     from learn.inference.prediction_file import predict_files
-    from learn.inference.shipped import require_model
+    from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
     from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
@@ -269,7 +267,7 @@ def predict_command(
 
     set_threads(threads)
     if source is None:
-        model, source = require_model(has_right_camera(model)), model
+        model, source = choose_model(has_right_camera(model)), model
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options, predictor = (
@@ -362,7 +360,7 @@ def export_command(
 def models_command(json: Json = False) -> None:
     """List the pretrained networks."""
     from learn.checkpoint import read_card
-    from learn.inference.shipped import NONE, describe, hash_data, shipped
+    from learn.inference.shipped import describe, hash_data, shipped
     from synth.system.checked_file import folder_bytes
 
     found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
@@ -376,5 +374,3 @@ def models_command(json: Json = False) -> None:
         return
     for name, (folder, card) in found.items():
         print(f"{name}: {describe(card)}, {folder_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
-    if not found:
-        print(NONE)

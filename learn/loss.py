@@ -38,8 +38,6 @@ FREE = 0.01  # `off-target`: tissue is contact-free where its true density is un
 RAMP = (0.25, 0.75)
 """`off-target`: shares of the run between which the penalty grows from zero to full. At full weight from the
 start a network first learns to predict no force."""
-SHARES = ("error", "r2", "off_target")
-"""Names of the terms of the loss, as in history.jsonl."""
 
 
 def full(kind: Loss, progress: float) -> bool:
@@ -121,17 +119,6 @@ def unexplained(
     sst = t.square().sum(over) - t.sum(over).square() / count
     least = 0.1 * cells.sum(-1).clamp_min(1) * prediction.shape[1]
     return (e.square().sum(over).sum(-1) / sst.sum(-1).clamp_min(least)).mean()
-
-
-def gradient_shares(terms: Terms, prediction: Tensor) -> dict[str, float]:
-    """Share of each term in the gradient on the map: norms over their sum. Call before `backward`."""
-    norms = dict.fromkeys(SHARES, 0.0)
-    for name, term in zip(SHARES, terms, strict=True):
-        if term.requires_grad:
-            (g,) = torch.autograd.grad(term, prediction, retain_graph=True, allow_unused=True)
-            norms[name] = 0.0 if g is None else float(g.norm())
-    total = sum(norms.values()) or 1.0
-    return {name: norm / total for name, norm in norms.items()}
 
 
 def _length(values: Tensor) -> Tensor:

@@ -163,7 +163,7 @@ def write_recording(
     Raises:
         UserError: the folder exists, or a picture can't be decoded.
     """
-    with writer.write_whole_folder(out) as part:
+    with checked_file.folder_of(out) as part:
         # The container requires rising times; frames.csv has the true ones.
         steps = np.maximum(np.diff(found.times_s), 1e-3)
         rising = found.times_s[0] + np.cumsum([0.0, *steps])

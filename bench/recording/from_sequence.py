@@ -13,6 +13,7 @@ from bench.recording import writer
 from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
 from synth.errors import UserError, as_path
+from synth.system import checked_file
 
 _PAIR = "stereo.yaml"
 
@@ -32,7 +33,7 @@ def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["pn
         UserError: the folder exists.
     """
     folder = as_path("recording", folder)
-    with writer.write_whole_folder(folder) as part:
+    with checked_file.folder_of(folder) as part:
         _write_files(sequence, part, frames)
     return folder
 

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from synth.system import checked_file
 from synth.video.write import encode
 
 if TYPE_CHECKING:
     from synth.render.camera.camera import Camera
 
 Floats = NDArray[np.float64]
-write_whole_folder = checked_file.folder_of
 
 
 def write_frames(folder: Path, time_s: Floats) -> None:

@@ -23,7 +23,7 @@ from bench.scoring.result import Result, as_json
 from bench.tracking import flow_process
 from bench.tracking.tracking import Progress
 from learn import Predictor
-from learn.inference.shipped import find_model, require_model
+from learn.inference.shipped import choose_model, find_model
 from synth.errors import UserError, as_path
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.flow import LocalFlow
@@ -82,7 +82,7 @@ def score(
     if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
         raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
     if model is None and not methods:
-        model = require_model(opened.has_stereo)
+        model = choose_model(opened.has_stereo)
     elif isinstance(model, (str, Path)):
         model = find_model(model)
     frames = len(opened.numbers()) or None

@@ -29,6 +29,7 @@ from bench.recording import writer
 from bench.recording.meta import read_meta
 from evidence.scoring.exvivo import ramp
 from synth.errors import UserError
+from synth.system import checked_file
 from synth.system.checked_file import read_picture
 
 Floats = NDArray[np.float64]
@@ -58,12 +59,12 @@ def main(
         for index in range(count):
             folder = out / f"{kind}-{index}"
             if not folder.exists():
-                with writer.write_whole_folder(folder) as part:
+                with checked_file.folder_of(folder) as part:
                     rng = np.random.default_rng([seed, KINDS.index(kind), index])
                     pythons = mechanics_python, pictures_python
                     record(part, folder.name, kind, rng, (seconds, fps, spp), pythons)
             if left is not None and not (left / folder.name).exists():
-                with writer.write_whole_folder(left / folder.name) as part:
+                with checked_file.folder_of(left / folder.name) as part:
                     copy_left_camera(folder, part)
             print(folder)
 

@@ -21,8 +21,7 @@ from evidence.learn import labels
 from evidence.learn.runs import JOB, Run, by_sequence, carry_out, ends, pictured, study
 from learn.data.grid import Grid, Scales, channels
 from learn.evaluation.statistics import interval, paired
-from learn.network.d2fnet import Architecture, D2FNet, fused
-from learn.network.traced import Quick
+from learn.network.d2fnet import Architecture, D2FNet, freeze, fused
 from learn.settings import PRESETS, replace
 from learn.training.threads import set_threads
 from synth.job import reader
@@ -147,7 +146,7 @@ def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
     """A function that processes one frame as in live use, prepared."""
     torch.manual_seed(0)
     model = D2FNet(arch).eval()
-    net: Callable[[Tensor], Any] = Quick(model, arch, size) if device == "cpu" else fused(model).to(device)
+    net: Callable[[Tensor], Any] = freeze(model, arch, size) if device == "cpu" else fused(model).to(device)
     grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
     displacement = torch.randn(1, 2, size, size, device=device) * 0.1
     mask = torch.ones(1, 1, size, size, device=device)

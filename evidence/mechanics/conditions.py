@@ -101,7 +101,7 @@ class Scenes:
         packed = folder / f"{index:06d}"
         if _refusal(packed).is_file():
             return _refusal(packed).read_text("utf-8")
-        if packed.is_dir():
+        if packed.is_file():
             return ""
         folder.mkdir(parents=True, exist_ok=True)
         store = location.store(folder, index)

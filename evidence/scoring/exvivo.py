@@ -32,6 +32,7 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
+from synth.system import checked_file
 from synth.system.terminal import counting
 
 Floats = NDArray[np.float64]
@@ -124,7 +125,7 @@ def make(plan: Plan, index: int, folder: Path, progress: Callable[[int], None] =
     """
     if plan.seconds < _PRESS_S + 5:
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
-    with writer.write_whole_folder(folder) as part:
+    with checked_file.folder_of(folder) as part:
         _fill(plan, index, part, progress)
     return folder
 

@@ -33,7 +33,7 @@ from bench.scoring.score import score
 from evidence import cache as stored
 from evidence import report
 from learn import load_model
-from learn.inference.shipped import require_model
+from learn.inference.shipped import choose_model
 from synth.dataset.store import Dataset
 from synth.engine.run import render_job
 from synth.errors import UserError
@@ -174,7 +174,7 @@ def _encode(path: Path, images: NDArray[np.uint8], codec: tuple[int, str, int]) 
 
 @cache
 def _model(stereo: bool) -> Any:
-    return load_model(require_model(stereo), quick=True)
+    return load_model(choose_model(stereo), quick=True)
 
 
 def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:

@@ -12,15 +12,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
+from safetensors import safe_open
 from safetensors.numpy import save_file
-from safetensors.torch import load_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
 from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
-from synth.errors import UserError, as_user_error, first_line
+from synth.errors import UserError, as_user_error
 from synth.job import identity
 from synth.job.types import MembraneState
 from synth.system import checked_file
@@ -47,9 +46,7 @@ _CURE = {
     "motion": "render with render.stereo_mm and flow.backend other than 'ideal'",
     "motion-ideal": "render with render.stereo_mm",
 }
-_ARRAYS = ("mask", "confidence", "density", "force")
-_SPATIAL = "motion_confidence"
-_FILE = "arrays.safetensors"
+_ARRAYS = ("mask", "confidence", "density", "force", "motion_confidence")
 _PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening", "membrane")
 
 
@@ -218,69 +215,49 @@ def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
     key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
-    folder = cache / hashlib.blake2b(identity.canonical(key), digest_size=16).hexdigest()
-    if not folder.is_dir():
-        pack(read_clip(sequence, grid, wanted), folder)
-    found = unpack(folder)
-    if found.displacement.keys() != set(wanted) or found.density.shape[-1] != grid.size:
-        raise UserError(f"{folder}: packed for another grid or input; remove it")
-    return replace(found, **_plain(sequence))
+    file = cache / f"{hashlib.blake2b(identity.canonical(key), digest_size=16).hexdigest()}.safetensors"
+    if not file.is_file():
+        pack(read_clip(sequence, grid, wanted), file)
+    return replace(unpack(file), **_plain(sequence))
 
 
-def pack(clip: Clip, folder: Path) -> None:
-    """Writes a clip as plain arrays into a new folder, atomically; an existing folder is left as it is.
+def pack(clip: Clip, file: Path) -> None:
+    """Writes a clip as one file of plain arrays (safetensors), atomically. UserError if it can't be written.
 
-    Raises UserError if it can't be written.
+    One file per clip: a process may have 65,530 mappings, a dataset has thousands of clips.
     """
-    arrays = {name: getattr(clip, name) for name in _ARRAYS}
+    arrays = {name: getattr(clip, name) for name in _ARRAYS if getattr(clip, name) is not None}
     arrays |= {f"displacement-{source}": values for source, values in clip.displacement.items()}
-    if clip.motion_confidence is not None:
-        arrays[_SPATIAL] = clip.motion_confidence
-    plain = {name: getattr(clip, name) for name in _PLAIN}
-    plain["checksums"] = {name: _checksum(values) for name, values in arrays.items()}
-    try:
-        with checked_file.folder_of(folder) as part:
-            # One file per clip: a process may have 65,530 mappings, a dataset has thousands of clips.
-            save_file({name: np.ascontiguousarray(values) for name, values in arrays.items()}, part / _FILE)
-            (part / "clip.json").write_text(json.dumps(plain))
-    except (OSError, UserError, SafetensorError) as error:
-        if not folder.is_dir():  # else another run wrote it meanwhile
-            why = getattr(error, "strerror", error)
-            raise UserError(f"{folder}: cannot be written ({why})") from None
+    arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    plain = {name: getattr(clip, name) for name in _PLAIN} | {"checksum": _checksum(arrays)}
+    with as_user_error(f"{file}: cannot be written"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with checked_file.part_of(file) as part:
+            save_file(arrays, part, metadata={"clip": json.dumps(plain)})
 
 
-def unpack(folder: Path) -> Clip:
-    """A packed clip, memory-mapped. Raises UserError if the folder is not one, or damaged."""
-    try:
-        with as_user_error(f"{folder}: not a packed sequence, or damaged: remove it"):
-            plain = json.loads(checked_file.read_bytes(folder / "clip.json", 1_000_000))
-            arrays: dict[str, Any] = _mapped(folder / _FILE, plain.pop("checksums"))
-            stored = [s for s in FIELDS if f"displacement-{s}" in arrays]
-            displacement = {s: arrays.pop(f"displacement-{s}") for s in stored}
-            return Clip(**plain, displacement=displacement, **arrays)
-    except UserError as error:
-        why = error.__cause__
-        if isinstance(why, (OSError, RuntimeError)) and not isinstance(why, RecursionError):
-            # A process has too many mappings or open files: nothing is damaged.
-            raise UserError(f"{folder}: cannot be mapped ({first_line(why)})") from None
-        raise
-
-
-def _mapped(file: Path, checksums: Mapping[str, int]) -> dict[str, NDArray[Any]]:
-    """The arrays of a packed clip, mapped and checked against their checksums; no file stays open."""
+def unpack(file: Path) -> Clip:
+    """A packed clip, memory-mapped; no file stays open. Raises UserError if it is not one, or damaged."""
     checked_file.check_file(file, 64 << 30)
-    arrays: dict[str, NDArray[Any]] = {name: values.numpy() for name, values in load_file(file).items()}
-    if arrays.keys() != checksums.keys():
-        raise ValueError(f"{file.name}: holds other arrays")
-    for name, array in arrays.items():
-        array.flags.writeable = False
-        if _checksum(array) != checksums[name]:
-            raise ValueError(f"{name}: the checksum does not match")
-    return arrays
+    with as_user_error(f"{file}: can't be read as a packed sequence"):
+        with safe_open(file, "pt") as opened:
+            plain = json.loads(opened.metadata()["clip"])
+            arrays = {name: opened.get_tensor(name).numpy() for name in opened.keys()}  # noqa: SIM118
+        if plain.pop("checksum") != _checksum(arrays):
+            raise ValueError("damaged: the checksum does not match")
+        for array in arrays.values():
+            array.flags.writeable = False
+        stored = [source for source in FIELDS if f"displacement-{source}" in arrays]
+        displacement = {source: arrays.pop(f"displacement-{source}") for source in stored}
+        return Clip(**plain, displacement=displacement, **arrays)
 
 
-def _checksum(values: NDArray[Any]) -> int:
-    return zlib.crc32(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
+def _checksum(arrays: Mapping[str, NDArray[Any]]) -> int:
+    """Of all values, in order of their names."""
+    found = 0
+    for name in sorted(arrays):
+        found = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, found)
+    return found
 
 
 def target(clip: Clip, frame: int, components: int) -> NDArray[np.float32]:

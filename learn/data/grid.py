@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -129,17 +130,32 @@ class Resampler:
         return out
 
     def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Grid values at the picture's pixels, bilinear, 0 outside: (..., N, N) → (..., H, W) float32."""
-        n, ratio = self.grid.size, self.scale_mm_per_px / self.grid.pitch_mm
-        x = (np.arange(self.shape[1]) - self.centre_px[0]) * ratio + (n - 1) / 2
-        y = (np.arange(self.shape[0]) - self.centre_px[1]) * ratio + (n - 1) / 2
-        inside = ((y >= -0.5) & (y <= n - 0.5))[:, None] & ((x >= -0.5) & (x <= n - 0.5))[None, :]
-        x, y = np.clip(x, 0, n - 1), np.clip(y, 0, n - 1)
-        x0, y0 = np.minimum(x.astype(int), n - 2), np.minimum(y.astype(int), n - 2)
-        fx, fy = (x - x0), (y - y0)[:, None]
-        top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
-        low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
-        return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
+        """See `to_image`: (..., N, N) → (..., H, W) float32."""
+        return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
+
+
+def to_image(
+    values: NDArray[np.floating],
+    shape: tuple[int, int],
+    centre_px: Sequence[float],
+    scale_mm_per_px: float,
+    pitch_mm: float,
+) -> NDArray[np.float32]:
+    """Values of a grid's cells at a picture's pixels, bilinear, 0 outside the grid.
+
+    `values`: (..., N, N); `shape`: (H, W) of the picture; `centre_px`: x, y of the grid's centre in it.
+    Returns (..., H, W) float32.
+    """
+    n, ratio = values.shape[-1], scale_mm_per_px / pitch_mm
+    x = (np.arange(shape[1]) - centre_px[0]) * ratio + (n - 1) / 2
+    y = (np.arange(shape[0]) - centre_px[1]) * ratio + (n - 1) / 2
+    inside = ((y >= -0.5) & (y <= n - 0.5))[:, None] & ((x >= -0.5) & (x <= n - 0.5))[None, :]
+    x, y = np.clip(x, 0, n - 1), np.clip(y, 0, n - 1)
+    x0, y0 = np.minimum(x.astype(int), n - 2), np.minimum(y.astype(int), n - 2)
+    fx, fy = (x - x0), (y - y0)[:, None]
+    top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
+    low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
+    return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
 
 
 class GridView:

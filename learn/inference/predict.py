@@ -17,8 +17,7 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, GridView, certainty, channels, membrane_code
 from learn.inference.shipped import find_model
-from learn.network.d2fnet import fused
-from learn.network.traced import Quick
+from learn.network.d2fnet import freeze, fused
 from learn.uncertainty.features import motion_features
 from synth.errors import UserError, as_path, as_positive, as_user_error
 from synth.flow.stereo.track import Moved
@@ -53,7 +52,7 @@ class Predictor:
         self.model = fused(network).to(self.device)
         self._network: Callable[..., Any] = self.model
         if quick and self.device.type == "cpu":
-            self._network = Quick(network, card.settings.arch, card.settings.size)
+            self._network = freeze(network, card.settings.arch, card.settings.size)
         self._view: GridView | None = None
 
     def readable(self, source: str) -> str:

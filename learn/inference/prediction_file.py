@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from learn.data.grid import to_image
 from learn.inference.apply import apply
 from learn.inference.motion import VideoOptions, motions
 from learn.inference.predict import Predictor, length
@@ -183,7 +184,8 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
         shrink = max(1, -(-rgb.shape[1] // _WIDEST_PX))
         small = cv2.resize(rgb, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
         small = picture.legible(np.asarray(small, np.uint8))
-        values = on_picture(size[t], found, t, rgb.shape[:2])
+        place = found["centres_px"][t], float(found["scale_mm_per_px"]), float(found["pitch_mm"])
+        values = to_image(size[t], (rgb.shape[0], rgb.shape[1]), *place)
         values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
             curve = sequence_video.draw_curve(times, force, small.shape[1])
@@ -193,17 +195,3 @@ def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterato
         shown = sequence_video.glow(small, values, largest) if found["trusted"][t] else small
         shown = picture.caption(shown, f"{times[t]:.2f} s  {text}")
         yield np.vstack([shown, sequence_video.mark(curve, t, len(force))])
-
-
-def on_picture(
-    cells: NDArray[np.floating], found: dict[str, Any], t: int, shape: tuple[int, ...]
-) -> NDArray[np.float32]:
-    """Values of the grid's cells (N, N) at the video's own pixels, (H, W); 0 outside the grid."""
-    step = float(found["scale_mm_per_px"]) / float(found["pitch_mm"])
-    offset = (np.array(cells.shape[::-1]) - 1) / 2 - step * np.asarray(found["centres_px"][t])
-    way = np.array([[step, 0, offset[0]], [0, step, offset[1]]])
-    size = (shape[1], shape[0])
-    return np.asarray(
-        cv2.warpAffine(cells.astype(np.float32), way, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP),
-        np.float32,
-    )

@@ -16,38 +16,21 @@ from synth.system.checked_file import folder_bytes, write_whole
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")
 LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
-NONE = "this version has no pretrained network; train one: learn train DATASET --out model"
 
 
 def shipped() -> dict[str, Path]:
     """Folders of the pretrained networks by name."""
-    return {name: MODELS / name for name in NAMES if (MODELS / name / "config.json").is_file()}
+    return {name: MODELS / name for name in NAMES}
 
 
 def find_model(named: Path | str) -> Path:
-    """The folder of a model: a folder of that name, else of the pretrained network.
-
-    Raises UserError if that network is not in the package.
-    """
-    if str(named) not in NAMES or Path(named).exists():
-        return Path(named)
-    if str(named) not in shipped():
-        raise UserError(f"{named}: no such folder, and {NONE}")
-    return shipped()[str(named)]
+    """The folder of a model: a folder of that name, else of the pretrained network."""
+    return MODELS / named if str(named) in NAMES and not Path(named).exists() else Path(named)
 
 
-def choose_model(stereo: bool) -> Path | None:
-    """The default network's folder: `stereo` for stereo recordings, else `mono`; None if there is none."""
-    found = shipped()
-    return next((found[name] for name in ("stereo", "mono")[not stereo :] if name in found), None)
-
-
-def require_model(stereo: bool) -> Path:
-    """As `choose_model`. Raises UserError if there is none."""
-    found = choose_model(stereo)
-    if found is None:
-        raise UserError(f"give a model: {NONE}")
-    return found
+def choose_model(stereo: bool) -> Path:
+    """The default network's folder, for recordings of one camera or stereo ones."""
+    return MODELS / NAMES[stereo]
 
 
 def find_name(card: ModelCard) -> str:
@@ -79,7 +62,7 @@ def pack_model(
     """
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
-    card = checkpoint.write_model(folder, card, net.state_dict(), safe=True)
+    card = checkpoint.write_model(folder, card, net.state_dict())
     write_whole(folder / "README.md", _readme(folder.name, card, commit, metrics, limits).encode())
     size = folder_bytes(folder)
     if size > LARGEST_BYTES:

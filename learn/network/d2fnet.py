@@ -12,7 +12,8 @@ by soft weights. Width 32 on 256² is the paper's network: 13.1 M parameters, 27
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -234,3 +235,19 @@ def fused(model: nn.Module) -> nn.Module:
                 block.body[conv] = fuse_conv_bn_eval(*pair)
                 block.body[norm] = nn.Identity()
     return quick
+
+
+def freeze(model: nn.Module, arch: Architecture, size: int) -> Callable[[Tensor], Tensor]:
+    """The network traced for batches of any length on its own grid; its output is equal up to rounding.
+
+    Eager PyTorch runs small convolutions (gates, pyramid, heads) in its plain kernels; a frozen graph runs
+    all of them in oneDNN. That saves a fifth of the time of `d2fnet-s` on a CPU.
+    """
+    net: Any = fused(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    example = torch.zeros(2, len(arch.channels), size, size).contiguous(memory_format=torch.channels_last)
+    jit: Any = torch.jit
+    with warnings.catch_warnings(), torch.no_grad():
+        # Tracing warns that it makes the grid's size a constant: it is one.
+        warnings.simplefilter("ignore")
+        frozen = jit.freeze(jit.trace(net, (example,), check_trace=False))
+    return lambda x: frozen(x.contiguous(memory_format=torch.channels_last))

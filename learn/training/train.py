@@ -22,7 +22,7 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement
-from learn.loss import SHARES, full, gradient_shares, loss
+from learn.loss import full, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
 from learn.split import Split, name_parts
@@ -36,7 +36,7 @@ from synth.system.terminal import ProgressCallback
 CLIP = 1.0  # largest norm of the gradient
 WEIGHT_DECAY = 1e-5
 PATIENCE = 5  # `plateau`: epochs without a better score after which the learning rate is halved
-CHECK_EVERY = 16  # steps between two checks of the loss and its gradient, each of which makes a GPU wait
+CHECK_EVERY = 16  # steps between two checks of the loss, each of which makes a GPU wait
 _GAIN_ANATOMIES = 8  # least number of anatomies that a force gain is fitted on
 _GAINS = 0.67, 1.5  # limits of the gain: a larger correction would hide that a network has not learnt
 
@@ -156,7 +156,7 @@ def _epoch(
     step = settings.batch * fabric.world_size
     batches = max(len(order) // step, 1)
     net.train()
-    means = {k: MeanMetric().to(fabric.device) for k in ("loss", *(f"share_{k}" for k in SHARES))}
+    mean = MeanMetric().to(fabric.device)
     for i in range(batches):
         batch = frames.batch(order[i * step : (i + 1) * step][fabric.global_rank :: fabric.world_size])
         batch = batch.to(fabric.device)
@@ -170,8 +170,6 @@ def _epoch(
         terms = loss(predicted, batch.target, batch.mask, settings.loss, unit, spread, progress)
         if i % CHECK_EVERY == 0:
             _finite(float(terms.sum.detach()), epoch)
-            for k, v in gradient_shares(terms, predicted).items():
-                means[f"share_{k}"].update(v)
         if settings.schedule == "cosine":
             for group in optimizer.param_groups:
                 group["lr"] = settings.learning_rate * cosine(progress)
@@ -179,11 +177,11 @@ def _epoch(
         fabric.backward(terms.sum)
         fabric.clip_gradients(net, optimizer, max_norm=CLIP)
         optimizer.step()
-        means["loss"].update(terms.sum.detach())
+        mean.update(terms.sum.detach())
         report(epoch * batches + i + 1, settings.epochs * batches)
-    numbers = {k: float(m.compute()) for k, m in means.items()}
-    _finite(numbers["loss"], epoch)
-    return numbers
+    found = float(mean.compute())
+    _finite(found, epoch)
+    return {"loss": found}
 
 
 def _finite(value: float, epoch: int) -> None:

@@ -14,7 +14,7 @@ from fake_model import write_model
 from typer.testing import CliRunner
 
 from learn.cli import app
-from learn.data.grid import GridView
+from learn.data.grid import GridView, to_image
 from learn.inference import prediction_file
 from learn.inference.apply import apply
 from learn.inference.motion import motions
@@ -74,7 +74,8 @@ def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, 
     view = GridView(motion.tissue, motion.scale_mm_per_px, predictor.grid)
     n = predictor.grid.size
     cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
-    there = prediction_file.on_picture(cells, found, 2, motion.tissue.shape)
+    place = found["centres_px"][2], float(found["scale_mm_per_px"]), float(found["pitch_mm"])
+    there = to_image(cells, motion.tissue.shape, *place)
     back = view.resample.mean(there, np.ones(motion.tissue.shape, bool))
     assert np.abs(back - cells)[view.mask > 0].max() < 0.1
     row, column = (np.average(axis, weights=there) for axis in np.indices(there.shape))

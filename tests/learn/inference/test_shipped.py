@@ -38,12 +38,13 @@ def pack(models: Path, name: str, *changes: str) -> Path:
 
 def test_a_packed_model_is_equal_and_damage_is_found(models: Path) -> None:
     folder = pack(models, "mono", "arch.output=vector")
+    pack(models, "stereo")
     assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "weights.safetensors"}
     both = (models.parent / "trained-mono", folder)
     before, after = (checkpoint.read_model(one)[0].state_dict() for one in both)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
-    (row,) = json.loads(run(app, ["models", "--json"]).stdout)
+    row = json.loads(run(app, ["models", "--json"]).stdout)[0]
     assert (row["name"], row["cameras"], row["bytes"]) == ("mono", 1, folder_bytes(folder))
     weights = folder / "weights.safetensors"
     whole = weights.read_bytes()

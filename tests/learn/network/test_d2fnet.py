@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from evidence.learn.pareto import flops, parameters
-from learn.network.d2fnet import BOUNDS, Architecture, D2FNet
-from learn.network.traced import Quick
+from learn.network.d2fnet import BOUNDS, Architecture, D2FNet, freeze
 
 
 def test_the_published_network_has_its_size() -> None:
@@ -40,7 +39,7 @@ def test_the_quick_network_is_equal_in_any_batch() -> None:
     torch.manual_seed(0)
     arch = Architecture(width=8, stem=4, levels=2)
     model = D2FNet(arch).eval()
-    quick = Quick(model, arch, 64)
+    quick = freeze(model, arch, 64)
     for batch in (1, 2, 3):
         x = torch.randn(batch, 5, 64, 64)
         x[:, 3] = 1

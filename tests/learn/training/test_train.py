@@ -121,12 +121,12 @@ def test_force_does_not_depend_on_the_resolution(model: Path) -> None:
 def test_other_runs_and_leaking_splits_are_refused(
     clips: list[Clip], split: Split, model: Path, tmp_path: Path
 ) -> None:
-    before = (model / "weights.pt").read_bytes()
+    before = (model / "weights.safetensors").read_bytes()
     with pytest.raises(UserError, match="settings"):
         train(clips, split, small(input="mixed", learning_rate=0.1), model)
     with pytest.raises(UserError):
         train(clips[:-1], Split((2, 5), (0, 1), (3, 4, 6)), small(input="mixed"), model)
-    assert (model / "weights.pt").read_bytes() == before
+    assert (model / "weights.safetensors").read_bytes() == before
     with pytest.raises(UserError):  # a leaking split: clips 0 and 1 share an anatomy
         train(clips, Split((0, 2), (3,), (1,)), small(), tmp_path / "m")
 
