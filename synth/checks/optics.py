@@ -46,9 +46,8 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if len(instruments) != 1:
         return
     at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
-    scenario, time = sequence.attrs["scenario"], sequence["time"][:]
-    footprint = float(scenario["gesture"]["footprint_mm"])
-    poses = _poses(sequence, at_rest, time)
+    footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
+    poses = camera_poses(sequence)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)
     peak = float(np.linalg.norm(sequence["force"][:], axis=1).max())
@@ -67,12 +66,12 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         yield Measure(off, 0.1 * footprint + view.mm_per_px, f"frame {t}", "mm")
 
 
-def _poses(sequence: Sequence, at_rest: cameras.Camera, time: Floats) -> Floats:
+def camera_poses(sequence: Sequence) -> Floats:
     """World to camera axes in every frame, (T, 4, 4) mm: as stored, else by the scenario's camera motion."""
-    if "camera" in sequence.fields:
+    if "camera" in sequence:
         return np.asarray(sequence["camera"][:])
-    moves = sequence.attrs["scenario"].get("camera_motion")
-    views = [CameraMotion(**moves).at(at_rest, float(t)) if moves else at_rest for t in time]
+    at_rest, moves = camera_of(sequence), sequence.attrs.get("scenario", {}).get("camera_motion")
+    views = [CameraMotion(**moves).at(at_rest, float(t)) if moves else at_rest for t in sequence["time"][:]]
     return np.stack([view.pose for view in views])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,51 +25,73 @@ NAME = "index.parquet"
 
 
 class IndexColumn(NamedTuple):
-    """One column of the index."""
+    """One fact about a sequence and its column: index, card, Croissant and exports follow from it."""
 
     name: str
     type: pa.DataType
     meaning: str
     unit: str = "-"
+    source: str | Callable[[Sequence], Any] = ""
+    """Path of the attribute, `name` if empty, or a function of the sequence."""
+    title: str = ""
+    """Heading of its chart and range in the card; empty: it has none."""
 
     def field(self) -> pa.Field:
         """The column in a Parquet schema."""
         about = {"meaning": self.meaning} | ({} if self.unit == "-" else {"unit": self.unit})
         return pa.field(self.name, self.type, metadata=about)
 
+    def read(self, sequence: Sequence) -> Any:
+        """The cell of a finished sequence; None if it has no such attribute."""
+        if callable(self.source):
+            return self.source(sequence)
+        found: Any = sequence.attrs
+        for step in (self.source or self.name).split("."):
+            found = found.get(step) if found else None
+        return found
+
+
+def _peak_motion_mm(sequence: Sequence) -> float | None:
+    scale, flow = sequence.attrs.get("scale_mm_per_px"), sequence.attrs.get("summary", {}).get("peak_flow_px")
+    return None if scale is None or flow is None else scale * flow
+
 
 _INT, _REAL, _TEXT = pa.int64(), pa.float64(), pa.string()
 
+# fmt: off
 COLUMNS = (
     IndexColumn("index", _INT, "position in the dataset"),
-    IndexColumn("status", _TEXT, "done or failed"),
-    IndexColumn("reason", _TEXT, "why it failed"),
-    IndexColumn("path", _TEXT, "the store, relative to this file"),
+    IndexColumn("status", _TEXT, "done or failed", source=lambda one: "done"),
+    IndexColumn("reason", _TEXT, "why it failed", source=lambda one: None),
+    IndexColumn("path", _TEXT, "the store, relative to this file", source=lambda one: one.path.name),
     IndexColumn("content_hash", _TEXT, "hash of fields and attributes"),
-    IndexColumn(
-        "anatomy",
-        _TEXT,
-        "the geometry: a user's brain or the seed of a procedural one, the same in every dataset; sequences "
-        "that share it belong on one side of a split",
-    ),
-    IndexColumn("opening", _TEXT, "place of the craniotomy on a user's brain, named alike in every dataset"),
-    IndexColumn("family", _TEXT, "appearance family"),
-    IndexColumn("gesture", _TEXT, "kind of gesture of each instrument"),
-    IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa"),
+    IndexColumn("anatomy", _TEXT,
+                "the geometry: a user's brain or the seed of a procedural one, the same in every dataset; "
+                "sequences that share it belong on one side of a split",
+                source=lambda one: split.name_anatomy(one.attrs)),
+    IndexColumn("opening", _TEXT, "place of the craniotomy on a user's brain, named alike in every dataset",
+                source="opening_id"),
+    IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
+    IndexColumn("gesture", _TEXT, "kind of gesture of each instrument",
+                source=lambda one: name_gestures(one.attrs.get("scenario", {})) or None),
+    IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
-    IndexColumn("load", _REAL, "peak load F/(E a^2)"),
-    IndexColumn("peak_force_mn", _REAL, "largest force", "mN"),
-    IndexColumn("peak_flow_px", _REAL, "largest true motion", "px"),
-    IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm"),
+    IndexColumn("load", _REAL, "peak load F/(E a^2)", source="scenario.gesture.load", title="Load F/(E a²)"),
+    IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
+    IndexColumn("peak_flow_px", _REAL, "largest true motion", "px", "summary.peak_flow_px"),
+    IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm",
+                _peak_motion_mm, "Peak motion"),
     IndexColumn("frames", _INT, "number of frames"),
     IndexColumn("fps", _REAL, "frames per second"),
-    IndexColumn("width", _INT, "width of the picture", "px"),
-    IndexColumn("height", _INT, "height of the picture", "px"),
+    IndexColumn("width", _INT, "width of the picture", "px", lambda one: one.size[1]),
+    IndexColumn("height", _INT, "height of the picture", "px", lambda one: one.size[0]),
     IndexColumn("scale_mm_per_px", _REAL, "scale at the craniotomy", "mm/px"),
     IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
     IndexColumn("split", _TEXT, "train, validation or test; null if there are too few anatomies to split"),
-    IndexColumn("cpu_s", _REAL, "processor time of its creation", "s"),
+    IndexColumn("cpu_s", _REAL, "processor time of its creation", "s",
+                lambda one: sum(one.stages_cpu_s.values())),
 )
+# fmt: on
 
 SCHEMA = pa.schema([one.field() for one in COLUMNS])
 
@@ -175,32 +197,8 @@ def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def row_of(sequence: Sequence) -> dict[str, Any]:
-    """The index row of a finished sequence, from its attributes."""
-    attrs = sequence.attrs
-    scenario, summary = attrs.get("scenario", {}), attrs.get("summary", {})
-    height, width = sequence.size
-    scale, flow = attrs.get("scale_mm_per_px"), summary.get("peak_flow_px")
-    stages = [stage for stage in attrs.get("timings", {}).values() if isinstance(stage, dict)]
-    return {
-        **{name: attrs.get(name) for name in ("young_kpa", "poisson", "fps", "flow_backend")},
-        "index": sequence.index,
-        "status": "done",
-        "path": sequence.path.name,
-        "content_hash": attrs["content_hash"],
-        "anatomy": split.name_anatomy(attrs),
-        "opening": attrs.get("opening_id"),
-        "family": scenario.get("family"),
-        "gesture": name_gestures(scenario) or None,
-        "load": (scenario.get("gesture") or {}).get("load"),
-        "peak_force_mn": summary.get("peak_force_mn"),
-        "peak_flow_px": flow,
-        "peak_motion_mm": None if scale is None or flow is None else scale * flow,
-        "frames": sequence.frames,
-        "width": width,
-        "height": height,
-        "scale_mm_per_px": scale,
-        "cpu_s": sum(stage.get("cpu_s", 0.0) for stage in stages),
-    }
+    """The index row of a finished sequence, from its attributes; without its side, which is not its own."""
+    return {column.name: column.read(sequence) for column in COLUMNS if column.name != "split"}
 
 
 def dataset_hash(rows: Iterable[Mapping[str, Any]]) -> str:

@@ -245,6 +245,12 @@ class Sequence:
         return int(height), int(width)
 
     @property
+    def stages_cpu_s(self) -> dict[str, float]:
+        """CPU time of its creation by stage [s]; empty if unknown."""
+        timings = self.attrs.get("timings", {})
+        return {name: stage.get("cpu_s", 0.0) for name, stage in timings.items() if isinstance(stage, dict)}
+
+    @property
     def fields(self) -> list[str]:
         """Names of its fields, in the table's order."""
         return [name for name in FIELDS if name in self]

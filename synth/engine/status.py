@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-from collections import Counter
+from collections import ChainMap, Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,11 +119,8 @@ def clock(seconds: float) -> str:
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:
-    total: Counter[str] = Counter()
-    read = 0
+    read = []
     for key in pilot:
         with suppress(UserError):  # damage is reported by `synth verify`
-            timings = open_sequence(location.store(root, key)).attrs.get("timings", {})
-            total.update({name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)})
-            read += 1
-    return {name: seconds / read for name, seconds in total.items()}
+            read.append(open_sequence(location.store(root, key)).stages_cpu_s)
+    return {name: sum(one.get(name, 0.0) for one in read) / len(read) for name in ChainMap(*read)}

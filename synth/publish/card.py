@@ -19,13 +19,8 @@ from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.publish import picture, svg
 
-QUANTITIES = {
-    "peak_force_mn": ("Peak force", "mN"),
-    "young_kpa": ("Young's modulus", "kPa"),
-    "peak_motion_mm": ("Peak motion", "mm"),
-    "load": ("Load F/(E a²)", "1"),
-}
-"""Columns of the index that are drawn in card and page: title and unit."""
+QUANTITIES = {column.name: column for column in index.COLUMNS if column.title}
+"""Columns of the index that are drawn in card and page."""
 
 _THUMBNAILS, _THUMBNAIL_PX = 24, 320
 _FILES = ("README.md", "preview.mp4", "job.yaml", index.NAME)
@@ -54,7 +49,8 @@ def write_card(folder: Folder) -> Path:
         preview=(folder.root / "preview.mp4").exists(),
         variant=attrs.get("variant", "-"),
         versions=attrs.get("versions", {}),
-        ranges=[_range(done, name) for name in QUANTITIES],
+        quantities=QUANTITIES,
+        ranges=[_range(done, one) for one in QUANTITIES.values()],
         fields=[FIELDS[name] for name in fields],
         columns=index.COLUMNS,
         limits=limits(folder),
@@ -83,7 +79,7 @@ def facts(folder: Folder) -> dict[str, Any]:
     failed = [row for row in rows if row["status"] == "failed"]
     reasons = Counter(row["reason"] for row in failed)
     first = {row["reason"]: row["index"] for row in reversed(failed)}
-    drawn = {name: (column(done, name), *words) for name, words in QUANTITIES.items()}
+    drawn = {name: (column(done, name), one.title, one.unit) for name, one in QUANTITIES.items()}
     return {
         "job": job,
         "card": job.card,
@@ -97,7 +93,6 @@ def facts(folder: Folder) -> dict[str, Any]:
         "split_hash": split.read_stored(folder.root).hash,
         "cpu_h": column(done, "cpu_s").sum() / 3600,
         "charts": {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN},
-        "quantities": QUANTITIES,
         "identity": folder.described()["identity"],
         "dataset_hash": index.dataset_hash(rows),
     }
@@ -136,11 +131,11 @@ def template(name: str) -> Any:
     ).from_string(text)
 
 
-def _range(rows: list[dict[str, Any]], name: str) -> list[str]:
-    """Name, minimum, median and maximum."""
-    values, (title, unit) = column(rows, name), QUANTITIES[name]
+def _range(rows: list[dict[str, Any]], quantity: index.IndexColumn) -> list[str]:
+    """Title, minimum, median and maximum."""
+    values = column(rows, quantity.name)
     ends = np.quantile(values, (0, 0.5, 1)).tolist() if len(values) else []
-    return [f"{title} [{unit}]", *([f"{value:.3g}" for value in ends] or ["-"] * 3)]
+    return [f"{quantity.title} [{quantity.unit}]", *([f"{value:.3g}" for value in ends] or ["-"] * 3)]
 
 
 def _thumbnail(root: Path, row: dict[str, Any]) -> dict[str, str] | None:
@@ -157,6 +152,7 @@ def _thumbnail(root: Path, row: dict[str, Any]) -> dict[str, str] | None:
     image.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
     file = io.BytesIO()
     image.save(file, "JPEG", quality=80)
-    numbers = [f"{row[name]:.3g} {unit}" for name, (_, unit) in QUANTITIES.items() if row[name] is not None]
-    caption = ", ".join([f"{row['index']:06d} {row['gesture'] or '-'}", row["family"] or "-", *numbers[:2]])
+    shown = [QUANTITIES[name] for name in ("peak_force_mn", "young_kpa") if row[name] is not None]
+    numbers = [f"{row[one.name]:.3g} {one.unit}" for one in shown]
+    caption = ", ".join([f"{row['index']:06d} {row['gesture'] or '-'}", row["family"] or "-", *numbers])
     return {"path": path.name, "jpeg": base64.b64encode(file.getvalue()).decode(), "caption": caption}

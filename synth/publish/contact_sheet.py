@@ -118,6 +118,6 @@ def _stages(job: Job, index: int, frames: int, folder: str) -> dict[str, float]:
     """Processor time [s] of a sequence with that number of frames, by stage."""
     short = job.model_copy(update={"frames": frames})
     path = pipeline.render_sequence(short, index, Path(folder), lambda stage, done, of: None)
-    timings = open_sequence(path).attrs["timings"]
+    spent_s = open_sequence(path).stages_cpu_s
     shutil.rmtree(path)
-    return {name: stage["cpu_s"] for name, stage in timings.items() if isinstance(stage, dict)}
+    return spent_s

@@ -9,7 +9,6 @@ all pictures are resampled.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import write_png
+from synth.render.camera.camera import Camera
 
 UNIT_MM = 0.01  # one step of a depth picture, and the unit of lengths: 16 bits reach to 655 mm
 
@@ -48,16 +49,18 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
     are those of frame 0's camera. `scene.json` contains unit, focal length, baseline and force.
 
     Raises:
-        UserError: a sequence has no depth, or its microscope moved and its poses were not stored.
+        UserError: a sequence has no depth.
     """
     for sequence in dataset:
         if "depth" not in sequence:
             raise UserError(f"{sequence.path}: has no depth; remove it from the job's store.without")
         here = target / f"{sequence.index:06d}"
-        focal = float(sequence.attrs["K"][0][0])
-        bounds = _write_pictures(sequence, _maps(sequence, sequence.attrs, focal), here)
-        lens = np.array([[*sequence.size, focal]]).T
-        poses = [np.concatenate([_pose(pose), lens], axis=1).ravel() for pose in _poses(sequence)]
+        left = optics.camera_of(sequence)
+        focal = float(left.K[0, 0])
+        bounds = _write_pictures(sequence, _maps(left, focal), here)
+        lens, views = np.array([[*sequence.size, focal]]).T, optics.camera_poses(sequence)
+        each = (_pose(views[0] @ np.linalg.inv(view)) for view in views)  # to the camera of frame 0
+        poses = [np.concatenate([pose, lens], axis=1).ravel() for pose in each]
         np.save(here / "poses_bounds.npy", np.concatenate([poses, bounds], axis=1))
         about: dict[str, Any] = {
             "unit_mm": UNIT_MM,
@@ -67,19 +70,18 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             "young_kpa": sequence.attrs["young_kpa"],
         }
         if "rgb_right" in sequence:
-            maps = _maps(sequence, sequence.attrs["right"], focal)
+            maps = _maps(stereo.right_of(sequence), focal)
             for t in range(sequence.frames):
                 write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
             about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
         (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
 
 
-def _maps(sequence: Sequence, lens: dict[str, Any], focal: float) -> _Maps:
+def _maps(view: Camera, focal: float) -> _Maps:
     """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume."""
-    height, width = sequence.size
+    width, height = view.size
     middle = np.array([[focal, 0, width // 2], [0, focal, height // 2], [0, 0, 1]], np.float64)
-    K, distortion = np.asarray(lens["K"], np.float64), np.asarray(lens["distortion"], np.float64)
-    x, y = cv2.initUndistortRectifyMap(K, distortion, np.eye(3), middle, (width, height), cv2.CV_32FC1)
+    x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, np.eye(3), middle, view.size, cv2.CV_32FC1)
     return _Maps(np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 
@@ -100,22 +102,7 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
     return np.array(bounds)
 
 
-def _poses(sequence: Sequence) -> Iterator[Floats]:
-    """Transforms from the camera of each frame to that of frame 0, (4, 4), in mm and OpenCV's axes."""
-    if "camera" in sequence:
-        poses = sequence["camera"][:]
-        yield from (poses[0] @ np.linalg.inv(pose) for pose in poses)
-        return
-    camera_motion = sequence.attrs.get("scenario", {}).get("camera_motion", {})
-    if camera_motion.get("drift_mm"):
-        raise UserError(
-            f"{sequence.path}: the microscope moves and its poses were not stored; "
-            "render with store.extra=[camera]"
-        )
-    yield from [np.eye(4)] * sequence.frames
-
-
 def _pose(pose: Floats) -> Floats:
-    """(3, 4) in axes right, up, backward, and in the scene's unit."""
+    """A transform (4, 4) of OpenCV's axes in mm as (3, 4) in axes right, up, backward, and in the scene's unit."""
     turned = _TO_OPENGL @ pose[:3, :3] @ _TO_OPENGL
     return np.concatenate([turned, (_TO_OPENGL @ pose[:3, 3:]) / UNIT_MM], axis=1)

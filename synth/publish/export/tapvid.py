@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.checks import optics
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import as_png
-from synth.render.camera.camera import undistort
+from synth.render.camera.camera import rays
 
 _POINTS = 1024
 
@@ -72,16 +73,14 @@ def _choose(sequence: Sequence) -> NDArray[np.int64]:
 
 def _in_depth(sequence: Sequence, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """Tracks of pixels (N, 2) of frame 0 in space, and the camera's intrinsics."""
-    lens, right = sequence.attrs, sequence.attrs["right"]
-    (fx, _, cx), (_, fy, cy), _ = K = np.asarray(lens["K"], np.float64)
-    distortion = np.asarray(lens["distortion"], np.float64)
+    view, right = optics.camera_of(sequence), sequence.attrs["right"]
+    (fx, _, cx), (_, fy, cy), _ = view.K
     columns, rows = pixels.T
     disparity = sequence["disparity"][:][rows, columns] + right["K"][0][2] - cx
-    flat = undistort((pixels - K[:2, 2]) / [fx, fy], distortion)
-    rest = np.insert(flat, 2, 1, axis=1) * (fx * right["baseline_mm"] / disparity)[:, None]
+    rest = rays(view, pixels) * (fx * right["baseline_mm"] / disparity)[:, None]
     tracks = np.stack([rest + sequence["motion"][t][rows, columns] for t in range(sequence.frames)])
     return {
         "tracks_XYZ": (tracks / 1000).astype(np.float32),
         "fx_fy_cx_cy": np.array([fx, fy, cx + 0.5, cy + 0.5]),
-        "distortion": distortion,
+        "distortion": view.distortion,
     }
