@@ -38,9 +38,13 @@ setup: .venv/developed .venv/llvm
 	@$(INSTALL) -e '.[dev]' || $(UNREACHABLE)
 	@touch $@
 
-# The fast renderer needs LLVM; without it the slow variant renders the same.
+# The fast renderer needs LLVM; without it the slow variant renders the same. Debian's is installed where permitted.
+LLVM := $(BIN)/python -c 'from synth.system.llvm import find; exit(0 if find() else 1)'
+APT := $$(test $$(id -u) = 0 || echo sudo -n) env DEBIAN_FRONTEND=noninteractive apt-get
 .venv/llvm: .venv/installed
-	@$(BIN)/python -m synth.system.llvm_setup
+	@$(LLVM) || { echo "installing libllvm19 ..."; { $(APT) update -q; \
+	  $(APT) install -y -q --no-install-recommends libllvm19; } >/dev/null 2>&1 </dev/null; $(LLVM); } || \
+	  echo "no usable LLVM (17 or newer; Debian: apt-get install libllvm19): rendering takes up to twice as long"
 	@touch $@
 
 demo: .venv/installed .venv/llvm

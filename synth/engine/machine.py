@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from pathlib import Path
 
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.system import llvm
+from synth.system import gpu, llvm
 
 
 def gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
@@ -20,25 +19,12 @@ def gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
     if chosen == "none":
         return ()
     if chosen == "auto":
-        return (_visible_gpus() or None) if wanted else None
-    named, here = tuple(word.strip() for word in chosen.split(",")), _visible_gpus()
+        return (gpu.visible() or None) if wanted else None
+    named, here = tuple(word.strip() for word in chosen.split(",")), gpu.visible()
     missing = [name for name in named if name not in here]
     if missing:
         raise UserError(f"--gpus {', '.join(missing)}: this machine has {', '.join(here) or 'none'}")
     return named
-
-
-def _visible_gpus() -> tuple[str, ...]:
-    """The GPUs in CUDA_VISIBLE_DEVICES, else all."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if visible is not None:
-        return tuple(name.strip() for name in visible.split(",") if name.strip())
-    try:
-        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30)
-    except (OSError, subprocess.TimeoutExpired):  # no driver, or it does not respond
-        return ()
-    count = sum(line.startswith("GPU ") for line in listed.stdout.splitlines())
-    return tuple(str(k) for k in range(count)) if listed.returncode == 0 else ()
 
 
 def environment(job: Job, workers: int) -> dict[str, str]:
