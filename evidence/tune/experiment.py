@@ -37,9 +37,8 @@ def main(
     rows = []
     for scene in scenes.split(","):
         job = reader.load_job(str(out / f"{scene}.yaml"))
-        journal = out / f"{scene}.part"
         # Each budget reuses the measurements of the one before.
-        measurements = search.Measurements(job, journal)
+        measurements = search.Measurements(job)
         for budget in map(search.parse_budget, budgets.split(",")):
             tuned = search.tune(measurements, budget, probes, checks)
             others = range(probes + checks, probes + checks + fresh)
@@ -52,7 +51,6 @@ def main(
             described = {kind: _described(one) for kind, one in whole.items()}
             checked = {kind: _described(one) for kind, one in again.items()}
             rows.append({"scene": scene, "budget": budget, "changes": changes, **described, "fresh": checked})
-        journal.unlink()
     report.publish(out, "tune.json", {"rows": rows}, page, {"rows": table(rows)})
 
 

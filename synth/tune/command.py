@@ -31,8 +31,6 @@ def tune(
     out = out or Path(f"{Path(job).stem}.tuned.yaml")
     if out.exists() or not out.resolve().parent.is_dir():
         raise UserError(f"{out}: {'exists already' if out.exists() else 'its folder does not exist'}")
-    journal = out.with_name(f"{out.name}.part")
-    tuned = search.tune(search.Measurements(loaded, journal), share, probes, checks)
+    tuned = search.tune(search.Measurements(loaded), share, probes, checks)
     table.write(tuned, job, overrides or [], out)
-    journal.unlink(missing_ok=True)
     print("\n".join([*table.table(tuned), "", f"wrote {out}"]))

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -27,6 +26,7 @@ from scipy import stats
 from synth.dataset import provenance
 from synth.errors import UserError
 from synth.job.schema import Job
+from synth.system import cache
 from synth.tune.grid import Settings, changed, differences, list_settings, show
 from synth.tune.probe import Probe
 
@@ -34,6 +34,7 @@ Floats = NDArray[np.float64]
 
 _DRAWS = 5  # of a probe sequence, until full fidelity carries one out
 _TRIES, _CAREFUL = 6, 0.7  # of whole jobs; a miss is stepped back from to this part of the growth it adds
+_STORED = 5000  # measurements, in the user's cache
 _CHEAPER = 0.98  # costs that differ by less than 2%, to which they are known, count as equal
 
 
@@ -50,20 +51,18 @@ class Evaluation:
 
 
 class Measurements:
-    """Measurements of a job's settings on sequences like its own, none of which is one of them."""
+    """Measurements of a job's settings on sequences like its own, none of which is one of them.
 
-    def __init__(self, job: Job, journal: Path) -> None:
-        """Takes up what the file `journal` holds of this job and this code, and appends to it."""
-        self.job, self.grid, self._journal = job, list_settings(job), journal
+    They are stored in the user's cache: a run that was stopped goes on.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.job, self.grid = job, list_settings(job)
         explicit = changed(job, {"fem.law": job.fem.chosen_law[0]})
         self.own: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
         self.full: Settings = {key: settings[0] for key, settings in self.grid.items()}
         self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()}"
         self._probes: dict[int, tuple[Job, Probe]] = {}
-        self._known: dict[str, list[float]] = {}
-        for line in journal.read_text("utf-8", "replace").splitlines() if journal.exists() else []:
-            with suppress(ValueError, TypeError):  # cut off
-                self._known.update([json.loads(line)])
 
     def evaluate(self, settings: Settings, sequences: Sequence[int]) -> Evaluation:
         """Measures settings as a whole. UserError if not even full fidelity can carry a sequence out."""
@@ -77,18 +76,18 @@ class Measurements:
         return Evaluation(settings, growths, recovered, mean, margin, np.mean(stages, axis=1))
 
     def _measure(self, sequence: int, settings: Settings) -> list[float]:
-        """As `Probe.measure`."""
-        key = f"{self._made_by} {sequence} {sorted(settings.items())}"
-        if key not in self._known:
-            job, probe = self._probe(sequence)
-            self._known[key] = [np.inf] * 6
+        """As `Probe.measure`; all infinite if the settings cannot be carried out."""
+
+        def make() -> list[float]:
+            (job, probe), found = self._probe(sequence), [np.inf] * 6
             with suppress(*[UserError] * (settings != self.full)):
-                self._known[key] = probe.measure(changed(job, settings))
-            with self._journal.open("a", encoding="utf-8") as file:
-                # The newline comes first, so that a line cut off before it corrupts only itself.
-                file.write("\n" + json.dumps([key, self._known[key]]))
+                found = probe.measure(changed(job, settings))
             print(f"sequence {sequence}: {show(settings, self.own)}", file=sys.stderr, flush=True)
-        return self._known[key]
+            return found
+
+        key = f"{self._made_by} {sequence} {sorted(settings.items())}".encode()
+        dump, load = (lambda found: json.dumps(found).encode()), json.loads
+        return cache.cached("tune/json", key, make, dump, load, (ValueError,), _STORED)
 
     def _probe(self, sequence: int) -> tuple[Job, Probe]:
         """A sequence's job and probe; draws that full fidelity cannot carry out are passed over."""

@@ -11,6 +11,7 @@ import pytest
 from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
+from synth.system import cache
 from synth.tune import grid, search, table
 from synth.tune.probe import Probe
 from synth.tune.search import Measurements, Tuned
@@ -52,15 +53,16 @@ class Fake:
 
 
 @pytest.fixture(autouse=True)
-def fake(monkeypatch: pytest.MonkeyPatch) -> None:
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "Probe", Fake)
+    monkeypatch.setattr(cache, "folder", lambda _: tmp_path)
     for name, value in (("calls", 0), ("refused", 0), ("scale", 1.0)):
         monkeypatch.setattr(Fake, name, value)
 
 
-def tune(tmp_path: Path, probes: int = 2, checks: int = 1, budget: float = 0.03, job: Job = JOB) -> Tuned:
+def tune(probes: int = 2, checks: int = 1, budget: float = 0.03, job: Job = JOB) -> Tuned:
     """The answer, with what holds of every one asserted."""
-    tuned = search.tune(Measurements(job, tmp_path / "part"), budget, probes, checks)
+    tuned = search.tune(Measurements(job), budget, probes, checks)
     lines = table.table(tuned)
     assert not any("nan" in line or "inf" in line for line in lines)
     assert any("this job" in line for line in lines)
@@ -70,8 +72,8 @@ def tune(tmp_path: Path, probes: int = 2, checks: int = 1, budget: float = 0.03,
     return tuned
 
 
-def test_a_prediction_that_does_not_hold_is_given_up(tmp_path: Path) -> None:
-    tuned = tune(tmp_path)
+def test_a_prediction_that_does_not_hold_is_given_up() -> None:
+    tuned = tune()
     first, *_, last = tuned.rows[tuned.rows.index(tuned.own) + 1 :]
     assert first.growth > 0.03  # the surprise
     assert tuned.best is last
@@ -79,48 +81,48 @@ def test_a_prediction_that_does_not_hold_is_given_up(tmp_path: Path) -> None:
     assert len(last.growths) == 3
 
 
-def test_a_job_gets_dearer_only_if_it_surely_misses_the_budget(tmp_path: Path) -> None:
-    one = tune(tmp_path, probes=1, checks=0, budget=0.003)  # over it, but of one sequence nothing is sure
+def test_a_job_gets_dearer_only_if_it_surely_misses_the_budget() -> None:
+    one = tune(probes=1, checks=0, budget=0.003)  # over it, but of one sequence nothing is sure
     assert one.own.growth > 0.003
     assert one.best is one.own
-    more = tune(tmp_path, probes=2, checks=2, budget=0.003)
+    more = tune(probes=2, checks=2, budget=0.003)
     assert more.own.growth - more.own.margin > 0.003
     assert more.best.stages.sum() > more.own.stages.sum()
     assert more.best.stages.sum() < more.full.stages.sum()
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "part"
-    first, calls = table.table(tune(tmp_path)), Fake.calls
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:30])  # killed while it wrote
-    assert table.table(tune(tmp_path)) == first
+    first, calls = table.table(tune()), Fake.calls
+    missing, corrupted, *_ = tmp_path.glob("*.json")
+    missing.unlink()
+    corrupted.write_text(corrupted.read_text()[:-4])
+    assert table.table(tune()) == first
     assert Fake.calls == calls + 2
-    tune(tmp_path, job=grid.changed(JOB, {"seed": 2}))
+    tune(job=grid.changed(JOB, {"seed": 2}))
     assert Fake.calls >= 2 * calls  # of another job nothing is taken
 
 
 @pytest.mark.parametrize("refused", [800, 1600, 2500])
-def test_settings_that_cannot_be_carried_out_are_never_chosen(refused: int, tmp_path: Path) -> None:
+def test_settings_that_cannot_be_carried_out_are_never_chosen(refused: int) -> None:
     Fake.refused = refused
-    tuned = tune(tmp_path)
+    tuned = tune()
     assert tuned.best.settings["fem.tets"] != refused
     assert any("cannot be carried out" in line for line in table.table(tuned))
     Fake.refused = 4000  # full fidelity
     with pytest.raises(UserError, match="inverted"):
-        tune(tmp_path, job=grid.changed(JOB, {"seed": 2}))
+        tune(job=grid.changed(JOB, {"seed": 2}))
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0])  # of errors: none at all, and some
-def test_nothing_to_choose(scale: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_to_choose(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
     Fake.scale = scale
-    tune(tmp_path, job=grid.changed(JOB, {"flow.backend": "ideal"}))
+    tune(job=grid.changed(JOB, {"flow.backend": "ideal"}))
     monkeypatch.setattr(search, "list_settings", lambda _: {})  # a single setting of everything
-    assert tune(tmp_path, probes=1, checks=0).best.settings == {}
+    assert tune(probes=1, checks=0).best.settings == {}
 
 
 def test_the_written_job_is_the_persons_own(tmp_path: Path) -> None:
-    tuned = tune(tmp_path)
+    tuned = tune()
     source, out = tmp_path / "job.yaml", tmp_path / "other" / "tuned.yaml"
     out.parent.mkdir()
     source.write_text("fem:\n  gestures: [pull]  # mine\nappearance:\n  photo: cortex.jpg\n")
@@ -153,8 +155,8 @@ def test_the_grid_follows_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "in-vivo"])
-def test_every_setting_is_a_job(name: str, tmp_path: Path) -> None:
-    own = Measurements(job := reader.load_job(name), tmp_path / "part").own
+def test_every_setting_is_a_job(name: str) -> None:
+    own = Measurements(job := reader.load_job(name)).own
     for key, settings in grid.list_settings(job).items():
         assert own[key] in settings
         assert [grid.changed(job, {key: setting}) for setting in settings]
