@@ -330,7 +330,9 @@ def view(
     from synth.publish.rerun_view import save_recording, show_sequence
     from synth.system.checked_file import write_picture
 
-    pictured = save is not None and save.suffix != ".rrd"
+    if save is not None and save.suffix.lower() not in (".rrd", ".png", ".jpg", ".jpeg"):
+        raise UserError(f"{save}: its name must end with .rrd for a recording, .png or .jpg for a picture")
+    pictured = save is not None and save.suffix.lower() != ".rrd"
     if frame and not pictured:
         raise UserError("--frame needs --save with a name that ends with .png or .jpg")
     _end_on_terminate()
