@@ -11,7 +11,7 @@ from typing import Any
 
 from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
-from synth.fields import FIELDS, TIME
+from synth.fields import TIME
 
 _OPEN = 64  # stores that one process keeps open; opening one takes some milliseconds
 
@@ -36,9 +36,6 @@ class TorchDataset:
         Raises:
             UserError: not a dataset, or a sequence lacks a field.
         """
-        unknown = [name for name in fields if name not in FIELDS]
-        if unknown:
-            raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         self._ends: list[int] = []

@@ -17,6 +17,7 @@ from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.fields import FIELDS
+from synth.job.schema import Job
 from synth.publish import picture, svg
 
 QUANTITIES = {column.name: column for column in index.COLUMNS if column.title}
@@ -31,8 +32,9 @@ def write_card(folder: Folder) -> Path:
     """Writes README.md and its pictures, from the index and the sequences. Returns its path."""
     about = facts(folder)
     done, pictures = about["done"], folder.root / "card"
+    charts = _charts(done)
     pictures.mkdir(exist_ok=True)
-    for name, chart in about["charts"].items():
+    for name, chart in charts.items():
         write_whole(pictures / f"{name}.svg", chart)
     best = max(done, key=lambda row: row["peak_flow_px"] or 0.0, default=None)
     attrs, fields = dict[str, Any](), list(FIELDS)
@@ -45,6 +47,7 @@ def write_card(folder: Folder) -> Path:
         Image.fromarray(drawn).save(pictures / "example.png")
     text = template("card.md.jinja").render(
         **about,
+        charts=charts,
         example=best,
         preview=(folder.root / "preview.mp4").exists(),
         variant=attrs.get("variant", "-"),
@@ -53,7 +56,6 @@ def write_card(folder: Folder) -> Path:
         ranges=[_range(done, one) for one in QUANTITIES.values()],
         fields=[FIELDS[name] for name in fields],
         columns=index.COLUMNS,
-        limits=limits(folder),
     )
     path = folder.root / "README.md"
     write_whole(path, text)
@@ -67,19 +69,18 @@ def write_page(root: Path, target: Path) -> Path:
     chosen = np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]
     thumbnails = [found for k in chosen if (found := _thumbnail(root, done[k])) is not None]
     links = [name for name in _FILES if (root / name).exists()]
-    page = template("report.html.jinja").render(**about, thumbnails=thumbnails, links=links)
-    write_whole(target, page)
+    page = template("report.html.jinja")
+    write_whole(target, page.render(**about, charts=_charts(done), thumbnails=thumbnails, links=links))
     return target
 
 
 def facts(folder: Folder) -> dict[str, Any]:
-    """Values for the templates of card and page, from the dataset's job and index."""
+    """Values for the templates of all descriptions, from the dataset's job and index."""
     rows, job = index.read_index(folder.root).to_pylist(), folder.job()
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]
     reasons = Counter(row["reason"] for row in failed)
     first = {row["reason"]: row["index"] for row in reversed(failed)}
-    drawn = {name: (column(done, name), one.title, one.unit) for name, one in QUANTITIES.items()}
     return {
         "job": job,
         "card": job.card,
@@ -92,15 +93,20 @@ def facts(folder: Folder) -> dict[str, Any]:
         "splits": share(done, "split"),
         "split_hash": split.read_stored(folder.root).hash,
         "cpu_h": column(done, "cpu_s").sum() / 3600,
-        "charts": {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN},
         "identity": folder.described()["identity"],
         "dataset_hash": index.dataset_hash(rows),
+        "limits": _limits(folder, job),
     }
 
 
-def limits(folder: Folder) -> list[str]:
+def _charts(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Histograms of `QUANTITIES` by name, as SVG."""
+    drawn = {name: (column(rows, name), one.title, one.unit) for name, one in QUANTITIES.items()}
+    return {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN}
+
+
+def _limits(folder: Folder, job: Job) -> list[str]:
     """The known limits of the dataset, which depend on its job."""
-    job = folder.job()
     text: str = template("limits.jinja").render(
         job=job,
         versions=len(folder.described()["generators"]),

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from synth.dataset import size_forecast
 from synth.dataset.store import open_sequence
-from synth.fem.tool_gesture import Gesture
+from synth.fem import tool_gesture
+from synth.fem.tool_gesture import Gesture, ToolMotion
+from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface
@@ -24,7 +25,6 @@ from synth.sequence import pipeline, scenario
 from synth.sequence.scene import at_rest
 
 _TILE_PX = 320
-_OPENING_MM = 1.0  # least distance of the two tips of forceps
 _PROBES = 3  # sequences that are computed with few frames, after one for the compilation
 _SHORT, _LONG = 3, 9  # frames: their difference is the cost of further frames
 
@@ -84,12 +84,10 @@ def _draw_scenario(job: Job, index: int) -> Rgb:
 
 def poised(gesture: Gesture, surface: CortexSurface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
-    azimuth, rise = np.deg2rad([gesture.azimuth_deg, gesture.elevation_deg])
-    shaft = np.array([np.cos(azimuth) * np.cos(rise), np.sin(azimuth) * np.cos(rise), np.sin(rise)])
-    side = 0.5 * max(gesture.spread_mm, _OPENING_MM) * np.array([-np.sin(azimuth), np.cos(azimuth)])
-    flat = np.asarray(gesture.point_mm) + np.stack([side, -side])
-    height = surface.vertices[cKDTree(surface.vertices[:, :2]).query(flat)[1], 2]
-    return np.concatenate([flat, height[:, None]], axis=1), np.stack([shaft, shaft])
+    touching = ToolMotion(np.zeros(1), np.zeros(1), np.zeros((1, 2)))
+    shape = Shape(surface.vertices, surface.faces)
+    tips, shafts = tool_gesture.pose(gesture, touching, shape, surface.vertices[None])
+    return tips[0], shafts[0]
 
 
 def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:

@@ -16,7 +16,8 @@ from synth.job.schema import CardSection
 from synth.publish import card
 
 NAME = "croissant.json"
-_CONTEXT = Path(__file__).parent / "croissant_context.json"  # of the specification, plus the prefix rai
+_BASE = Path(__file__).parent / "croissant_base.json"
+"""What is the same of every dataset, with the specification's context and the prefix rai."""
 
 STATED = {"creator": "authors", "license": "licence"}  # Croissant key -> key of the job's `card`
 
@@ -32,39 +33,27 @@ def write_croissant(folder: Folder) -> Path:
 
 def describe(folder: Folder) -> dict[str, Any]:
     """The description, JSON-LD, from the dataset and the card in its job."""
-    job, rows = folder.job(), index.read_index(folder.root).to_pylist()
-    done = [row for row in rows if row["status"] == "done"]
-    about, (width, height) = job.card, job.render.size
+    facts = card.facts(folder)
+    job, about, (width, height) = facts["job"], facts["card"], facts["job"].render.size
     summary = (
-        f"{len(done)} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain surface "
-        "under load, with true motion, traction, force, depth and visibility."
+        f"{len(facts['done'])} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain "
+        "surface under load, with true motion, traction, force, depth and visibility."
     )
     fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
     return {
-        "@context": json.loads(_CONTEXT.read_text("utf-8")),
-        "@type": "sc:Dataset",
-        "conformsTo": ["http://mlcommons.org/croissant/1.1", "http://mlcommons.org/croissant/RAI/1.0"],
+        **json.loads(_BASE.read_text("utf-8")),
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
         "description": about.summary or summary,
-        "version": "1.0.0",
         **_stated(about),
-        "keywords": ["synthetic", "neurosurgery", "optical flow", "force estimation", "finite elements"],
-        "citeAs": "Heraoui et al., Vision-Based Force Estimation Using Brain Surface Deformation Models",
-        "isLiveDataset": False,
         "distribution": _distribution(folder),
         "recordSet": [_sequences()],
-        "rai:dataCollection": "Simulated and rendered from a job file; nothing was recorded.",
-        "rai:dataCollectionType": ["Software Collection"],
         "rai:dataAnnotationProtocol": f"Labels are the simulation's own state. Fields: {fields}",
-        "rai:dataPreprocessingProtocol": ["None: sensor noise and 8-bit sRGB are part of the rendering."],
-        "rai:dataLimitations": card.limits(folder),
+        "rai:dataLimitations": facts["limits"],
         "rai:dataBiases": [
-            f"Appearance: {card.share(done, 'family')}. Gestures: {card.share(done, 'gesture')}. "
-            f"Anatomies: {len({row['anatomy'] for row in done})}."
+            f"Appearance: {facts['families']}. Gestures: {facts['gestures']}. "
+            f"Anatomies: {facts['anatomies']}."
         ],
-        "rai:dataUseCases": ["Training and testing of motion and force estimation from surgical video."],
-        "rai:personalSensitiveInformation": ["None: no person, patient or animal was recorded."],
     }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial import ConvexHull, cKDTree
 
 from synth.errors import UserError
@@ -168,11 +169,7 @@ def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
     As in the renderer, points deeper than three quarters of the square's side belong to the far side of the
     brain.
     """
-    count = int(np.ceil(2 * half / _PIXEL_MM))
-    cell = np.floor((placed[:, :2] / half + 1) / 2 * count).astype(np.int64)
-    within = ((cell >= 0) & (cell < count)).all(axis=1) & (placed[:, 2] > -1.5 * half)
-    height = np.full((count, count), -np.inf)
-    np.maximum.at(height, (cell[within, 1], cell[within, 0]), placed[within, 2])
-    middles = (np.arange(count) + 0.5) / count * 2 * half - half
-    x, y = np.meshgrid(middles, middles)
-    return x, y, np.where(np.isfinite(height), height, np.nan)
+    across, down, up = placed[placed[:, 2] > -1.5 * half].T
+    edges = np.linspace(-half, half, 1 + int(np.ceil(2 * half / _PIXEL_MM)))
+    height = stats.binned_statistic_2d(down, across, up, "max", [edges, edges]).statistic
+    return *np.meshgrid(*[(edges[1:] + edges[:-1]) / 2] * 2), height

@@ -43,26 +43,15 @@ def diagnose(folder: Path) -> list[Diagnosis]:
         _disk(folder),
         Diagnosis(
             "LLVM",
-            library or "none works",
+            library or "none works: scalar_rgb renders, at half the speed",
             library is not None,
             "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH",
         ),
         _cuda(),
-        Diagnosis(
-            "renderer",
-            "llvm_ad_rgb" if library else "scalar_rgb",
-            library is not None,
-            "it is slow: with LLVM rendering takes half the time",
-        ),
         *_lacking(),
         _kernels(),
     ]
-    found += [Diagnosis(name, version) for name, version in packages.versions().items()]
-    for name in ("mitsuba", "cv2", "torch", "trimesh", "av"):
-        if importlib.util.find_spec(name) is None:
-            advice = "pip install -c constraints.txt . in the project's folder"
-            found.append(Diagnosis(name, "missing", False, advice))
-    return found
+    return found + [Diagnosis(name, version) for name, version in packages.versions().items()]
 
 
 def lines(found: Sequence[Diagnosis]) -> list[str]:

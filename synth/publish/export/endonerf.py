@@ -103,6 +103,6 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
 
 
 def _pose(pose: Floats) -> Floats:
-    """A transform (4, 4) of OpenCV's axes in mm as (3, 4) in axes right, up, backward, and in the scene's unit."""
+    """A transform (4, 4) in mm and OpenCV axes as (3, 4) in axes right, up, backward and the scene's unit."""
     turned = _TO_OPENGL @ pose[:3, :3] @ _TO_OPENGL
     return np.concatenate([turned, (_TO_OPENGL @ pose[:3, 3:]) / UNIT_MM], axis=1)

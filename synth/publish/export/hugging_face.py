@@ -155,23 +155,12 @@ def _bytes(value: Any) -> int:
 
 def _card(dataset: Dataset, sides: list[str], framed: list[str], frameless: list[str]) -> str:
     """The text of README.md, with its header for the Hub and `datasets`."""
-    folder = Folder(dataset.root)
-    rows = [index.row_of(sequence) for sequence in dataset]
-    return str(
-        card.template("export/hugging_face.md.jinja").render(
-            card=folder.job().card,
-            sides=sides,
-            sequences=len(rows),
-            frames=sum(row["frames"] for row in rows),
-            row_columns=_ROWS,
-            framed=[FIELDS[name] for name in framed],
-            still=[FIELDS[name] for name in frameless],
-            index=[column for column in index.COLUMNS if column.name not in _LEFT_OUT],
-            families=card.share(rows, "family"),
-            gestures=card.share(rows, "gesture"),
-            limits=card.limits(folder),
-            identity=folder.described()["identity"],
-            width=rows[0]["width"],
-            height=rows[0]["height"],
-        )
+    text: str = card.template("export/hugging_face.md.jinja").render(
+        **card.facts(Folder(dataset.root)),
+        sides=sides,
+        row_columns=_ROWS,
+        framed=[FIELDS[name] for name in framed],
+        still=[FIELDS[name] for name in frameless],
+        index=[column for column in index.COLUMNS if column.name not in _LEFT_OUT],
     )
+    return text

@@ -77,7 +77,7 @@ def _in_depth(sequence: Sequence, pixels: NDArray[np.int64]) -> dict[str, NDArra
     (fx, _, cx), (_, fy, cy), _ = view.K
     columns, rows = pixels.T
     disparity = sequence["disparity"][:][rows, columns] + right["K"][0][2] - cx
-    rest = rays(view, pixels) * (fx * right["baseline_mm"] / disparity)[:, None]
+    rest = rays(view, pixels.astype(np.float64)) * (fx * right["baseline_mm"] / disparity)[:, None]
     tracks = np.stack([rest + sequence["motion"][t][rows, columns] for t in range(sequence.frames)])
     return {
         "tracks_XYZ": (tracks / 1000).astype(np.float32),
