@@ -228,16 +228,15 @@ def report(
     """Writes the description of a dataset again: report.html, its card README.md, and croissant.json."""
     from synth.dataset.folder import Folder
     from synth.dataset.index import write_index
-    from synth.publish import croissant
     from synth.publish.card import write_card, write_page
+    from synth.publish.croissant import write_croissant
 
     folder = Folder(out)
-    folder.described()
+    stated = folder.job().card
     write_index(folder)
     print(write_card(folder))
-    print(croissant.write_croissant(folder))
-    missing = ", ".join(sorted(croissant.STATED.keys() - croissant.describe(folder).keys()))
-    if missing:
+    print(write_croissant(folder))
+    if missing := ", ".join(name for name in ("authors", "licence") if not getattr(stated, name)):
         print(f"not in the job's card, so not in the description: {missing}", file=sys.stderr)
     print(write_page(out, to or out / "report.html"))
 

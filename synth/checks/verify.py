@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -179,13 +178,6 @@ def _frames(sequence: Sequence, fast: bool) -> list[int]:
     return sorted({int(np.argmax(force)), *spread.tolist()})
 
 
-def _same(one: object, other: object) -> bool:
-    """Whether two cells agree, floats except for the last bits: Python 3.12 sums more exactly than 3.11."""
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=1e-12)
-    return one == other
-
-
 def _dataset(
     folder: Folder, described: dict[str, Any], sealed: list[int]
 ) -> Iterator[tuple[str, str, bool, str]]:
@@ -212,7 +204,7 @@ def _dataset(
         except UserError:
             continue  # reported by the check of that sequence
         row = rows.get(key, {})
-        differing = [name for name, value in index.row_of(found).items() if not _same(row.get(name), value)]
+        differing = [name for name, value in index.row_of(found).items() if row.get(name) != value]
         yield "dataset", index.NAME, not differing, f"row {key} differs in {', '.join(differing)}"
         known = found.attrs.get("versions", {}).get("generator") in makers
         yield "dataset", found.path.name, known, "its version is not in dataset.json"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -89,7 +90,7 @@ COLUMNS = (
     IndexColumn("flow_backend", _TEXT, "estimator of the recovered flow"),
     IndexColumn("split", _TEXT, "train, validation or test; null if there are too few anatomies to split"),
     IndexColumn("cpu_s", _REAL, "processor time of its creation", "s",
-                lambda one: sum(one.stages_cpu_s.values())),
+                lambda one: math.fsum(one.stages_cpu_s.values())),
 )
 # fmt: on
 

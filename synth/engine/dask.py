@@ -185,7 +185,4 @@ def read_slurm(path: Path) -> dict[str, Any]:
     found = checked_file.read_yaml(path)
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
         raise UserError(f"{path}: must contain `jobs`, the number of jobs to submit")
-    missing = {"cores", "memory"} - found.keys()
-    if missing:
-        raise UserError(f"{path}: must contain {' and '.join(sorted(missing))} of a job")
     return dict(found)

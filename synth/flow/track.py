@@ -69,12 +69,8 @@ class Tracker:
             tissue: (H, W), where tissue is tracked.
 
         Raises:
-            UserError: no such estimator, or shapes that differ.
+            UserError: no such estimator.
         """
-        if rest.shape[:2] != tissue.shape or rest_blocked.shape != tissue.shape:
-            raise UserError(
-                f"flow: rest frame {rest.shape[:2]}, masks {rest_blocked.shape}, {tissue.shape} differ"
-            )
         self.estimator = create(backend)
         self.rest, self.tissue = rest, tissue
         self.usable = tissue & ~rest_blocked
@@ -181,8 +177,6 @@ def track(
     backend: str | Estimator, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags
 ) -> Track:
     """As `recover_flow`, with masks (T, H, W) of everything that is not tissue."""
-    if len(frames) == 0 or len(frames) != len(blocked):
-        raise UserError(f"flow: {len(frames)} frames with {len(blocked)} masks")
     tracker = Tracker(backend, frames[0], blocked[0], tissue)
     flow = np.zeros((*frames.shape[:3], 2), np.float32)
     confidence = np.zeros(frames.shape[:3], np.float32)

@@ -12,14 +12,11 @@ import pyarrow as pa
 from synth.dataset import index
 from synth.dataset.folder import Folder, write_whole
 from synth.fields import FIELDS
-from synth.job.schema import CardSection
 from synth.publish import card
 
 NAME = "croissant.json"
 _BASE = Path(__file__).parent / "croissant_base.json"
 """What is the same of every dataset, with the specification's context and the prefix rai."""
-
-STATED = {"creator": "authors", "license": "licence"}  # Croissant key -> key of the job's `card`
 
 _TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:Text"}
 
@@ -39,13 +36,15 @@ def describe(folder: Folder) -> dict[str, Any]:
         f"{len(facts['done'])} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain "
         "surface under load, with true motion, traction, force, depth and visibility."
     )
+    creators = [{"@type": "sc:Person", "name": name} for name in about.authors]
+    stated = {"creator": creators, "license": about.licence}
     fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
     return {
         **json.loads(_BASE.read_text("utf-8")),
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
         "description": about.summary or summary,
-        **_stated(about),
+        **{key: value for key, value in stated.items() if value},
         "distribution": _distribution(folder),
         "recordSet": [_sequences()],
         "rai:dataAnnotationProtocol": f"Labels are the simulation's own state. Fields: {fields}",
@@ -55,13 +54,6 @@ def describe(folder: Folder) -> dict[str, Any]:
             f"Anatomies: {facts['anatomies']}."
         ],
     }
-
-
-def _stated(about: CardSection) -> dict[str, Any]:
-    """Authors and licence, if stated."""
-    found = {key: getattr(about, name) for key, name in STATED.items()}
-    found["creator"] = [{"@type": "sc:Person", "name": name} for name in about.authors]
-    return {key: value for key, value in found.items() if value}
 
 
 def _distribution(folder: Folder) -> list[dict[str, Any]]:

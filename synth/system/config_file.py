@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import typing
 from collections.abc import Iterable, Iterator
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
 
 from synth.errors import UserError, did_you_mean, first_line
 from synth.system import checked_file
@@ -47,13 +49,21 @@ class ConfigFile:
             at: Loc = tuple(key.strip().split("."))
             if not equals or not all(at):
                 raise UserError(f"{text}: an override is written section.key=value")
-            block: Any = self.values
-            for step in at[:-1]:
-                if not isinstance(block.get(step), dict):
-                    block[step] = {}
-                block = block[step]
-            block[at[-1]] = checked_file.load_yaml(value, text)
+            block: Any
+            for block in (self.values, self._tree):
+                for step in at[:-1]:
+                    if not isinstance(block.get(step), dict):
+                        block[step] = type(block)()
+                    block = block[step]
+                block[at[-1]] = checked_file.load_yaml(value, text)
             self.changes[at] = text
+
+    def dump(self) -> str:
+        """The YAML text with its comments and with the changes."""
+        out, yaml = io.StringIO(), YAML(typ="rt")
+        yaml.width = 110
+        yaml.dump(self._tree, out)
+        return out.getvalue()
 
     def validate(self, model: type[Model], further: Iterable[Mistake] = ()) -> Model:
         """The validated model of the values.

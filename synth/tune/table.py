@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap
 
 from synth.job import identity, reader
-from synth.system import checked_file
+from synth.system.config_file import ConfigFile
 from synth.tune.grid import differences, show
 from synth.tune.search import Tuned
 
@@ -38,25 +37,14 @@ def table(tuned: Tuned) -> list[str]:
 def write(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) -> None:
     """Writes the tuned job of the one that `reader.load_job` reads. FileExistsError if `out` exists."""
     text, label, folder = reader.read_source(source)
-    tree = checked_file.load_yaml(text, label, places=True)
-    given = (override.partition("=")[::2] for override in overrides)
-    keys = {key.strip(): checked_file.load_yaml(value, key, places=True) for key, value in given}
+    config, keys = ConfigFile(text, label), dict[str, Any]()
+    config.change(overrides)
     if folder != out.resolve().parent:  # from which relative paths will start
         job = reader.load_job(source, overrides).model_dump(mode="json")
         paths = {f"{section}.{name}": job[section][name] for section, name in identity.FILES}
-        keys |= {key: path for key, path in paths.items() if path is not None}
+        keys = {key: path for key, path in paths.items() if path is not None}
     changes = differences(tuned.best.settings, tuned.own.settings)
-    keys |= {key: list(one) if isinstance(one, tuple) else one for key, one in changes.items()}
-    for key, value in keys.items():
-        *sections, name = key.split(".")
-        block = tree
-        for section in sections:
-            block[section] = block.get(section) or CommentedMap()
-            block = block[section]
-        block[name] = value
-    body, yaml = io.StringIO(), YAML(typ="rt")
-    yaml.width = 110
-    yaml.dump(tree, body)
+    config.change(f"{key}={json.dumps(value)}" for key, value in (keys | dict(changes)).items())
     head = "".join(f"# {line}".rstrip() + "\n" for line in table(tuned))
     with out.open("x", encoding="utf-8") as file:
-        file.write(f"{head}\n{body.getvalue()}")
+        file.write(f"{head}\n{config.dump()}")

@@ -24,7 +24,7 @@ def test_a_missing_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(
     ("text", "named"),
-    [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: 4\n", "cores"), ("jobs: [", "YAML")],
+    [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: [", "YAML")],
 )
 def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str, named: str) -> None:
     (tmp_path / "slurm.yaml").write_text(text)
