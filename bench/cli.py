@@ -177,19 +177,21 @@ def check(
     """Reports what of a recording is usable and what is missing. Exits with code 2 if it can't be used."""
     from dataclasses import asdict
 
-    from bench.recording import check as checking
+    from bench.checks.check_recording import check_recording
+    from synth.recording_flow.finding import first_fault
     from synth.system.checked_file import make_folder
     from synth.system.text_lines import hang
 
     if picture is not None:
         make_folder(picture.parent)  # fails before the video is decoded
-    found = checking.check_recording(recording, phantom, picture)
+    found = check_recording(recording, phantom, picture)
+    usable = not first_fault(found)
     if json:
-        print(json_.dumps({"usable": checking.is_usable(found), "findings": [asdict(f) for f in found]}))
+        print(json_.dumps({"usable": usable, "findings": [asdict(f) for f in found]}))
     else:
         for finding in found:
-            print("\n".join(hang(f"{finding.state:<5}{finding.what:<11}", printable(finding.message))))
-    if not checking.is_usable(found):
+            print("\n".join(hang(f"{finding.severity:<8}{finding.cause:<11}", printable(finding.message))))
+    if not usable:
         raise typer.Exit(2)
 
 
@@ -337,7 +339,7 @@ def live(
         )
     summary = stream.summary()
     for one in stream.findings:
-        typer.echo(f"{one.state}: {one.what}: {one.message}", err=True)
+        typer.echo(f"{one.severity}: {one.cause}: {one.message}", err=True)
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
     if out is not None:

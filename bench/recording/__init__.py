@@ -1,1 +1,1 @@
-"""Recordings: reading, writing and checking folders of video, force sensor and description."""
+"""Recordings: reading and writing folders of video, force sensor and description."""

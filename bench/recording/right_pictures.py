@@ -13,24 +13,23 @@ from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass
 from synth.recording_flow.stereo import RightCamera
 
-LATE = 0.22  # share of the motion that the right camera lacks, from which it is out of sync
-
 
 @dataclass(frozen=True)
 class StereoQuality(stereo.StereoQuality):
     """Quality of the right or depth camera, and whether the pictures belong together."""
 
-    fault: str = ""  # why the right pictures don't belong to the left ones; empty if they do
+    copied: bool = False  # whether the right pictures are copies of the left ones
+    frozen: int = 0  # frames in which only the left picture changes
+    tool_behind_px: float = 0.0  # disparity of tissue minus that of the tool; 0: unknown
+    lag_s: float = 0.0  # of the right camera; negative: early
+    lag_from_s: float | None = None  # time from which on it is late or early; None: the start
 
     def describe(self) -> str:
         """The quality in words."""
         noise = f"depth motion has a standard deviation of {self.noise_mm:.2g} mm"
         if np.isnan(self.baseline_mm):
             return f"depth camera; {noise}"
-        late = f"; the right camera lacks {100 * self.lag:.0f}% of the motion: out of sync" * (
-            self.lag > LATE
-        )
-        return f"baseline {self.baseline_mm:.3g} mm, rows {self.epipolar_px:.2g} px off; {noise}{late}"
+        return f"baseline {self.baseline_mm:.3g} mm, rows {self.epipolar_px:.2g} px off; {noise}"
 
 
 class RightPictures:
@@ -60,8 +59,8 @@ class RightPictures:
         found = None if camera is None else camera.quality
         if found is None:
             return None
-        fault = ""
-        if isinstance(camera, RightCamera) and camera.stereo is not None:
-            fault = self._pairing.fault(camera.stereo.rectified)
-            fault = fault or ("" if self._timing is None else self._timing.fault())
-        return StereoQuality(**vars(found), fault=fault)
+        if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
+            return StereoQuality(**vars(found))
+        behind_px = self._pairing.find_tool_behind_px(camera.stereo.rectified)
+        pair = self._pairing.copied, self._pairing.frozen, behind_px, *self._timing.find_lag_s()
+        return StereoQuality(*vars(found).values(), *pair)

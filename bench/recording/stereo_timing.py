@@ -1,4 +1,4 @@
-"""Check that the pictures of left and right camera are simultaneous: both show the same motion.
+"""Lag of the right camera's pictures behind the left ones, from the motion that both show.
 
 In rectified pictures the vertical motion is equal and the horizontal motion nearly so: a millimetre towards
 the camera changes the disparity by less than a tenth of the shift from a millimetre across the view. So
@@ -62,14 +62,13 @@ class StereoTiming:
             self._moved[camera].append(np.where(known[:, None], there - at, np.nan))
         self._time_s.append(time_s)
 
-    def fault(self) -> str:
-        """What is wrong with the right camera, as a predicate; empty if nothing is."""
+    def find_lag_s(self) -> tuple[float, float | None]:
+        """Lag [s], negative: early, 0: none or unknown; and the time [s] from which on, None: the start."""
         lag, since = find_lag(*(np.array(moved, np.float64) for moved in self._moved))
         if not lag:
-            return ""
+            return 0.0, None
         step_s = float(np.median(np.diff(self._time_s)))
-        after = f", from {self._time_s[since]:.3g} s" if since > _LEAST_FRAMES else ""
-        return f"is about {abs(lag) * step_s:.2g} s {'late' if lag > 0 else 'early'}{after}"
+        return lag * step_s, self._time_s[since] if since > _LEAST_FRAMES else None
 
     def _picture(self, rgb: Rgb, camera: int) -> NDArray[np.uint8]:
         """Local contrast of the rectified picture, (H, W)."""

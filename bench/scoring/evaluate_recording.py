@@ -1,7 +1,7 @@
 """Scoring of methods on a recording.
 
 The video is tracked and each method estimates the force of every frame; the sensor is aligned with the video
-and interpolated at the frames; each method's curve is scored against it.
+and interpolated at the frames; all is checked; each method's curve is scored in the selected frames.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.checks.judgement import judge
+from bench.checks.sensor import find_sensor_motion
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.fusion import Fusion
 from bench.methods.protocol import Method
 from bench.recording.folder import Recording
 from bench.recording.meta import Meta, Span
@@ -23,20 +24,15 @@ from bench.recording.pixel_scale import PixelScale
 from bench.scoring import metrics
 from bench.scoring.result import Curve, Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
-from bench.sensor.plausibility import judge_sensor
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import Finding, first_fault, worth_saying
+from synth.recording_flow.finding import first_fault, problems
 from synth.recording_flow.flow import LocalFlow
 
 Flags = NDArray[np.bool_]
 _MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones
 _SEED = 0  # of the bootstrap, for reproducible intervals
-_NO_YOUNG = (
-    "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that are independent of a "
-    "factor are reported, and those after the gain of a separate press if there is one"
-)
 
 
 def evaluate_recording(
@@ -69,49 +65,30 @@ def evaluate_recording(
     tracked = track_recording(
         recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
     )
-    meta, notes = recording.meta, [*recording.notes, *tracked.notes]
-    time_s, lost = np.array(tracked.time_s), ~np.array(tracked.trusted)
-    sensor = align_sensor(recording, time_s, _speed(tracked, lost), tracked.turning, notes)
-    findings = [*tracked.findings, *_against_sensor(recording, tracked, methods, sensor, ~lost)]
-    if first_fault(findings):
-        lost[:] = True
-    if meta.young_kpa is None:
-        notes.append(_NO_YOUNG)
-    press = None if meta.press_s is None else _within(time_s, meta.press_s)
-    used = _scored_frames(meta, time_s, notes) & ~_repeated(tracked, sensor.size_mn, notes)
-    against = _Reference(time_s, sensor, used, press, meta.young_kpa is not None)
-    if lost.any() and not first_fault(findings):
-        notes.append(f"tracking was lost in {lost.sum()} of {len(lost)} frames: they are not scored")
-    scored: dict[str, Scored] = {}
-    for name, method in methods.items():
-        force = np.array(tracked.force_mn[name], np.float64)
-        force[lost] = np.nan
-        first = scored.get(main)
-        gain = None
-        if isinstance(method, FlowSize):
-            gain = _fit_gain(_magnitude(force), main, first, against)
-            force *= gain.mn_per_mm
-        one = replace(_score(force, first, against), gain=gain)
-        scored[name] = _with_interval(one, tracked.bounds[name], lost, against)
+    meta, time_s = recording.meta, np.array(tracked.time_s)
+    sensor = align_sensor(recording, time_s, _speed(tracked), tracked.turning)
+    findings = judge(recording, tracked, find_sensor_motion(recording, tracked, methods, sensor))
+    against = _select_frames(meta, tracked, sensor, bool(first_fault(findings)))
+    missing = tuple(one.message for one in findings if one.severity == "missing")
     return Result(
         recording=recording.name,
         main=main,
         time_s=time_s,
         sensor_mn=sensor.size_mn,
         sensor_axes_mn=sensor.axes_mn,
-        methods=scored,
+        methods=_score_methods(methods, main, tracked, against),
         scale=scale,
         relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=sensor.noise_floor_mn,
         scored=against.scored,
-        lost=lost,
+        lost=against.lost,
         sync=sensor.offset,
-        notes=tuple(notes),
+        notes=(*missing, *tracked.notes, *sensor.notes, *against.notes),
         steps=sensor.steps,
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         tracked=tracked,
         turn=sensor.rotation,
-        findings=worth_saying(findings),
+        findings=problems(findings),
         absolute=against.absolute,
     )
 
@@ -122,45 +99,26 @@ class _Reference:
 
     time_s: Curve
     sensor: AlignedSensor
-    scored: Flags  # (T,) frames that are scored
+    lost: Flags  # (T,) frames without valid forces
+    scored: Flags  # (T,) frames that are scored, unless they are lost
     press: Flags | None  # (T,) frames of the calibrating press; None without one
     absolute: bool  # whether E is known
+    notes: tuple[str, ...]  # on frames that are not scored
 
 
-def _against_sensor(
-    recording: Recording,
-    tracked: TrackedRecording,
-    methods: Mapping[str, Method],
-    sensor: AlignedSensor,
-    followed: Flags,
-) -> list[Finding]:
-    """Findings on the sensor from the frames that were tracked (`followed`)."""
-    moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
-    if sensor.axes_mn is None or moved is None:
-        return []
-    forces = []
-    if recording.meta.young_kpa is not None:
-        # A fusion is not an independent estimate.
-        alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Fusion))]
-        every = [np.array(tracked.force_mn[name]) for name in alone]
-        forces = [force[followed] for force in every if np.nan_to_num(force).any()]
-    size = np.array(tracked.force_mn[moved])[followed, 0]
-    time_s = np.array(tracked.time_s)[followed]
-    axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
-    return judge_sensor(time_s, sensor.axes_mn[followed], size, forces, axes if sensor.in_camera_axes else 0)
-
-
-def _speed(tracked: TrackedRecording, lost: Flags) -> Curve:
+def _speed(tracked: TrackedRecording) -> Curve:
     """Speed of the tissue, (T,) mm/s; NaN where this frame or the one before is lost."""
+    lost = ~np.array(tracked.trusted)
     return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
 
 
-def _within(time_s: Curve, span: Span) -> Flags:
-    return (time_s >= span[0]) & (time_s <= span[1])
+def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor, fault: bool) -> _Reference:
+    """Selects the frames to score: not those that something is calibrated on, nor repeated pictures.
 
-
-def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
-    """Frames (T,) outside the spans that something is calibrated on."""
+    `fault`: whether no force of any frame is valid.
+    """
+    time_s = np.array(tracked.time_s)
+    notes: list[str] = []
     scored = np.ones(len(time_s), bool)
     for what, span in (
         ("clock calibration", meta.sync.calibration_s),
@@ -171,10 +129,20 @@ def _scored_frames(meta: Meta, time_s: Curve, notes: list[str]) -> Flags:
             inside = _within(time_s, span)
             scored &= ~inside
             notes.append(f"{inside.sum()} frames of the {what} ({describe_span(span)}) are not scored")
-    return scored
+    again = _repeated(tracked, sensor.size_mn)
+    if again.any():
+        notes.append(f"{again.sum()} frames show an earlier one again, frozen or repeated: not scored")
+    lost = ~np.array(tracked.trusted) | fault
+    press = None if meta.press_s is None else _within(time_s, meta.press_s)
+    known = meta.young_kpa is not None
+    return _Reference(time_s, sensor, lost, scored & ~again, press, known, tuple(notes))
 
 
-def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[str]) -> Flags:
+def _within(time_s: Curve, span: Span) -> Flags:
+    return (time_s >= span[0]) & (time_s <= span[1])
+
+
+def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None) -> Flags:
     """Frames (T,) with the picture of the tracked frame before: identical, or frozen while force changed."""
     pairs = list(zip(tracked.frame, [-1, *tracked.frame[:-1]], strict=True))
     # Repeats of frames that were not tracked do not count.
@@ -184,9 +152,23 @@ def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None, notes: list[st
         for run in np.split(np.arange(len(maybe)), np.flatnonzero(np.diff(maybe)) + 1):
             if maybe[run[0]] and np.ptp(sensor_mn[max(run[0] - 1, 0) : run[-1] + 1]) > _MOVED * peak:
                 surely[run] = True
-    if surely.any():
-        notes.append(f"{surely.sum()} frames show an earlier one again, frozen or repeated: not scored")
     return np.asarray(surely, bool)
+
+
+def _score_methods(
+    methods: Mapping[str, Method], main: str, tracked: TrackedRecording, against: _Reference
+) -> dict[str, Scored]:
+    """Scores of each method by name, the main one first."""
+    scored: dict[str, Scored] = {}
+    for name, method in methods.items():
+        force, first, gain = np.array(tracked.force_mn[name], np.float64), scored.get(main), None
+        force[against.lost] = np.nan
+        if isinstance(method, FlowSize):
+            gain = _fit_gain(_magnitude(force), main, first, against)
+            force *= gain.mn_per_mm
+        one = replace(_score(force, first, against), gain=gain)
+        scored[name] = _with_interval(one, tracked.bounds[name], against)
+    return scored
 
 
 def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference) -> Gain:
@@ -232,11 +214,9 @@ def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
     return Scored(force, size, scores, components, events, intervals, calibrated, worse)
 
 
-def _with_interval(
-    scored: Scored, bounds: Sequence[tuple[float, float]], lost: Flags, against: _Reference
-) -> Scored:
+def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], against: _Reference) -> Scored:
     """Adds the method's prediction intervals, their mean width and their coverage of the sensor."""
-    low, high = np.where(lost, np.nan, np.array(bounds, np.float64).T)
+    low, high = np.where(against.lost, np.nan, np.array(bounds, np.float64).T)
     known = np.isfinite(low)
     if not known.any():
         return scored

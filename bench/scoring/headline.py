@@ -43,14 +43,14 @@ def headline(result: Result) -> Headline:
     First, scores after scaling by the gain found on `press_s`. Then those in newtons; if E is unknown, the
     scale-invariant ones instead. There are none if too many frames were lost.
     """
-    odd = tuple(one.message for one in result.findings if one.state == "odd")
+    doubts = tuple(one.message for one in result.findings if one.severity == "warning")
     if result.refused:
-        return Headline(result.refused, (), odd)
+        return Headline(result.refused, (), doubts)
     main = result.methods[result.main]
     if not main.scores:
         why = "No usable force sensor: predictions only, nothing is scored"
-        return Headline(why, (), odd, trust=_trust(result))
-    warnings = list(odd)
+        return Headline(why, (), doubts, trust=_trust(result))
+    warnings = list(doubts)
     if result.left == 2:
         warnings.append("Only two frames are scored: correlations are meaningless (see the notes)")
     if result.sync is not None and not result.aligned:

@@ -90,7 +90,7 @@ class Result:
     turn: SensorRotation | None = None
     """The sensor's rotation found on `sensor.turn_s`; None without that span."""
     findings: tuple[Finding, ...] = ()
-    """What is wrong or odd, the worst first."""
+    """Errors, then warnings."""
     absolute: bool = True
     """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
     environment: dict[str, str] = field(default_factory=lambda: _environment())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -26,7 +26,6 @@ from learn import Predictor
 from learn.inference.shipped import choose_model, find_model
 from synth.errors import UserError, as_path
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.flow import LocalFlow
 from synth.system import checked_file
 from synth.system.terminal import counting
 
@@ -70,11 +69,40 @@ def score(
     Raises:
         UserError: unusable recording, model or settings, or nothing to score; nothing is written.
     """
+    opened = recording
+    if not isinstance(opened, Recording):
+        opened = open_recording(as_path("recording", opened))
+    model = _require_model(model, methods, train, opened.has_stereo)
+    frames = len(opened.numbers()) or None
+    bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
+    if progress:
+        bar = counting(f"scoring {opened.name}", frames)
+    with ExitStack() as stack:
+        if out is not None:
+            stack.enter_context(checked_file.made_folder(Path(out), _OUTPUT_BYTES))
+        flow = None
+        if own_process and (frames or _LONG) >= _LONG:
+            # The process takes seconds to start, during which the baselines are fitted.
+            flow = stack.enter_context(flow_process.open_flow_process())
+        chosen = _choose_methods(model, methods or {}, opened.has_stereo, baselines, train)
+        scale, main = pixel_scale.find_scale(opened.meta, opened.folder), next(iter(chosen))
+        used, about = settings or Settings(), _describe(chosen)
+        with bar as done:
+            result = evaluate_recording(opened, chosen, main, scale, used, about, done, flow)
+        if out is not None:
+            write_result(result, Path(out), title)
+    return result
+
+
+def _require_model(
+    model: str | Path | Predictor | None,
+    methods: Mapping[str, Method] | None,
+    train: str | Path | None,
+    stereo: bool,
+) -> Path | Predictor | None:
+    """The model to score, None: only own methods. UserError if the arguments don't fit each other."""
     if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
         raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
-    opened = (
-        recording if isinstance(recording, Recording) else open_recording(as_path("recording", recording))
-    )
     if not isinstance(model, (str, Path, Predictor, NoneType)):
         raise UserError(f"model: expected a folder or a result of `load_model`, got {type(model).__name__}")
     if not isinstance(methods or {}, Mapping):
@@ -82,29 +110,8 @@ def score(
     if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
         raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
     if model is None and not methods:
-        model = choose_model(opened.has_stereo)
-    elif isinstance(model, (str, Path)):
-        model = find_model(model)
-    frames = len(opened.numbers()) or None
-    flow: AbstractContextManager[LocalFlow | None] = nullcontext()
-    if own_process and (frames or _LONG) >= _LONG:
-        flow = flow_process.open_flow_process()
-    written: AbstractContextManager[None] = nullcontext()
-    if out is not None:
-        written = checked_file.made_folder(Path(out), _OUTPUT_BYTES)
-    bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
-    if progress:
-        bar = counting(f"scoring {opened.name}", frames)
-    # The process takes seconds to start, during which the baselines are fitted.
-    with written, flow as process:
-        chosen = _choose_methods(model, methods or {}, opened.has_stereo, baselines, train)
-        scale, main = pixel_scale.find_scale(opened.meta, opened.folder), next(iter(chosen))
-        used, about = settings or Settings(), _describe(chosen)
-        with bar as done:
-            result = evaluate_recording(opened, chosen, main, scale, used, about, done, process)
-        if out is not None:
-            write_result(result, Path(out), title)
-    return result
+        return choose_model(stereo)
+    return find_model(model) if isinstance(model, (str, Path)) else model
 
 
 def _choose_methods(

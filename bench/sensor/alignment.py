@@ -28,6 +28,7 @@ class AlignedSensor:
     offset: Offset | None = None  # found by correlation; None without a search
     rotation: SensorRotation | None = None  # found on `sensor.turn_s`; None without that span
     in_camera_axes: bool = False
+    notes: tuple[str, ...] = ()  # for the user
 
     @property
     def size_mn(self) -> Curve | None:
@@ -36,7 +37,7 @@ class AlignedSensor:
 
 
 def align_sensor(
-    recording: Recording, time_s: Curve, speed: Curve, surface: SurfaceMotion | None, notes: list[str]
+    recording: Recording, time_s: Curve, speed: Curve, surface: SurfaceMotion | None
 ) -> AlignedSensor:
     """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames.
 
@@ -45,41 +46,31 @@ def align_sensor(
         time_s: (T,) times of the frames [s].
         speed: (T,) mean speed of the tissue since the frame before [mm/s]; NaN where unknown.
         surface: the tissue's motion over `sensor.turn_s`; None without that span.
-        notes: notes for the user are appended.
 
     Raises:
         UserError: as `force_sensor.process_force`.
     """
     force, sensor = recording.force, recording.meta.sensor
-    if force is None:
-        notes.append("no force.csv: predictions only, nothing is scored")
+    if force is None or clocks.find_other_unit(time_s, force.time_s):
         return AlignedSensor()
     offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
-    rotation = None
+    rotation, notes = None, list[str]()
     if sensor.turn_s is not None:
         rotation = _find_rotation(force, sensor, offset_s, surface)
         if rotation.refused:
-            notes.append(
-                f"the sensor's rotation was not found ({rotation.refused}): components are not scored"
-            )
+            notes = [f"the sensor's rotation was not found ({rotation.refused}): components are not scored"]
         else:
             span = describe_span(sensor.turn_s)
-            notes.append(f"the sensor's rotation was found on {span}: {rotation.describe()}")
+            notes = [f"the sensor's rotation was found on {span}: {rotation.describe()}"]
             sensor = sensor.model_copy(update={"to_camera": rotation.rows})
     processed = force_sensor.process_force(force, sensor, offset_s)
     axes = force_sensor.force_at(processed, time_s)
     covered = int(np.isfinite(axes).all(axis=1).sum())
-    if covered == 0:
-        notes.append("force.csv and the video don't overlap: predictions only; are both clocks in seconds?")
-        return AlignedSensor(steps=processed.steps, offset=found, rotation=rotation)
-    if other := clocks.find_other_unit(time_s, force.time_s):
-        notes.append(f"{other}: predictions only, nothing is scored")
-        return AlignedSensor()
     if covered < len(time_s):
         notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
-    return AlignedSensor(
-        axes, processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes
-    )
+    floor, steps = processed.noise_floor_mn, processed.steps
+    in_camera = sensor.in_camera_axes
+    return AlignedSensor(axes if covered else None, floor, steps, found, rotation, in_camera, tuple(notes))
 
 
 def describe_span(span: Span) -> str:

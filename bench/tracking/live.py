@@ -17,7 +17,7 @@ import numpy as np
 from bench.methods.protocol import Method, MethodContext
 from synth.errors import UserError
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.finding import Finding, worth_saying
+from synth.recording_flow.finding import Finding, problems
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.passes import VideoPass
 from synth.system.checked_file import write_whole
@@ -112,7 +112,7 @@ def stream_video(
         )
         stream.frames.append(frame)
         report(frame)
-    stream.dropped, stream.findings = pace.dropped, worth_saying(video.findings)
+    stream.dropped, stream.findings = pace.dropped, problems(video.findings)
     if not stream.frames:
         raise UserError(f"{footage.name}: fewer than two frames")
     return stream

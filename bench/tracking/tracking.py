@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from bench.methods.fusion import Fusion
 from bench.methods.protocol import ForceEstimate, Method, MethodContext, Revising
-from bench.recording import check
 from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
 from bench.recording.meta import Meta, Span
 from bench.recording.right_pictures import RightPictures, StereoQuality
 from synth.errors import UserError
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import Finding, first_fault
+from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
 from synth.recording_flow.passes import VideoPass, passes
@@ -66,15 +65,13 @@ class TrackedRecording:
     size: tuple[int, int] = (0, 0)  # height, width of the recording [px]
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)  # on the pictures
+    decoded: list[tuple[int, float | None]] = field(default_factory=list)  # number, time [s] of every picture
+    rest_s: float | None = None  # time of the rest frame
+    scale_mm_per_px: float = 1.0  # of the recording's own pixels
     stereo: StereoQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
     pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
-
-    @property
-    def fault(self) -> str:
-        """Reason why no number is valid; empty if there is none."""
-        return first_fault(self.findings)
 
 
 def track_recording(
@@ -86,6 +83,8 @@ def track_recording(
     pictured: str | None = None,
     flow: LocalFlow | None = None,
     progress: Progress = lambda done: None,
+    only: Container[int] | None = None,
+    each: Callable[[FrameMotion], None] = lambda frame: None,
 ) -> TrackedRecording:
     """Tracks the video and applies every method, with a few frames in memory.
 
@@ -98,18 +97,21 @@ def track_recording(
         flow: computes the flow and is closed by the caller; None: in this process. Another process computes
             it while the methods are applied to the previous frame.
         progress: called after every frame.
+        only: numbers of the frames to track, with the rest frame; None: all.
+        each: called with every tracked frame.
 
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
     """
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
-    footage, free_s = as_footage(recording, scale_mm_per_px), about.pulse.free_s
+    footage, free_s = replace(as_footage(recording, scale_mm_per_px), only=only), about.pulse.free_s
     for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
         mm_per_px = scale_mm_per_px * video.rest.shrink
         forces = _Forces(methods, pictured, watch, video.rest, _context(about, video.rest.tissue, mm_per_px))
         pictures = RightPictures(video)
         for frame in video.frames():
+            each(frame)
             pictures.add(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
@@ -144,16 +146,13 @@ def _describe(
     """Adds summary, findings and notes after the last frame."""
     rest, decoder = video.rest, video.decoder
     out.summary, out.size, out.notes = video.summary, rest.size, video.notes
-    out.findings = check.judge(recording, mm_per_px / rest.shrink, video, out.stereo)
+    out.findings, out.decoded, out.rest_s = video.findings, decoder.decoded, rest.time_s
+    out.scale_mm_per_px = mm_per_px / rest.shrink
     out.repeats = decoder.faults.repeats()
-    if out.fault:
-        out.trusted = [False] * len(out.time_s)
-        out.notes.append(f"nothing can be measured: {out.fault}")
-    out.notes.append(recording.describe_tool(decoder.decoded))
+    if recording.masks:
+        out.notes.append(recording.describe_tool(len(out.decoded)))
     for name, method in methods.items():
         out.notes += [f"{name}: {note}" for note in getattr(method, "notes", ())]
-    if out.summary.is_odd:
-        out.notes.append(out.summary.describe())
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:

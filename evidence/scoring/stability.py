@@ -185,7 +185,7 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
         result = score(folder, _model(stereo), methods={PHYSICS: Physics()}, baselines=False)
     except UserError as error:
         return {**row, "messages": [str(error).replace(f"{folder}: ", "")]}
-    row["messages"] = [f"{one.what}: {one.message}" for one in result.findings]
+    row["messages"] = [f"{one.cause}: {one.message}" for one in result.findings]
     row["messages"] += [note for note in result.notes if re.search(_NOTES, note)]
     sensor, main = np.asarray(result.sensor_mn), result.methods[result.main]
     for key, method in (("physics", result.methods[PHYSICS]), ("error", main)):

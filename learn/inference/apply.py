@@ -16,7 +16,7 @@ from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
 from synth.errors import UserError
 from synth.job.types import MembraneState
-from synth.recording_flow.finding import first_fault, judge_young, worth_saying
+from synth.recording_flow.finding import first_fault, judge_young, problems
 
 
 def apply(
@@ -42,7 +42,7 @@ def apply(
             times.append(math.nan if frame.time_s is None else frame.time_s)
             followed.append(frame.trusted)
             found.append(estimator.estimate(frame))
-    findings = worth_saying([*judge_young(young), *one.findings()])
+    findings = problems([*judge_young(young), *one.findings()])
     fault = first_fault(findings)
     trusted = np.array(followed) & (not fault)
     force = np.where(trusted[:, None], [each.force_mn for each in found], np.nan)
@@ -66,7 +66,7 @@ def apply(
         out["time_s"] = np.array(times)
     if last.force_mn is not None:
         out["force_mn"] = force
-    notes = [finding.message for finding in findings if finding.state == "odd"]
+    notes = [finding.message for finding in findings if finding.severity == "warning"]
     notes += one.notes() + estimator.notes
     if motion.scale_known:
         notes += estimator.interval_notes

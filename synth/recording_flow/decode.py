@@ -93,7 +93,7 @@ class Decoder:
         self._rate_hz = settings.rate_hz
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
         self._due_s = self._last_s = -math.inf
-        self.decoded = 0
+        self.decoded: list[tuple[int, float | None]] = []  # number and time [s] of every picture so far
         self.left_out = Counter[str]()  # number of frames that are not tracked, by reason
         self._pictures = self._decode()
         rest = self._find_rest()
@@ -130,9 +130,9 @@ class Decoder:
                 picture = next(pictures, None)
             if picture is None:
                 return
-            self.decoded += 1
+            self.decoded.append((picture.index, picture.time_s))
             yield picture
-            self._progress(self.decoded)
+            self._progress(len(self.decoded))
 
     def _find_rest(self) -> Picture:
         """The first frame to be tracked; the stated rest frame may lack a time."""
@@ -145,7 +145,7 @@ class Decoder:
         if self.left_out["without a time"]:
             raise UserError(f"{self._footage.name}: no frame from the rest frame on has a time")
         rest = self._footage.rest_frame
-        raise UserError(f"{self._footage.name}: rest_frame {rest}, but {self.decoded} frames")
+        raise UserError(f"{self._footage.name}: rest_frame {rest}, but {len(self.decoded)} frames")
 
     def _reason(self, picture: Picture) -> str:
         """Why a picture is not tracked; empty if it is."""
@@ -173,10 +173,10 @@ class Decoder:
         findings = []
         if is_inside_out(tissue):
             inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
-            findings.append(Finding("odd", "tissue", inverted))
+            findings.append(Finding("warning", "tissue", inverted))
         if (tissue & bars).any():
             share = f"{100 * bars.mean():.0f}% of the picture are black bars, removed from the tissue mask"
-            findings.append(Finding("odd", "pictures", share))
+            findings.append(Finding("warning", "pictures", share))
         tissue = shrink_mask(tissue & ~bars, shrink, 127)
         if not tissue.any():
             raise UserError(f"{self._footage.name}: the tissue mask marks no tissue")

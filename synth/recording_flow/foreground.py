@@ -76,7 +76,7 @@ class ForegroundSearch:
         for places in self._found.values():
             unmasked = [(share, text) for share, text, where in places if self._masked[where].mean() < 0.5]
             if len(unmasked) > 1:
-                found.append(Finding("odd", "foreground", max(unmasked)[1]))
+                found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
 
     def _note(self, why: str, where: Flags, frame: FrameMotion, share: float, extent: float = 0.0) -> None:

@@ -157,7 +157,7 @@ class VideoFaults:
         leaps = [k for k, other in enumerate(around, 1) if change[k] > LIMITS.leapt * other]
         cuts = [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])]
         at = dict(zip(self._numbers, self._times, strict=True))
-        found = [Finding("odd", "pictures", message) for message in self._rest]
+        found = [Finding("warning", "pictures", message) for message in self._rest]
         for times, fault in (
             (self._combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
@@ -166,7 +166,7 @@ class VideoFaults:
         ):
             if times:
                 some = ", ".join(f"{t:.2f}" for t in times[:_SOME]) + (", ..." if len(times) > _SOME else "")
-                found.append(Finding("odd", "pictures", f"{len(times)} pictures ({some} s) are {fault}"))
+                found.append(Finding("warning", "pictures", f"{len(times)} pictures ({some} s) are {fault}"))
         return found
 
 

@@ -15,8 +15,6 @@ from synth.recording_flow.finding import Finding
 
 Size = tuple[int, int]  # height, width [px]
 
-_ODD = 0.2  # share of the tissue masked, or of the frames lost, above which a recording should be checked
-
 
 @dataclass(frozen=True, eq=False)
 class RestFrame:
@@ -93,11 +91,6 @@ class TrackingSummary:
         """Share of the tissue that is masked, and of the frames that are lost and reinitialised."""
         n = max(self.frames, 1)
         return {"masked": self.masked / n, "lost": self.lost / n, "reinitialised": self.reinitialised / n}
-
-    @property
-    def is_odd(self) -> bool:
-        """Whether the recording should be checked."""
-        return self.shares["masked"] > _ODD or self.shares["lost"] > _ODD
 
     def describe(self) -> str:
         """A sentence for reports."""

@@ -257,18 +257,19 @@ class VideoPass:
             fault = f"the rest frame is {self.rest.fault}"
         elif self.summary.frames and not self.decoder.faults.changes:
             fault = "the picture never changes"
-        bad = [Finding("bad", "pictures", fault)] if fault else []
+        bad = [Finding("error", "pictures", fault)] if fault else []
         pictures = [] if fault else self.decoder.faults.findings()
         found = [*bad, *self.rest.findings, *self._inspection.findings, *pictures]
         moved = [one.describe() for one in (self._register, self._on_tissue) if one is not None]
-        return found + [Finding("odd", "camera", text) for text in chain(*moved)]
+        return found + [Finding("warning", "camera", text) for text in chain(*moved)]
 
     @property
     def notes(self) -> list[str]:
         """Sentences on the processing for reports, after the search for pulsation."""
         shrink, decoder = self.rest.shrink, self.decoder
         shrunk = [f"pictures are downsampled {shrink} times for flow"] if shrink > 1 else []
-        left = [f"left out: {n} of {decoder.decoded} frames {why}" for why, n in decoder.left_out.items()]
+        count = len(decoder.decoded)
+        left = [f"left out: {n} of {count} frames {why}" for why, n in decoder.left_out.items()]
         missed = "" if self.known is None or first_fault(self.findings) else self.known.describe()
         return shrunk + left + ([missed] if missed else [])
 

@@ -22,8 +22,6 @@ from synth.recording_flow.mask import mask_right
 from synth.video.read import Picture
 from synth.video.shrink import shrink_picture
 
-_MOVED_PX = 0.5  # less motion has no information on timing
-
 
 @dataclass(frozen=True)
 class RightVideo:
@@ -49,7 +47,6 @@ class StereoQuality:
     epipolar_px: float  # median row error of stereo matches, at flow's resolution; NaN for a depth camera
     mm_per_px: float  # of the video's own pixels at the tissue in the rest frame, by stereo or depth
     noise_mm: float  # median stated deviation of depth motion over tissue and frames
-    lag: float = 0.0  # share of the motion that the right camera lacks: its pictures are of another moment
 
 
 class Stereo(Protocol):
@@ -92,7 +89,6 @@ class RightCamera:
         self.stereo: StereoTracker | None = None  # from the rest frame on
         self._camera: CameraTracker | None = None  # motion of the right camera
         self._noise: list[float] = []
-        self._lags: list[float] = []
         self._pair: tuple[Rgb, Rgb] | None = None  # of the last tracked frame
 
     @property
@@ -102,8 +98,7 @@ class RightCamera:
             return None
         r, rest = self.stereo.rectified, self.stereo.rest
         scale = self.stereo.distance_mm / r.focal / self._rest.shrink
-        lag = float(np.percentile(np.abs(self._lags), 90)) if self._lags else 0.0
-        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, _median(self._noise), lag)
+        return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, _median(self._noise))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """See `Stereo`."""
@@ -125,8 +120,6 @@ class RightCamera:
         if view is not None:
             hidden |= view.outside(tissue.shape)
         moved = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)
-        if np.percentile(np.abs(frame.flow[tissue]), 98) > _MOVED_PX:
-            self._lags.append(self.stereo.lag)
         self._noise.append(_noise(moved, tissue))
         return replace(frame, right=right, motion=moved)
 

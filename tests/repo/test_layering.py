@@ -14,7 +14,7 @@ INSIDE = {
     "dataset sequence checks publish publish.export engine tune fit cli __main__",
     "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "
     "cli __main__",
-    "bench": "bootstrap recording importers sensor methods tracking scoring cli __main__",
+    "bench": "bootstrap recording importers sensor methods tracking checks scoring cli __main__",
     "evidence": "",
 }
 ORDER = [name for top, names in INSIDE.items() for name in (top, *(f"{top}.{one}" for one in names.split()))]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from fake_recording import Maker, scored, texture
 
-from bench.recording import check, writer
+from bench.checks.check_recording import check_recording
+from bench.recording import writer
 from synth.errors import UserError
 
 Corruption = Callable[[Path], object]
@@ -58,10 +59,10 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Maker(tmp_path_factory.mktemp("intact"))(frames=8)
 
 
-def test_an_intact_recording_has_no_bad_findings(intact: Path, tmp_path: Path) -> None:
+def test_an_intact_recording_has_no_problems(intact: Path, tmp_path: Path) -> None:
     drawn = tmp_path / "tracked.png"
-    states = {finding.state for finding in check.check_recording(intact, picture=drawn)}
-    assert states <= {"ok", "lack"}
+    severities = {finding.severity for finding in check_recording(intact, picture=drawn)}
+    assert severities <= {"ok", "missing"}
     rows, columns = np.array(cv2.imread(str(drawn)).shape[:2]) // (4 * 96, 4 * 128)
     assert (rows, columns) == (2, 3)  # five frames and a legend, enlarged fourfold
 
@@ -71,8 +72,8 @@ def test_a_broken_recording_is_reported(intact: Path, tmp_path: Path, name: str)
     folder = tmp_path / "rec"
     shutil.copytree(intact, folder)
     CASES[name](folder)
-    findings = check.check_recording(folder)
-    assert any(finding.state in ("odd", "bad") for finding in findings)
+    findings = check_recording(folder)
+    assert any(finding.severity in ("warning", "error") for finding in findings)
     try:
         notes: tuple[str, ...] = scored(folder, backend="dis").notes
     except UserError as error:

@@ -9,7 +9,8 @@ import pytest
 from fake_recording import Maker, force_curve, scored
 from scipy.spatial.transform import Rotation
 
-from bench.recording import check, writer
+from bench.checks.check_recording import check_recording
+from bench.recording import writer
 
 EPOCH = 1.7e9
 
@@ -33,8 +34,8 @@ def test_times_since_1970_are_counted_from_the_start(make: Maker) -> None:
     assert one.methods["bump"].scores["mae_mn"] == pytest.approx(
         other.methods["bump"].scores["mae_mn"], abs=1e-3
     )
-    states = {f.what: f.state for f in check.check_recording(stamped)}
-    assert (states["clocks"], states["press"]) == ("ok", "ok")
+    severities = {f.cause: f.severity for f in check_recording(stamped)}
+    assert (severities["clocks"], severities["spans"]) == ("ok", "ok")
 
 
 @pytest.mark.parametrize("stamped", ["frames", "force"])

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from skimage import data
 
+from bench.checks import stereo
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import writer
-from bench.recording.check import judge_stereo
 from bench.recording.folder import open_recording
 from bench.recording.right_pictures import StereoQuality
 from bench.recording.stereo_timing import find_lag
-from bench.tracking.tracking import track_recording
+from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import RecordingFlowSettings
@@ -192,9 +192,11 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)
 
 
-def test_a_baseline_in_metres_is_reported() -> None:
-    (found,) = judge_stereo(StereoQuality(0.024, 0.1, 0.05e-3, 0.01), 0.05)
-    assert found.state == "bad"
+def test_a_baseline_in_metres_is_reported(make: Make) -> None:
+    quality = StereoQuality(0.024, 0.1, 0.05e-3, 0.01)
+    tracked = TrackedRecording(stereo=quality, scale_mm_per_px=0.05)
+    (found,) = stereo.check_scale(open_recording(make("right")), tracked)
+    assert found.severity == "error"
     assert "metres" in found.message
     assert "1000" in found.message
 

@@ -1,4 +1,4 @@
-"""Findings on recordings: the same in `bench check` and `bench score`, and no scores with bad ones."""
+"""Findings on recordings: the same in `bench check` and `bench score`, and no scores with errors."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import pytest
 from fake_recording import Maker, scored, texture
 from typer.testing import CliRunner
 
+from bench.checks.check_recording import check_recording
+from bench.checks.judgement import SENSOR_CHECKS
+from bench.checks.sensor import SensorMotion
 from bench.cli import app
-from bench.recording import check
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
-from bench.sensor.plausibility import judge_sensor
 from learn.cli import app as learn
 
 STATED = {
@@ -25,15 +26,15 @@ STATED = {
 
 @pytest.mark.parametrize("case", STATED)
 def test_wrong_units_are_found_by_check_and_score(make: Maker, case: str) -> None:
-    meta, what = STATED[case]
+    meta, cause = STATED[case]
     folder = make(frames=6, meta=meta)
     result = scored(folder, backend="dis")
-    wrong = [one for one in result.findings if one.state == "bad"]
-    assert [one.what for one in wrong] == [what]
-    assert wrong == [one for one in check.check_recording(folder) if one.state == "bad"]
+    wrong = [one for one in result.findings if one.severity == "error"]
+    assert [one.cause for one in wrong] == [cause]
+    assert wrong == [one for one in check_recording(folder) if one.severity == "error"]
     assert np.isnan(result.methods["bump"].size_mn).all()
     assert headline(result).tiles == ()
-    assert next(iter(as_json(result)["findings"]))["what"] == what
+    assert next(iter(as_json(result)["findings"]))["cause"] == cause
 
 
 @pytest.mark.parametrize(("frames", "young", "code"), [(8, 1.0, 0), (8, 1500.0, 2), (2, 1.0, 2)])
@@ -55,37 +56,51 @@ def test_load_at_the_rest_frame_or_in_a_free_span_is_found_by_check_and_score(
 ) -> None:
     sensor = {"axes": "camera", "low_pass_hz": None, "free_s": free}
     folder = make(frames=12, meta={"rest_frame": rest, "sensor": sensor})
-    odd = [one for one in scored(folder, backend="dis").findings if one.state == "odd"]
-    assert {"rest frame" if rest else "sensor"} <= {one.what for one in odd}
-    assert {one for one in odd if one.what == "rest frame"} <= set(check.check_recording(folder))
+    found = [one for one in scored(folder, backend="dis").findings if one.severity == "warning"]
+    loaded = [one for one in found if one.cause == ("rest frame" if rest else "sensor")]
+    assert loaded
+    assert set(loaded) <= set(check_recording(folder))
 
 
 TIME = np.arange(60) / 10
 PRESS = np.sin(TIME * 1.3)[:, None] ** 2 * [1.0, -2.0, 4.0] + np.sin(TIME)[:, None] ** 4 * [3.0, 1.0, 0.0]
+
+
+def at(time_s: np.ndarray) -> np.ndarray:
+    """`PRESS` at other times (T,): (T, 3)."""
+    return np.stack([np.interp(time_s, TIME, axis) for axis in PRESS.T], axis=1)
+
+
 SENSORS = {
-    "mN for N": (1000 * PRESS, "bad"),
-    "on the tool": (-PRESS, "odd"),
-    "axes permuted": (PRESS[:, [1, 2, 0]], "odd"),
-    "constant": (0 * PRESS + 2.0, "bad"),
-    "saturated": (PRESS.clip(-9, 2.0), "odd"),
-    "0.6 s late": (np.roll(PRESS, 6, axis=0), "odd"),
-    "a clock 8% slow": (np.stack([np.interp(0.92 * TIME, TIME, axis) for axis in PRESS.T], axis=1), "odd"),
-    "backwards": (PRESS[::-1], "odd"),
-    "0.5 s of the video missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "odd"),
+    "mN for N": (1000 * PRESS, "error", "sensor"),
+    "on the tool": (-PRESS, "warning", "sensor"),
+    "axes permuted": (PRESS[:, [1, 2, 0]], "warning", "sensor"),
+    "constant": (0 * PRESS + 2.0, "error", "sensor"),
+    "saturated": (PRESS.clip(-9, 2.0), "warning", "sensor"),
+    "0.6 s late": (np.roll(PRESS, 6, axis=0), "warning", "clocks"),
+    "a clock 8% slow": (at(0.92 * TIME), "warning", "clocks"),
+    "backwards": (PRESS[::-1], "warning", "clocks"),
+    "0.5 s of the video missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "warning", "clocks"),
 }
+
+
+def findings(axes: np.ndarray, methods: list[np.ndarray]) -> set[tuple[str, str]]:
+    """Severity and cause of findings on a sensor (T, 3) next to the motion of `PRESS` and forces (T, 3)."""
+    sensor = SensorMotion(TIME, axes, np.linalg.norm(PRESS, axis=1) ** 0.9, tuple(methods), 3)
+    return {(one.severity, one.cause) for check in SENSOR_CHECKS for one in check(sensor)}
 
 
 @pytest.mark.parametrize("case", SENSORS)
 def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
-    moved, methods = np.linalg.norm(PRESS, axis=1) ** 0.9, [0.6 * PRESS, 1.5 * PRESS]
-    assert judge_sensor(TIME, PRESS, moved, methods, 3) == []
-    assert judge_sensor(TIME, PRESS, moved, [60 * PRESS], 3) == [], "one method may be wrong itself"
+    methods = [0.6 * PRESS, 1.5 * PRESS]
+    assert findings(PRESS, methods) == set()
+    assert findings(PRESS, [60 * PRESS]) == set(), "one method may be wrong itself"
     spiked = PRESS + 400 * (np.arange(len(PRESS)) == 3)[:, None]
-    assert "bad" not in {one.state for one in judge_sensor(TIME, spiked, moved, methods, 3)}
     noise = np.random.default_rng(1).normal(0, 0.3, PRESS.shape)
-    assert "bad" not in {one.state for one in judge_sensor(TIME, noise, moved, methods, 3)}
-    wrong, state = SENSORS[case]
-    assert state in {one.state for one in judge_sensor(TIME, wrong, moved, methods, 3)}
+    for doubtful in (spiked, noise):
+        assert "error" not in {severity for severity, _ in findings(doubtful, methods)}
+    wrong, severity, cause = SENSORS[case]
+    assert (severity, cause) in findings(wrong, methods)
 
 
 BLACK = np.zeros((96, 128, 3), np.uint8)

@@ -60,8 +60,8 @@ def test_a_camera_bump_is_removed_from_the_motion_and_reported() -> None:
     assert max(np.median(np.abs(one.flow[OPENING])) for one in frames) < 0.05
     assert all(one.trusted for one in frames)
     # The pictures have no noise and are therefore reported as repeated too.
-    (finding,) = [one for one in video.findings if one.what == "camera"]
-    assert finding.state == "odd"
+    (finding,) = [one for one in video.findings if one.cause == "camera"]
+    assert finding.severity == "warning"
     assert all(part in finding.message for part in ("5 px", "0.375 s"))
 
 

@@ -127,8 +127,8 @@ def settings(pulse: bool = True) -> RecordingFlowSettings:
 def test_a_bump_is_removed_and_reported() -> None:
     video = VideoPass(footage(np.array([0.0, 0, 0, 5, 5, 5])), settings(pulse=False))
     assert max(np.median(np.abs(one.flow)) for one in video.frames()) < 0.05
-    (finding,) = [one for one in video.findings if one.what == "camera"]
-    assert finding.state == "odd"
+    (finding,) = [one for one in video.findings if one.cause == "camera"]
+    assert finding.severity == "warning"
     assert all(part in finding.message for part in ("5 px", "0.3 s"))
 
 
@@ -149,7 +149,7 @@ def test_the_bump_of_a_recording_is_removed_in_the_second_pass() -> None:
     found = []
     for video in passes(footage(shift), settings()):
         last = [np.median(one.flow, axis=(0, 1))[1] for one in video.frames()]
-        found.append((last, [one.what for one in video.findings].count("camera")))
+        found.append((last, [one.cause for one in video.findings].count("camera")))
     (first, unreported), (second, reported) = found
     assert first[-1] == pytest.approx(5, abs=0.1)
     assert np.abs(second).max() < 0.05

@@ -1,0 +1,1 @@
+"""Checks of a recording: what is usable, missing, doubtful or wrong."""

@@ -1,0 +1,66 @@
+"""The list of all checks, and the findings of a recording by it, for `bench check` and `bench score`.
+
+A new check is a function in the file of its subject and an entry in one of these lists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from bench.checks import clocks, files, scale, sensor, stereo, times
+from bench.checks.sensor import SensorMotion
+from bench.recording.folder import Recording
+from bench.tracking.tracking import TrackedRecording
+from synth.recording_flow.finding import Finding, by_severity, first_fault
+
+RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
+    files.check_notes,
+    scale.check_stiffness,
+    scale.check_scale,
+    files.check_tissue,
+    sensor.check_samples,
+    sensor.check_free_spans,
+)
+"""Checks of the files alone."""
+
+TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ...] = (
+    files.check_pictures,
+    files.check_tool,
+    files.check_tracking,
+    scale.check_field_of_view,
+    stereo.check_pairing,
+    stereo.check_quality,
+    stereo.check_scale,
+    times.check_times,
+    times.check_spans,
+    clocks.check_overlap,
+    clocks.check_margin,
+    sensor.check_rest_frame,
+)
+"""Checks of the pictures, of which a few or all are tracked."""
+
+SENSOR_CHECKS: tuple[Callable[[SensorMotion], list[Finding]], ...] = (
+    sensor.check_unit,
+    sensor.check_axes,
+    clocks.check_motion,
+    sensor.check_constant,
+)
+"""Checks of the aligned sensor against the motion and the methods' forces in all tracked frames."""
+
+
+def judge(
+    recording: Recording, tracked: TrackedRecording, sensor: SensorMotion | None = None
+) -> list[Finding]:
+    """Findings of every check, errors first.
+
+    Args:
+        recording: the opened recording.
+        tracked: its tracked frames; if tracking failed, with the decoded pictures only.
+        sensor: sensor and motion at the tracked frames, if there is a sensor and methods were applied.
+    """
+    found = [one for check in RECORDING_CHECKS for one in check(recording)]
+    found += [one for check in TRACKED_CHECKS for one in check(recording, tracked)]
+    # Forces that are not valid contradict any sensor.
+    if sensor is not None and not first_fault(found):
+        found += [one for check in SENSOR_CHECKS for one in check(sensor)]
+    return by_severity(found)

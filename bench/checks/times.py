@@ -1,0 +1,64 @@
+"""Checks of the frames' times and of the spans for calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.recording.folder import Recording
+from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
+from bench.tracking.tracking import TrackedRecording
+from synth.recording_flow.finding import Finding
+
+# Chosen by hand.
+_GAP = 3.0  # median intervals
+_RATES_HZ = 0.5, 1000.0  # of frames whose times are in seconds
+_TRACKED_HZ = 10.0  # default rate of tracked frames
+_LEAST_PRESS = 5  # frames of a press that determine its gain
+
+
+def check_times(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on the frames' times: missing, backwards, with gaps or in another unit."""
+    t = rising_times(tracked)
+    if len(t) < 2:
+        return [Finding("error", "times", "fewer than two frames have a time")]
+    # From first to last frame: the median interval misleads where stamps come in bursts.
+    steps, rate = np.diff(t), (len(t) - 1) / (t[-1] - t[0])
+    found = [Finding("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")]
+    timeless = sum(time_s is None for _, time_s in tracked.decoded)
+    back = len(tracked.decoded) - timeless - len(t)
+    if timeless or back:
+        message = f"{timeless} frames without a time, {back} backwards in time"
+        found.append(Finding("warning", "times", message))
+    if gaps := int((steps > _GAP * np.median(steps)).sum()):
+        found.append(Finding("warning", "times", f"{gaps} gaps, the longest {steps.max():.3g} s"))
+    if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+        message = f"{rate:.3g} frames per second: are the times in seconds?"
+        found.append(Finding("warning", "times", message))
+    return found
+
+
+def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on the spans for calibration: too short, or outside the video."""
+    meta, t, found = recording.meta, rising_times(tracked), []
+    if len(t) < 2:
+        return []
+    rate = min((len(t) - 1) / (t[-1] - t[0]), _TRACKED_HZ)
+    clock = meta.sync.calibration_s if meta.sync.method == "correlate" else None
+    for name, span, frames in (
+        ("sync.calibration_s", clock, LEAST_INTERVALS),
+        ("sensor.turn_s", meta.sensor.turn_s, LEAST_TURNING),
+        ("press_s", meta.press_s, _LEAST_PRESS),
+    ):
+        if span is not None:
+            inside_s = max(min(span[1], t[-1]) - max(span[0], t[0]), 0.0)
+            message = f"{name} covers {inside_s:.3g} s of video; at least {frames / rate:.3g} s are needed"
+            found.append(Finding("ok" if inside_s >= frames / rate else "warning", "spans", message))
+    return found
+
+
+def rising_times(tracked: TrackedRecording) -> NDArray[np.float64]:
+    """Times (T,) [s] of the decoded frames whose time is later than all before."""
+    t = np.array([time_s for _, time_s in tracked.decoded if time_s is not None], np.float64)
+    latest = np.maximum.accumulate(np.append(-np.inf, t[:-1])) if len(t) else t
+    return np.asarray(t[t > latest], np.float64)
