@@ -22,7 +22,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     """The recording's video; `mm_per_px`: scale of its own pixels."""
     depth: RightVideo | DepthVideo | None = None
     if recording.right:
-        depth = RightVideo(recording.right_frames, lambda size: _rig(recording, size))
+        depth = RightVideo(recording.right_frames, lambda size: _rig(recording, size), str(recording.folder))
     elif recording.depths:
         depth = DepthVideo(
             lambda frame, size: _depth(recording, frame, size), lambda size: _K(recording, size)

@@ -23,20 +23,20 @@ from typing import Protocol
 import numpy as np
 
 from synth.errors import UserError
-from synth.flow.estimator import Flags
 from synth.recording_flow.decode import Decoder, Footage, RecordingFlowSettings
 from synth.recording_flow.detrend import Detrend, GatherMotion
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.flow import LocalFlow, with_flow
+from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
-from synth.recording_flow.inspection import Inspection
 from synth.recording_flow.mask import Mask
 from synth.recording_flow.pulse import PulseEstimate, PulseSearch
 from synth.recording_flow.register_camera import RegisterCamera, RegisterOnTissue
-from synth.recording_flow.stereo import open_stereo
 from synth.system.stopwatch import Stopwatch
 from synth.video.read import Picture
+
+_SEARCHED = 12  # the first frames, and then one in this many, are searched for foreground
 
 
 class Pace(Protocol):
@@ -109,51 +109,32 @@ class VideoPass:
         watch: Stopwatch | None = None,
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
-        """Decodes the rest frame and starts all stages with it.
+        """Decodes the rest frame, with which all stages start; arguments and errors as for `passes`, and:
 
         Args:
-            footage: the video.
-            settings: of the tracking.
             known: pulsation and camera motion from a first pass, removed from every frame.
-            flow: computes the flow and is closed by the caller; None: in this process.
             pace: of a stream; None: every frame is processed. Flow runs once before the stream starts, so
                 that compilation does not add to the latency.
-            watch: collects the time spent; None: a new one.
-            progress: called after every decoded picture with their number.
-
-        Raises:
-            UserError: as `passes`.
         """
-        self.watch = watch or Stopwatch()
+        self.watch, self.known, self.summary = watch or Stopwatch(), known, TrackingSummary()
         self.decoder = Decoder(footage, settings, self.watch, progress)
-        self.rest, self.known = self.decoder.rest, known
+        self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
-        rest, mm_per_px, source = self.rest, footage.mm_per_px * self.rest.shrink, footage.depth
         self._mask = Mask(rest, settings.masks, footage.tool)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
-        path = None if known is None else known.camera
-        self._register = None if rest.fault else RegisterCamera(rest, _masked(self._first), path)
-        self.stereo = open_stereo(source, rest, settings.masks, footage.name) if source else None
-        self._inspection = Inspection(rest, self.stereo, foreground=pace is None and not rest.fault)
+        path, pulse = (None, None) if known is None else (known.camera, known.pulse)
+        self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
+        self.stereo = None if footage.depth is None else footage.depth.open(rest, settings.masks)
+        self._foreground: ForegroundSearch | None = None
+        if pace is None and not rest.fault:
+            self._foreground = ForegroundSearch(rest.tissue, rest.shrink)
+        mm_per_px = footage.mm_per_px * rest.shrink
         self._gather = GatherMotion(rest, mm_per_px) if settings.pulse and known is None else None
+        self._detrend = None if pulse is None else Detrend(pulse, mm_per_px)
         self._on_tissue: RegisterOnTissue | None = None
         if self._fills_picture and self._gather is None and known is None:
             self._on_tissue = RegisterOnTissue(rest)
-        pulse = None if known is None else known.pulse
-        self._detrend = None if pulse is None else Detrend(pulse, mm_per_px)
-        after: dict[str, Stage | None] = {
-            "camera": self._on_tissue,
-            "stereo": self.stereo,
-            "mask": self._inspection,
-            "pulse": self._detrend or self._gather,
-        }
-        self._after = {name: stage for name, stage in after.items() if stage is not None}
-
-    @property
-    def summary(self) -> TrackingSummary:
-        """Masks and lost frames so far."""
-        return self._inspection.summary
 
     @property
     def removed(self) -> PulseEstimate | None:
@@ -211,11 +192,8 @@ class VideoPass:
     def _prepare(self, picture: Picture, register: RegisterCamera) -> FrameMotion:
         """A frame after the stages before flow."""
         began = time.perf_counter()
-        frame = self.decoder.process(picture)
-        with self.watch.stage("camera"):
-            frame = register.process(frame)
-        with self.watch.stage("mask"):
-            frame = self._mask.process(frame)
+        frame = self._process("camera", register, self.decoder.process(picture))
+        frame = self._process("mask", self._mask, frame)
         return replace(frame, masking_s=time.perf_counter() - began)
 
     def _is_ready(self, flow: Future[FrameMotion], time_s: float) -> bool:
@@ -234,10 +212,26 @@ class VideoPass:
 
     def _finish(self, frame: FrameMotion) -> FrameMotion:
         """A frame after the stages after flow."""
-        for name, stage in self._after.items():
-            with self.watch.stage(name):
-                frame = stage.process(frame)
-        return frame
+        frame = self._process("camera", self._on_tissue, frame)
+        frame = self._process("stereo", self.stereo, frame)
+        if not frame.is_rest:
+            self.summary.add(frame, self.rest.tissue)
+        self._search_foreground(frame)
+        return self._process("pulse", self._detrend or self._gather, frame)
+
+    def _process(self, name: str, stage: Stage | None, frame: FrameMotion) -> FrameMotion:
+        if stage is None:
+            return frame
+        with self.watch.stage(name):
+            return stage.process(frame)
+
+    def _search_foreground(self, frame: FrameMotion) -> None:
+        """Searches the first frames, and then each twelfth, for foreground."""
+        count = self.summary.frames
+        if self._foreground is not None and (count <= _SEARCHED or count % _SEARCHED == 0):
+            with self.watch.stage("mask"):
+                depth = self.stereo.depth_mm() if self.stereo is not None and frame.trusted else None
+                self._foreground.add(frame, depth)
 
     def search(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
         """What a second pass is to remove, searched after the last frame; None: this pass did not gather it.
@@ -259,7 +253,8 @@ class VideoPass:
             fault = "the picture never changes"
         bad = [Finding("error", "pictures", fault)] if fault else []
         pictures = [] if fault else self.decoder.faults.findings()
-        found = [*bad, *self.rest.findings, *self._inspection.findings, *pictures]
+        foreground = [] if self._foreground is None else self._foreground.findings
+        found = [*bad, *self.rest.findings, *foreground, *pictures]
         moved = [one.describe() for one in (self._register, self._on_tissue) if one is not None]
         return found + [Finding("warning", "camera", text) for text in chain(*moved)]
 
@@ -272,9 +267,3 @@ class VideoPass:
         left = [f"left out: {n} of {count} frames {why}" for why, n in decoder.left_out.items()]
         missed = "" if self.known is None or first_fault(self.findings) else self.known.describe()
         return shrunk + left + ([missed] if missed else [])
-
-
-def _masked(frame: FrameMotion) -> Flags:
-    """(h, w) what is or may be masked in a frame."""
-    assert frame.proposal is not None
-    return frame.proposal.either | frame.proposal.known

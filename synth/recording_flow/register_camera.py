@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from synth.flow.confidence import add_deviation
-from synth.flow.estimator import Flags
 from synth.recording_flow.camera_motion import CameraPath, CameraTracker, Course, Similarity, describe_course
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame
 from synth.recording_flow.pulse import in_cells
@@ -21,9 +20,11 @@ class RegisterCamera:
     tracked: a second pass takes the path that was found on the tissue in the first.
     """
 
-    def __init__(self, rest: RestFrame, blocked: Flags, path: CameraPath | None) -> None:
-        """`blocked`: (h, w) mask of instruments and highlights in the rest frame; `path`: of a first pass."""
+    def __init__(self, rest: RestFrame, first: FrameMotion, path: CameraPath | None) -> None:
+        """`first`: the rest frame with its mask proposals; `path`: from a first pass."""
         self._rest, self._path = rest, path
+        assert first.proposal is not None
+        blocked = first.proposal.either | first.proposal.known
         self._tracker = CameraTracker(rest.rgb, rest.tissue, blocked)
         self.is_blind = self._tracker.is_blind
         self._course: Course = []  # along the path

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Protocol
 
 import numpy as np
 
@@ -29,6 +28,11 @@ class RightVideo:
 
     pictures: Callable[[], Iterable[Picture]]  # in order, with the numbers of the left camera's frames
     rig: Callable[[Size], StereoRig]  # of pictures of that size
+    name: str  # for messages
+
+    def open(self, rest: RestFrame, kind: str) -> RightCamera:
+        """The stage for a video with this rest frame; `kind`: of masks."""
+        return RightCamera(self, rest, kind)
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,10 @@ class DepthVideo:
 
     read: Callable[[FrameMotion, Size], Map | None]  # depth (H, W) mm of a frame, 0: unknown; None: missing
     K: Callable[[Size], Floats]  # (3, 3) of pictures of that size
+
+    def open(self, rest: RestFrame, kind: str) -> DepthCamera:
+        """The stage for a video with this rest frame; depth needs no masks of any `kind`."""
+        return DepthCamera(self, rest)
 
 
 @dataclass(frozen=True)
@@ -49,42 +57,12 @@ class StereoQuality:
     noise_mm: float  # median stated deviation of depth motion over tissue and frames
 
 
-class Stereo(Protocol):
-    """The stage, with either kind of camera."""
-
-    def process(self, frame: FrameMotion) -> FrameMotion:
-        """The frame with motion in three dimensions; without a picture of that camera it is lost.
-
-        The first frame must be the rest frame.
-
-        Raises:
-            UserError: missing rest picture, too few or unreadable pictures, a calibration that doesn't fit.
-        """
-        ...
-
-    def depth_mm(self) -> Map | None:
-        """Depth (h, w) along the optical axis in the last frame, NaN where unknown; None: unknown."""
-        ...
-
-    @property
-    def quality(self) -> StereoQuality | None:
-        """The quality over all frames so far; None if the rest frame could not be used."""
-        ...
-
-
-def open_stereo(source: RightVideo | DepthVideo, rest: RestFrame, kind: str, name: str) -> Stereo:
-    """The stage for a camera; `kind`: of masks; `name`: of the video, for messages."""
-    if isinstance(source, RightVideo):
-        return RightCamera(source, rest, kind, name)
-    return DepthCamera(source, rest)
-
-
 class RightCamera:
-    """Motion in three dimensions from a right camera, see `Stereo`."""
+    """Motion in three dimensions from a right camera."""
 
-    def __init__(self, source: RightVideo, rest: RestFrame, kind: str, name: str) -> None:
-        """Reads nothing yet; arguments as for `open_stereo`."""
-        self._source, self._rest, self._kind, self._name = source, rest, kind, name
+    def __init__(self, source: RightVideo, rest: RestFrame, kind: str) -> None:
+        """Reads nothing yet; `kind`: of masks, one of `MASKS`."""
+        self._source, self._rest, self._kind, self._name = source, rest, kind, source.name
         self._pictures: Iterator[Picture] = iter(source.pictures())
         self.stereo: StereoTracker | None = None  # from the rest frame on
         self._camera: CameraTracker | None = None  # motion of the right camera
@@ -93,7 +71,7 @@ class RightCamera:
 
     @property
     def quality(self) -> StereoQuality | None:
-        """See `Stereo`."""
+        """The quality over all frames so far; None if the rest frame could not be used."""
         if self.stereo is None:
             return None
         r, rest = self.stereo.rectified, self.stereo.rest
@@ -101,7 +79,11 @@ class RightCamera:
         return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, _median(self._noise))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
-        """See `Stereo`."""
+        """The frame with motion in three dimensions; without a picture of that camera it is lost.
+
+        The first frame must be the rest frame. Raises UserError for a missing rest picture, too few or
+        unreadable pictures, and a calibration that doesn't fit.
+        """
         if not frame.trusted or (right := self._right(frame)) is None:
             return _lost(frame)
         tissue = self._rest.tissue
@@ -124,7 +106,7 @@ class RightCamera:
         return replace(frame, right=right, motion=moved)
 
     def depth_mm(self) -> Map | None:
-        """See `Stereo`; by stereo matching of the last frame's own pictures."""
+        """Depth (h, w) in the last frame, NaN where unknown, by stereo matching; None: unknown."""
         if self.stereo is None or self._pair is None:
             return None
         r, anywhere = self.stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
@@ -163,10 +145,9 @@ class RightCamera:
 
 
 class DepthCamera:
-    """Motion in three dimensions from a depth camera, see `Stereo`."""
+    """Motion in three dimensions from a depth camera."""
 
     def __init__(self, source: DepthVideo, rest: RestFrame) -> None:
-        """Reads nothing yet; arguments as for `open_stereo`."""
         self._source, self._rest = source, rest
         self._tracker: DepthTracker | None = None  # from the rest frame on
         self._noise: list[float] = []
@@ -174,14 +155,14 @@ class DepthCamera:
 
     @property
     def quality(self) -> StereoQuality | None:
-        """See `Stereo`."""
+        """The quality over all frames so far; None if the rest frame could not be used."""
         if self._tracker is None:
             return None
         scale = self._tracker.distance_mm / float(self._tracker.K[0, 0]) / self._rest.shrink
         return StereoQuality(np.nan, np.nan, scale, _median(self._noise))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
-        """See `Stereo`."""
+        """The frame with motion in three dimensions, see `RightCamera.process`."""
         if not frame.trusted or (large := self._source.read(frame, self._rest.size)) is None:
             return _lost(frame)
         tissue, depth = self._rest.tissue, _shrink_depth(large, self._rest.shrink)
@@ -196,7 +177,7 @@ class DepthCamera:
         return replace(frame, motion=moved)
 
     def depth_mm(self) -> Map | None:
-        """See `Stereo`."""
+        """Depth (h, w) in the last frame, NaN where unknown; None: unknown."""
         return self._last
 
 
