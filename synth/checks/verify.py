@@ -58,6 +58,7 @@ class Check:
     meaning: str
     count: int = 0
     bad: int = 0
+    skipped: int = 0  # sequences that lack what it needs, or in which there is nothing to measure
     worst: float = 0.0
     limit: float = 0.0
     unit: str = "-"  # of worst and limit
@@ -98,10 +99,10 @@ class VerifyReport:
 
     def lines(self) -> list[str]:
         """Lines of text: a table of the checks with their worst measures, then every failure."""
-        rows = [("check", "count", "bad", "worst", "limit", "unit", "CPU s", "where")]
+        rows = [("check", "count", "bad", "skipped", "worst", "limit", "unit", "CPU s", "where")]
         for check in self.checks:
             worst = (f"{check.worst:.3g}", f"{check.limit:.3g}", check.unit) if check.offender else ("",) * 3
-            counts = (check.name, str(check.count), str(check.bad))
+            counts = (check.name, str(check.count), str(check.bad), str(check.skipped))
             rows.append((*counts, *worst, f"{check.cpu_s:.2f}", check.offender))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         table = []
@@ -127,9 +128,12 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     if fast and len(sealed) > _FAST_SEQUENCES:
         sealed = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
     for key in sealed:
-        path = location.store(folder.root, key)
+        path, measured = location.store(folder.root, key), set[str]()
         for name, measure in check_sequence(path, described["identity"], watch, fast=fast):
             checks[name].add(measure, path.name)
+            measured.add(name)
+        for name in INVARIANTS.keys() - measured:
+            checks[name].skipped += 1
     for name, check in checks.items():
         check.cpu_s = watch.cpu_s(name)
     return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
