@@ -5,6 +5,7 @@ from .engine.run import Summary as Summary
 from .engine.run import open_dataset as open_dataset
 from .engine.run import render_job as render_job
 from .errors import UserError as UserError
+from .fem.deformation import Deformation as Deformation
 from .fem.tool_gesture import ToolMotion as ToolMotion
 from .flow.estimator import Estimator as Estimator
 from .flow.track import Track as Track
@@ -14,9 +15,11 @@ from .job.laws import add_law as add_law
 from .job.reader import load_job as load_job
 from .job.schema import Job as Job
 from .render.camera.camera import Camera as Camera
+from .sequence.mechanics import Mechanics as Mechanics
 from .sequence.pipeline import write_scene as write_scene
 from .sequence.scenario import Scenario as Scenario
 from .sequence.scenario import draw_scenario as draw_scenario
 from .sequence.scene import Frame as Frame
+from .sequence.scene import RestScene as RestScene
 from .sequence.scene import Scene as Scene
-from .sequence.scene import simulate as simulate
+from .sequence.simulation import simulate as simulate

@@ -151,7 +151,7 @@ def compute(job: Job, index: int, folder: Path, progress: StageCallback) -> None
         writer.put_frame("traction", t, rng.normal(size=(*size, 3)))
     gesture = {"kind": "pull", "load": 0.1}
     writer.seal(
-        scenario={"index": index, "family": "healthy", "gesture": gesture},
+        scenario={"index": index, "family": "healthy", "gestures": [gesture]},
         scale_mm_per_px=0.1,
         young_kpa=1.0,
         poisson=0.4,

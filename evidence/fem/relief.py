@@ -15,7 +15,7 @@ from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.job.schema import Job
-from synth.sequence import mechanics, scenario
+from synth.sequence.scene import at_rest
 
 Row = dict[str, Any]
 _JOB = Job(sequences=1000)
@@ -38,15 +38,15 @@ def main(out: Path = report.RESULTS / "fem/relief", scenes: int = 40, tets: str 
 
 def measure_scene(index: int, count: int) -> Row:
     """Largest and load-weighted mean displacement [mm] of a scene at full load, reached in two steps."""
-    case = scenario.draw_scenario(_JOB, index)
-    surface, _ = mechanics.cortex(_JOB, case)
-    gesture, height = case.gesture, HeightMap(surface.pia, surface.extent_mm)
+    rest = at_rest(_JOB, index)
+    case, surface = rest.scenario, rest.surface
+    gesture, height = case.gestures[0], HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
     volume = tetrahedra.block(_JOB.anatomy, count, gesture.focus, height)
     moved = tool_gesture.trajectory(gesture, _JOB.frames)
     full = int(moved.load.argmax())
     moved = tool_gesture.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])
-    area = surface_embedding.vertex_area(surface.vertices, surface.faces)
+    area = rest.vertex_area
     traction = tool_gesture.tractions(gesture, moved, surface.vertices, area)[0]
     force = area[:, None] * traction / case.tissue.young_kpa
     embedding = surface_embedding.embed(volume, surface.vertices)

@@ -38,7 +38,7 @@ from synth.flow.stereo.track import Moved, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
 from synth.job import reader
-from synth.sequence.scene import simulate
+from synth.sequence.simulation import simulate
 
 Pairs = tuple[tuple[int, int], ...]
 Frames = dict[str, Any]  # arrays of a sequence, by name

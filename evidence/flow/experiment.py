@@ -24,7 +24,7 @@ from synth.flow.estimator import create
 from synth.flow.track import Tracker
 from synth.flow.tvl1 import Tvl1
 from synth.job import reader
-from synth.sequence.scene import simulate
+from synth.sequence.simulation import simulate
 
 Row = dict[str, Any]
 _OOD = report.CHECKOUT / "evidence/curves/mission-ood.yaml"

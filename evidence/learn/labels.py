@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from evidence import cache as stored
 from learn.data.clips import Clip
 from learn.data.grid import Grid, Resampler, centre, settled
-from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy import rim
 from synth.render.camera import camera
-from synth.sequence import mechanics, scenario
+from synth.sequence.simulation import simulate
 
 FINE = 128  # least cells along the edge of the grid on which labels are made
 
@@ -79,12 +78,10 @@ def key(job: Job, index: int, grid: Grid) -> str:
 
 def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     """One sequence of a job: deformed, projected, resampled on the grid."""
-    case = scenario.draw_scenario(job, index)
-    view = camera.place(case.view, job.render)
-    surface, tets = mechanics.build(job, case)
-    motion = mechanics.move(job, case, surface, tets)
+    scene = simulate(job, index)
+    case, view, surface, motion = scene.scenario, scene.view, scene.surface, scene.motion
     frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.appearance, view.mm_per_px).shape
-    still = truth.trace_rest(view, Shape(surface.vertices, surface.faces), frame)
+    still = truth.trace_rest(view, scene.shape, frame)
     resample = Resampler(
         (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid
     )
@@ -93,7 +90,7 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     density = np.empty((job.frames, 3, grid.size, grid.size), np.float32)
     rest = None
     for t in range(job.frames):
-        place = truth.at_rest_pixels(still, surface.faces, motion.rest + motion.displacement[t])
+        place = truth.at_rest_pixels(still, surface.faces, surface.vertices + motion.displacement[t])
         pixel = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
         rest = pixel if rest is None else rest
         flow = np.where(still.tissue[..., None], pixel - rest, 0.0).transpose(2, 0, 1)
@@ -107,7 +104,7 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
         content_hash=name,
         group=str(case.relief.seed),
         family=case.family,
-        gesture=case.gesture.kind,
+        gesture=case.gestures[0].kind,
         young_kpa=case.tissue.young_kpa,
         mask=mask,
         displacement={"ideal": moved},

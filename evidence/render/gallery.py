@@ -95,10 +95,10 @@ def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, capt
     rest = at_rest(job)
     case = rest.scenario
     appearance = replace(
-        case.appearance, rim_seed=_seed_of(kind, case.gesture.kind), scenery=job.render.scenery
+        case.appearance, rim_seed=_seed_of(kind, case.gestures[0].kind), scenery=job.render.scenery
     )
-    scene = replace(rest, scenario=replace(case, appearance=appearance, further=()))
-    state = SceneState(rest.surface.vertices, *poised(case.gesture, rest.surface))
+    scene = replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1]))
+    state = SceneState(rest.surface.vertices, *poised(case.gestures[0], rest.surface))
     shot = scene.renderer.render(state, scenario.frame_seeds(job, 0)[0])
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
     cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)

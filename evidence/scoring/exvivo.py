@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from bench.recording import writer
 from synth.errors import UserError
 from synth.fem import solver, tool_gesture
+from synth.fem.deformation import Deformation
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
-from synth.fem.solver import Deformation
 from synth.geometry.triangles import Shape
 from synth.job import schema as jobs
 from synth.render.anatomy.surface import CortexSurface
@@ -147,7 +147,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
-        vertices, tips, shafts = _pose(motion, gesture, course, at, rng)
+        vertices, tips, shafts = _pose(scene.shape, motion, gesture, course, at, rng)
         shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
         pictures.append(shot.rgb)
         if shot.rgb_right is not None:
@@ -227,7 +227,12 @@ def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
 
 
 def _pose(
-    motion: Deformation, gesture: tool_gesture.Gesture, course: _Course, at: int, rng: np.random.Generator
+    rest: Shape,
+    motion: Deformation,
+    gesture: tool_gesture.Gesture,
+    course: _Course,
+    at: int,
+    rng: np.random.Generator,
 ) -> tuple[Floats, Floats, Floats]:
     """Surface, tips and shafts, interpolated between two levels of the path, with a tremor of 0.1 mm."""
     levels = np.linalg.norm(motion.force, axis=1) / gesture.force_mn
@@ -236,14 +241,12 @@ def _pose(
     width = max(levels[above] - levels[above - 1], 1e-9)
     part = float(np.clip((strain - levels[above - 1]) / width, 0, 1))
     moved = (1 - part) * motion.displacement[above - 1] + part * motion.displacement[above]
-    places = tool_gesture.anchors(
-        gesture, tool_gesture.trajectory(gesture, 2), Shape(motion.rest, motion.faces)
-    )
+    places = tool_gesture.anchors(gesture, tool_gesture.trajectory(gesture, 2), rest)
     corners, weights = (of[0] for of in places)
-    touched = np.einsum("kc,kcd->kd", weights, (motion.rest + moved)[corners])
+    touched = np.einsum("kc,kcd->kd", weights, (rest.vertices + moved)[corners])
     shafts = motion.shaft[-1]
     tips = touched + gesture.hover_mm * course.away[at] * shafts + 0.1 * rng.normal(size=(1, 3))
-    return motion.rest + moved, tips, shafts
+    return rest.vertices + moved, tips, shafts
 
 
 def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Generator) -> float:

@@ -17,6 +17,7 @@ from safetensors.numpy import save_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
 from synth.dataset import provenance
+from synth.dataset.attributes import first_gesture
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError, as_user_error
@@ -175,7 +176,7 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "content_hash": sequence.attrs["content_hash"],
         "group": name_anatomy(sequence.attrs),
         "family": scenario.get("family") or "",
-        "gesture": (scenario.get("gesture") or {}).get("kind") or "",
+        "gesture": first_gesture(scenario).get("kind") or "",
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "opening": sequence.attrs.get("opening_id") or "",
         "membrane": ("intact" if tissue.get("membrane") else "stripped") if tissue else "unknown",

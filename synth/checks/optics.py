@@ -46,7 +46,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if len(instruments) != 1:
         return
     at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
-    footprint = float(sequence.attrs["scenario"]["gesture"]["footprint_mm"])
+    footprint = float(sequence.attrs["scenario"]["gestures"][0]["footprint_mm"])
     poses = camera_poses(sequence)
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     rows, columns = np.indices(sequence.size)

@@ -57,9 +57,9 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     mechanics = sequence.attrs.get("mechanics") or {}
     raised = mechanics.get("pulse_work_mn_mm")
     known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
-    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics:
+    instruments = mechanics.get("instruments")
+    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics or not instruments:
         return
-    instruments = mechanics["instruments"]
     if raised is not None and len(instruments) > 1:
         return  # the instruments' shares of the pulse may cancel, but not their uncertainties
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)

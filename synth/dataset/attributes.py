@@ -20,6 +20,9 @@ _Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 _Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Triple = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Square = Annotated[list[_Triple], Field(min_length=3, max_length=3)]
+_Pose = Annotated[
+    list[Annotated[list[_Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
+]
 _Edge = Annotated[int, Field(ge=1, le=LARGEST_PIXELS)]
 
 
@@ -30,8 +33,7 @@ class _Gesture(BaseModel):
 
 class _Scenario(BaseModel):
     family: str | None = None
-    gesture: _Gesture | None = None
-    further: list[_Gesture] | None = None
+    gestures: list[_Gesture] = []
 
 
 class Attributes(BaseModel):
@@ -53,6 +55,7 @@ class Attributes(BaseModel):
     distortion: Annotated[list[_Number], Field(max_length=14)] | None = None
     rotation: _Square | None = None
     translation: _Triple | None = None
+    mesh_to_world: _Pose | None = None  # from a user's brain mesh to world axes
     scenario: _Scenario | None = None
     mechanics: dict[str, Any] | None = None
     summary: dict[str, _Number | dict[str, _Number]] = {}
@@ -73,7 +76,11 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
         raise UserError(f"{where}: {width} x {height} pixels per frame is too large")
 
 
+def first_gesture(scenario: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The first instrument's gesture in a sequence's attribute `scenario`; empty without instruments."""
+    return next(iter(scenario.get("gestures", ())), {})
+
+
 def name_gestures(scenario: Mapping[str, Any]) -> str:
     """Gestures of all instruments in a sequence's attribute `scenario`: "pull + push"; may be empty."""
-    each = [scenario.get("gesture") or {}, *(scenario.get("further") or ())]
-    return " + ".join(one["kind"] for one in each if one.get("kind"))
+    return " + ".join(one["kind"] for one in scenario.get("gestures", ()) if one.get("kind"))

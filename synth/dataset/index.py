@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
-from synth.dataset.attributes import name_gestures
+from synth.dataset.attributes import first_gesture, name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
@@ -77,7 +77,8 @@ COLUMNS = (
                 source=lambda one: name_gestures(one.attrs.get("scenario", {})) or None),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
-    IndexColumn("load", _REAL, "peak load F/(E a^2)", source="scenario.gesture.load", title="Load F/(E a²)"),
+    IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
+                source=lambda one: first_gesture(one.attrs.get("scenario", {})).get("load")),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
     IndexColumn("peak_flow_px", _REAL, "largest true motion", "px", "summary.peak_flow_px"),
     IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm",

@@ -113,7 +113,7 @@ def march_in_time(
     skull = replace(system, hold=tets.hold, slip=tets.slip)
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-    size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm
+    size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm or 1.0
     past, before = _PronyHistory(clock), np.zeros_like(peak)
 
     def step(number: int, load: Floats, u: Floats) -> tuple[Floats, State, float]:

@@ -30,7 +30,7 @@ class Brain:
     """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
 
     shape: Shape
-    origin: Floats  # (3,) mm, the craniotomy's centre in the file's axes
+    to_world: Floats  # (4, 4) rigid, mm: a point p of the file is to_world @ (p, 1) in world axes
     attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
 
 
@@ -69,7 +69,9 @@ def load_brain(
         )
         for a in attachments
     )
-    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), origin, held)
+    to_world = np.eye(4)
+    to_world[:3] = np.column_stack([turn, -turn @ origin])
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, held)
 
 
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np.int64]]:

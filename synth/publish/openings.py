@@ -17,7 +17,8 @@ from synth.geometry.brain_surface import axes, read_brain
 from synth.job import writer
 from synth.job.schema import AnatomySection, CraniotomySection, FemSection, Job
 from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
-from synth.sequence import mechanics, scenario
+from synth.sequence.fem_mechanics import build_volume
+from synth.sequence.scene import at_rest
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +64,7 @@ def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = F
         section = AnatomySection(mesh=mesh.resolve(), fill_holes=fill_holes, vertices=2500, craniotomy=where)
         job = Job(anatomy=section, fem=FemSection(tets=400))  # a coarse mesh, to test whether it is possible
         try:
-            mechanics.build(job, scenario.draw_scenario(job, 0))
+            build_volume(at_rest(job))
         except UserError as error:
             why = str(error)
             continue

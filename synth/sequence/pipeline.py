@@ -17,12 +17,14 @@ from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
 from synth.job import identity
+from synth.job.laws import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
 from synth.render.camera.camera import Camera
-from synth.sequence import mechanics, scenario
+from synth.sequence import scenario
 from synth.sequence.published_labels import Published
-from synth.sequence.scene import Scene, simulate
+from synth.sequence.scene import Scene
+from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 # Fields of a `RenderedFrame`, for one camera and for two; those of `store.extra` are its attributes as well,
@@ -85,7 +87,7 @@ def write_scene(
 
     width, height = job.render.size
     writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
-    writer.put("time", scene.motion.time)
+    writer.put("time", scene.time)
     writer.put("force", scene.force)  # labels are in camera axes
     writer.put("tissue", scene.tissue)
     writer.put("area", scene.area)
@@ -206,6 +208,8 @@ def _seal(task: _Task) -> Path:
     extra: dict[str, Any] = {}
     if (opening := identity.identify_opening(task.job, case.index)) is not None:
         extra["opening_id"] = opening  # of a user's brain
+    if scene.brain is not None:
+        extra["mesh_to_world"] = scene.brain.to_world.tolist()
     if (right := scene.renderer.right) is not None:
         extra["right"] = {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}
     return task.writer.seal(
@@ -215,11 +219,43 @@ def _seal(task: _Task) -> Path:
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,
         poisson=case.tissue.poisson,
-        mechanics=mechanics.describe(task.job, case, scene.motion, view.rotation),
+        mechanics=_mechanics(scene),
         variant=scene.renderer.variant,
         timings=task.watch.report(),
         **extra,
     )
+
+
+def _mechanics(scene: Scene) -> dict[str, Any]:
+    """The attribute `mechanics` of a sequence; what its mechanics did not compute is absent."""
+    case, motion, fem = scene.scenario, scene.motion, scene.job.fem
+    timeless = fem.time == "quasi-static" and not fem.relaxation
+    series = {
+        "min_jacobian": motion.min_jacobian,
+        "energy_mn_mm": motion.energy,
+        "residual": motion.residual,
+    }
+    if case.pulse is not None:
+        series["pulse_mm"] = case.pulse.height(scene.time)
+    if case.pulse is not None and timeless:
+        series |= {"tool_work_mn_mm": motion.tool_work, "pulse_work_mn_mm": motion.pulse_work}
+    law_from = LAWS.source(case.tissue.law)
+    return {
+        "law": case.tissue.law,
+        **({"law_from": law_from} if law_from else {}),
+        # Whether the work of the instruments equals the stored energy.
+        "elastic": timeless and case.pulse is None,
+        **{name: values.tolist() for name, values in series.items() if values is not None},
+        "instruments": [
+            {
+                "kind": gesture.kind,
+                "force_mn": (motion.by_instrument[:, k] @ scene.view.rotation.T).tolist(),
+                "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
+                "shaft": motion.shaft[:, 2 * k].tolist(),
+            }
+            for k, gesture in enumerate(case.gestures)
+        ],
+    }
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

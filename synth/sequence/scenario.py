@@ -58,20 +58,13 @@ class Scenario:
     relief: Relief
     """Shape and vessels of the anatomy, with its own seed."""
     tissue: Tissue
-    gesture: Gesture
-    """Gesture of the first instrument."""
-    further: tuple[Gesture, ...]
-    """Gestures of the other instruments, at the same time."""
+    gestures: tuple[Gesture, ...]
+    """Gestures of the instruments, all at the same time; none where no instrument is shown."""
     appearance: Appearance
     view: CameraView
     camera_motion: CameraMotion
     pulse: Pulse | None
     """Pulse of heart and breath; None where only instruments move the tissue."""
-
-    @property
-    def gestures(self) -> tuple[Gesture, ...]:
-        """All gestures, one per instrument."""
-        return (self.gesture, *self.further)
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -95,7 +88,7 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     rngs = generator(_GESTURE), generator(_FURTHER)
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, visible_mm)
     appearance = draw_appearance(job, family, generator(_APPEARANCE))
-    return Scenario(index, family, relief, tissue, gestures[0], gestures[1:], appearance, view, motion, pulse)
+    return Scenario(index, family, relief, tissue, gestures, appearance, view, motion, pulse)
 
 
 def frame_seeds(job: Job, index: int) -> list[int]:

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import UserError
-from synth.fem.solver import Deformation
-from synth.fem.tool_gesture import ToolMotion
+from synth.fem.deformation import Deformation
+from synth.fem.surface_embedding import vertex_area
 from synth.flow import track
 from synth.flow.estimator import Estimator
 from synth.flow.track import Track
-from synth.job.reader import as_job
-from synth.job.schema import Job
-from synth.render.anatomy.surface import CortexSurface
+from synth.geometry.brain_surface import Brain, load_brain
+from synth.geometry.triangles import Shape
+from synth.job.schema import AnatomySection, Job
+from synth.render.anatomy import surface as anatomy
+from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
 from synth.render.scene import RenderedFrame, Renderer
-from synth.sequence import mechanics, scenario
+from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
-from synth.system.stopwatch import StageCallback, Stopwatch
 
 Floats = NDArray[np.float64]
 
@@ -62,6 +62,23 @@ class RestScene:
     """The fine surface at rest, world axes; shared between sequences of one anatomy, hence read-only."""
     view: Camera
     """The microscope at rest."""
+    brain: Brain | None
+    """The user's brain that the surface is part of, if any, with its transform to world axes."""
+
+    @property
+    def shape(self) -> Shape:
+        """Vertices (V, 3) mm and faces (F, 3) of the fine surface, counter-clockwise from outside."""
+        return Shape(self.surface.vertices, self.surface.faces)
+
+    @property
+    def vertex_area(self) -> Floats:
+        """(V,) mm^2 of the surface: a third of the faces at each vertex. Traction times it is force."""
+        return vertex_area(*self.shape)
+
+    @property
+    def time(self) -> Floats:
+        """(T,) s of the frames."""
+        return np.arange(self.job.frames) / self.job.fps
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -87,15 +104,15 @@ class RestScene:
 
 @dataclass(frozen=True)
 class Scene(RestScene):
-    """One sequence of a job, built and deformed; `simulate` makes it. Frames are rendered on demand."""
+    """One sequence of a job, built and deformed, made by `simulate`. Frames are rendered on demand."""
 
     motion: Deformation
-    """Surface, loads and instruments over T frames, world axes: `displacement` (T, V, 3) mm."""
+    """Motion of the surface, its load and the instruments over T frames."""
 
     @cached_property
     def _timeline(self) -> Timeline:
-        case = self.scenario
-        return Timeline(self.motion, self.view, case.camera_motion, case.appearance.light, self.job.fps)
+        case, rest = self.scenario, self.surface.vertices
+        return Timeline(rest, self.motion, self.view, case.camera_motion, case.appearance.light, self.job.fps)
 
     @cached_property
     def _seeds(self) -> list[int]:
@@ -134,7 +151,7 @@ class Scene(RestScene):
         return Frame(
             **vars(rendered),
             index=t,
-            time_s=float(self.motion.time[t]),
+            time_s=float(self.time[t]),
             traction=self.renderer.traction(self.motion.traction[t]),
             force=self.force[t],
             camera=now.camera or self.view,
@@ -186,48 +203,29 @@ def at_rest(
     """
     case = case or scenario.draw_scenario(job, index)
     if gestures is not None:
-        first, *further = (replace(case.gesture, kind=kind) for kind in gestures)
-        case = replace(case, gesture=first, further=tuple(further))
+        case = replace(case, gestures=tuple(replace(case.gestures[0], kind=kind) for kind in gestures))
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:
         case = replace(case, view=camera.calibrated(case.view, view))
-    return RestScene(job, index, case, mechanics.cortex(job, case)[0], view)
+    mesh = job.anatomy.mesh
+    written = mesh.stat() if mesh and mesh.is_file() else None
+    surface, brain = _cortex(
+        job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
+    )
+    return RestScene(job, index, case, surface, view, brain)
 
 
-def simulate(
-    job: Job | str | Path,
-    index: int = 0,
-    report: StageCallback | None = None,
-    watch: Stopwatch | None = None,
-    *,
-    case: Scenario | None = None,
-    motions: Sequence[ToolMotion] = (),
-) -> Scene:
-    """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
+@lru_cache(maxsize=4)
+def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
+    """The fine surface, and the user's brain that it is part of, if any; cached, hence read-only.
 
-    Without `case` and `motions` the scene is the one that `synth render` computes for that job and index.
-
-    Args:
-        job: the job, or its file or name as for `load_job`; its `sequences` only limits `index`.
-        index: number of the sequence, 0 <= index < job.sequences.
-        report: called with progress, stage by stage.
-        watch: adds up the time of each stage.
-        case: a scenario to use instead of the drawn one; its camera motion may be any dataclass with a method
-            `at` like that of `CameraMotion`.
-        motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
-
-    Raises:
-        UserError: no such sequence, or a job that cannot be carried out (surface, load, inverted element).
+    `written` (time and size of the brain's file) distinguishes a mesh from one that replaced it.
     """
-    job = as_job(job)
-    if index not in range(job.sequences):
-        raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
-    report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
-    report("mesh", 0, 1)
-    with watch.stage("mesh"):
-        rest = at_rest(job, index, case=case)
-        surface, tets = mechanics.build(job, rest.scenario)
-    report("fem", 0, 1)
-    with watch.stage("fem"):
-        motion = mechanics.move(job, rest.scenario, surface, tets, motions)
-    return Scene(**vars(rest), motion=motion)
+    brain = None
+    if section.mesh is not None:
+        brain = load_brain(section.mesh, section.craniotomy, section.attachments, section.fill_holes)
+    surface = anatomy.grow(relief, section, brain.shape if brain else None)
+    for value in (*vars(surface).values(), *((*brain.shape, brain.to_world) if brain else ())):
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+    return surface, brain

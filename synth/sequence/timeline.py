@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from synth.fem.solver import Deformation
+from synth.fem.deformation import Deformation
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera import Camera
 from synth.render.camera.camera_motion import CameraMotion
@@ -19,6 +20,7 @@ _SUBFRAMES = 4  # pictures averaged over an open shutter
 class Timeline:
     """Surface, instruments, microscope and lamps of one sequence over time."""
 
+    rest: NDArray[np.float64]  # (V, 3) mm, the surface at rest
     motion: Deformation
     camera: Camera  # at rest
     camera_motion: CameraMotion
@@ -39,7 +41,7 @@ class Timeline:
             )
 
         return SceneState(
-            vertices=self.motion.rest + between(self.motion.displacement),
+            vertices=self.rest + between(self.motion.displacement),
             tips=between(self.motion.tip),
             shafts=between(self.motion.shaft),
             camera=self.camera_motion.at(self.camera, frame / self.fps),

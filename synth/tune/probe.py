@@ -21,7 +21,8 @@ from synth.flow.estimator import create
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.camera import camera
-from synth.sequence.scene import Frame, Scene, at_rest, simulate
+from synth.sequence.scene import Frame, Scene, at_rest
+from synth.sequence.simulation import simulate
 from synth.system.stopwatch import Stopwatch
 
 Floats = NDArray[np.float64]

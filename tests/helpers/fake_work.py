@@ -41,7 +41,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
     """Attributes of a stand-in's store."""
     gesture = {"kind": "pull", "load": 0.1}
     return {
-        "scenario": {"index": index, "family": "healthy", "gesture": gesture},
+        "scenario": {"index": index, "family": "healthy", "gestures": [gesture]},
         "scale_mm_per_px": 0.1,
         "young_kpa": float(rng.uniform(0.5, 3)),
         "poisson": 0.4,
@@ -186,7 +186,7 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
     energy = 0.4 * np.square(share) * (load @ load)
     energy[-1] *= 1.7 if fault == "compliance" else 1.0
     described = attributes(index, rng)
-    described["scenario"]["gesture"]["footprint_mm"] = 3.0
+    described["scenario"]["gestures"][0]["footprint_mm"] = 3.0
     described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
     writer.seal(
         **described,

@@ -47,7 +47,7 @@ def render(folder: Path, job: Sequence[str]) -> Path:
     from synth.engine.run import open_dataset
     from synth.job.reader import load_job
     from synth.sequence.pipeline import write_scene
-    from synth.sequence.scene import simulate
+    from synth.sequence.simulation import simulate
 
     if not folder.exists():
         loaded = load_job("tiny", [*SMALL, *job])

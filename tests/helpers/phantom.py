@@ -113,7 +113,7 @@ def write(
             writer.put_frame("motion_deviation", t, spread.astype(np.float32))
             writer.put_frame("rgb_right", t, np.roll(picture, t, axis=1))
     return writer.seal(
-        scenario={"family": family, "gesture": {"kind": "pull"}},
+        scenario={"family": family, "gestures": [{"kind": "pull"}]},
         scale_mm_per_px=SCALE_MM_PER_PX,
         young_kpa=young,
         poisson=POISSON,

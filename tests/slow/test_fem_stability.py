@@ -16,7 +16,7 @@ from synth.fem.mesh.element import quality
 from synth.fem.system import assemble
 from synth.job import schema
 from synth.job.laws import LARGEST_LOAD, LEAST_JACOBIAN
-from synth.sequence import mechanics, scenario
+from synth.sequence.simulation import simulate
 
 CONTACT = fem_case.CONTACTS[0]
 LIVING = {
@@ -31,12 +31,14 @@ LIVING = {
 def random_scene(index: int, **fem: Any) -> None:
     shared = {"seed": 0, "sequences": 10**6, "frames": 12, "anatomy": {"vertices": 10_000}}
     job = schema.Job.model_validate({**shared, "fem": {"tets": 500, **fem}})
-    case = scenario.draw_scenario(job, index)
-    moved = mechanics.move(job, case, *mechanics.build(job, case))
+    scene = simulate(job, index)
+    case, moved = scene.scenario, scene.motion
+    assert moved.energy is not None
+    assert moved.min_jacobian is not None
     for numbers in (moved.displacement, moved.traction, moved.tip, moved.energy):
         assert np.isfinite(numbers).all()
     assert moved.min_jacobian.min() > LEAST_JACOBIAN
-    force = np.einsum("v,tvd->td", moved.area, moved.traction)
+    force = np.einsum("v,tvd->td", scene.vertex_area, moved.traction)
     assert np.abs(force - moved.force).max() <= 1e-9 * np.abs(moved.force).max()
     if case.pulse is None:  # displacement per force, frame to frame, while the force is even
         size, peak = np.linalg.norm(force, axis=1), np.linalg.norm(moved.displacement, axis=2).max(axis=1)

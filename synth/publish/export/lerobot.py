@@ -57,7 +57,7 @@ def _write_episode(
 ) -> dict[str, Any]:
     """Writes the frames and videos of an episode after `before` rows; returns its row of `meta/episodes`."""
     about = row_of(sequence)
-    task = f"{about['gesture']} the brain surface ({about['family']})"
+    task = f"{about['gesture'] or 'move'} the brain surface ({about['family']})"
     tasks += [task] if task not in tasks else []
     frames, fps = sequence.frames, float(sequence.attrs["fps"])
     frame = np.arange(frames)

@@ -50,7 +50,7 @@ def bad(dataset: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"young_kpa": np.nan}, {"frames": 10**9}, {"scenario": {"gesture": "pull"}}, {"format_version": 1}],
+    [{"young_kpa": np.nan}, {"frames": 10**9}, {"scenario": {"gestures": "pull"}}, {"format_version": 1}],
 )
 def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: dict[str, Any]) -> None:
     foreign.edit_attributes(dataset / SEQUENCE, **changes)

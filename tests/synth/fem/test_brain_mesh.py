@@ -13,7 +13,8 @@ from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope
 from synth.geometry import brain_surface
 from synth.job import schema
-from synth.sequence import mechanics, scenario
+from synth.sequence.fem_mechanics import build_volume
+from synth.sequence.simulation import simulate
 
 
 @pytest.mark.parametrize("suffix", ["obj", "vtk"])
@@ -24,16 +25,16 @@ def test_a_messy_surface_of_every_format_is_meshed_and_moved(suffix: str, tmp_pa
         anatomy=schema.AnatomySection(mesh=path, vertices=2500, craniotomy=OPENING),
         fem=schema.FemSection(tets=600, load=0.1, gestures=("pull",)),
     )
-    drawn = scenario.draw_scenario(case, 0)
-    surface, tets = mechanics.build(case, drawn)
+    scene = simulate(case)
+    tets, motion = build_volume(scene), scene.motion
     volume = bary_slope(tets.points[tets.cells[:, :4]])[1]
     assert volume.min() > 0
     assert volume.sum() == pytest.approx(4 / 3 * np.pi * 32 * 26 * 22, rel=0.03)
-    motion = mechanics.move(case, drawn, surface, tets)
     peak = int(np.linalg.norm(motion.force, axis=1).argmax())
-    total = np.einsum("v,vd->d", motion.area, motion.traction[peak])
+    total = np.einsum("v,vd->d", scene.vertex_area, motion.traction[peak])
     np.testing.assert_allclose(total, motion.force[peak], rtol=1e-9)
     assert 0.1 < np.linalg.norm(motion.displacement[peak], axis=1).max() < 10
+    assert motion.min_jacobian is not None
     assert motion.min_jacobian.min() > 0.2
 
 

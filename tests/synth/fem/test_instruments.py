@@ -12,6 +12,7 @@ from pydantic import ValidationError
 import synth
 from synth.fem import solver, tool_gesture
 from synth.fem.material import Tissue
+from synth.fem.surface_embedding import vertex_area
 from synth.job import schema
 from synth.sequence import scenario
 
@@ -44,8 +45,8 @@ def test_given_values_are_used_and_the_others_drawn() -> None:
         assert 3 <= pull.footprint_mm <= 6
         assert tool_gesture.clearance(push, pull) >= 0
     for drawn in ("azimuth_deg", "hover_mm"):
-        assert len({getattr(case.gesture, drawn) for case in cases}) == 20
-    assert len({case.further[0].timing for case in cases}) == 20
+        assert len({getattr(case.gestures[0], drawn) for case in cases}) == 20
+    assert len({case.gestures[1].timing for case in cases}) == 20
 
 
 @pytest.mark.parametrize(
@@ -64,17 +65,18 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     gestures = scenario.draw_gestures(fem, OPENING_MM, tissue.young_kpa, rng, rng)
     tets, surface = block(fem), patch()
     motion = solver.deform(fem, tissue, gestures, tets, surface, frames, 25.0)
+    area = vertex_area(*surface)
     np.testing.assert_allclose(motion.by_instrument.sum(axis=1), motion.force, atol=1e-12)
-    moved = motion.rest + motion.displacement
+    moved = surface.vertices + motion.displacement
     for k, gesture in enumerate(gestures):
         centre = np.asarray(gesture.contacts[0].point_mm)
-        mine = np.linalg.norm(motion.rest[:, :2] - centre, axis=1) < 1.1 * gesture.footprint_mm
+        mine = np.linalg.norm(surface.vertices[:, :2] - centre, axis=1) < 1.1 * gesture.footprint_mm
         theirs = (
-            np.linalg.norm(motion.rest[:, :2] - gestures[1 - k].contacts[0].point_mm, axis=1)
+            np.linalg.norm(surface.vertices[:, :2] - gestures[1 - k].contacts[0].point_mm, axis=1)
             < gestures[1 - k].footprint_mm
         )
         if not (mine & theirs).any():
-            part = np.einsum("v,tvd->td", motion.area[mine], motion.traction[:, mine])
+            part = np.einsum("v,tvd->td", area[mine], motion.traction[:, mine])
             np.testing.assert_allclose(part, motion.by_instrument[:, k], atol=1e-9)
         pressed = np.linalg.norm(motion.by_instrument[:, k], axis=1)
         apart = np.linalg.norm(motion.tip[:, 2 * k : 2 * k + 2, None] - moved[:, None], axis=3).min(axis=2)

@@ -14,6 +14,7 @@ from synth.fem.material import Pia
 from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.surface_embedding import vertex_area
 from synth.job import schema
 from synth.sequence import scenario
 
@@ -73,7 +74,8 @@ def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 700, gesture.focus)
     found = solver.deform(fem, tissue, [gesture], tets, patch(121), 97, 25.0)
-    force = found.area[:, None] * found.traction
+    assert found.energy is not None
+    force = vertex_area(*patch(121))[:, None] * found.traction
     step = np.diff(found.displacement, axis=0)
     work = np.r_[0, np.cumsum(0.5 * np.einsum("tvd,tvd->t", force[1:] + force[:-1], step))]
     assert found.energy.max() > 0

@@ -15,7 +15,8 @@ from synth.job import identity, writer
 from synth.job.reader import parse_job
 from synth.publish import openings
 from synth.publish.openings import Opening
-from synth.sequence import mechanics, scenario
+from synth.sequence.fem_mechanics import build_volume
+from synth.sequence.scene import at_rest
 
 pytestmark = pytest.mark.slow
 
@@ -53,7 +54,7 @@ def test_the_command_draws_the_places_and_prints_a_valid_job(egg: Path, tmp_path
     (tmp_path / "job.yaml").write_text(done.stdout)
     job = synth.load_job(str(tmp_path / "job.yaml"), ["anatomy.vertices=2500", "fem.tets=400"])
     assert job.anatomy.mesh == egg
-    mechanics.build(job, scenario.draw_scenario(job, 0))
+    build_volume(at_rest(job))
     (tmp_path / "job.yaml").write_text(done.stdout.replace("    # ", "    "))
     both = synth.load_job(str(tmp_path / "job.yaml")).anatomy.craniotomy
     assert len(both.also) == 1
@@ -65,11 +66,11 @@ def test_sequences_use_the_openings_of_a_brain_in_turn(egg: Path, found: list[Op
     also = [{name: one[name] for name in ("point", "direction")} for one in others]
     anatomy = {"mesh": egg, "vertices": 2500, "craniotomy": first | {"also": also}}
     job = synth.Job.model_validate({"sequences": 6, "frames": 3, "anatomy": anatomy})
-    cases = [scenario.draw_scenario(job, index) for index in range(6)]
-    for index, case in enumerate(cases):
-        origin = mechanics.cortex(job, case)[1].origin  # type: ignore[union-attr]
-        assert np.linalg.norm(origin - found[index % 3].point) < 1.0
-    named = [identity.identify_opening(job, case.index) for case in cases]
+    for index in range(6):
+        brain = at_rest(job, index).brain
+        assert brain is not None
+        assert np.linalg.norm(brain.to_world @ [*found[index % 3].point, 1.0] - [0, 0, 0, 1]) < 1.0
+    named = [identity.identify_opening(job, index) for index in range(6)]
     assert named[:3] == named[3:]
     assert len(set(named)) == 3
     assert parse_job(writer.commented(job), "job", Path()) == job

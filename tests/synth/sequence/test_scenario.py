@@ -30,7 +30,7 @@ def test_shares_are_drawn_and_unused_quantities_change_no_draw() -> None:
     for one, usual in zip(drawn, plain, strict=True):
         assert usual.pulse is usual.tissue.membrane is None
         assert one.tissue.young_kpa == usual.tissue.young_kpa
-        assert (one.gesture, one.appearance) == (usual.gesture, usual.appearance)
+        assert (one.gestures, one.appearance) == (usual.gestures, usual.appearance)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (640, 360)])
@@ -41,7 +41,7 @@ def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[in
     turn = np.linspace(0, 2 * np.pi, 100)
     reach = []
     for case in (draw_scenario(wide, k) for k in range(wide.sequences)):
-        lens, reach_mm = camera.place(case.view, wide.render), case.gesture.reach_mm
+        lens, reach_mm = camera.place(case.view, wide.render), case.gestures[0].reach_mm
         circle = reach_mm * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
         pixels = camera.project(lens, circle)
         assert (pixels > -0.6).all()

@@ -1,0 +1,91 @@
+"""Result of the mechanics of a sequence, and its check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.errors import UserError
+from synth.fem.surface_embedding import vertex_area
+from synth.geometry.triangles import Shape
+
+Floats = NDArray[np.float64]
+
+_ROUNDING = 1e-6
+"""Part of a quantity's largest value that passes for 0: other engines may compute in single precision."""
+_OPTIONAL = ("min_jacobian", "energy", "residual", "tool_work", "pulse_work")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deformation:
+    """Motion and load of a surface of V vertices and I instruments over T frames, float64, world axes.
+
+    Frame 0 is at rest, without load. Where no instrument is shown, I is 0. What a method does not compute is
+    None: it is absent from the store, and checks that need it are skipped.
+    """
+
+    displacement: Floats
+    """(T, V, 3) mm from rest."""
+    traction: Floats
+    """(T, V, 3) kPa on the tissue, on the surface at rest and linear on its faces."""
+    force: Floats
+    """(T, 3) mN on the tissue: the sum of traction times the area of each vertex, a third of its faces'."""
+    by_instrument: Floats
+    """(T, I, 3) mN, the part of each instrument in the force."""
+    tip: Floats
+    """(T, 2 I, 3) mm, two tips of each instrument."""
+    shaft: Floats
+    """(T, 2 I, 3) unit vectors from tip to hand."""
+    min_jacobian: Floats | None = None
+    """(T,) smallest det F in the volume, at quadrature points and corners."""
+    energy: Floats | None = None
+    """(T,) mN mm stored."""
+    residual: Floats | None = None
+    """(T,) force out of balance over the load, in the norm of the inverse stiffness."""
+    tool_work: Floats | None = None
+    """(T,) mN mm, half of traction times the motion by the instruments alone: without a pulse, and under the
+    linear law, the energy."""
+    pulse_work: Floats | None = None
+    """(T,) mN mm, half of traction times the motion by the pulse alone."""
+
+
+def check_deformation(found: Deformation, surface: Shape, frames: int, instruments: int) -> None:
+    """Raises UserError unless a result is one of that surface, over those frames, with those instruments.
+
+    Arrays must have the type and shape of `Deformation` and finite values; frame 0 is at rest; traction times
+    area, and the instruments' forces if there are any, add up to the force.
+    """
+    if not isinstance(found, Deformation):
+        raise UserError(f"mechanics: expected a Deformation, got {type(found).__name__}")
+    whole = (frames, len(surface.vertices), 3)
+    ends = (frames, 2 * instruments, 3)
+    shapes = {"displacement": whole, "traction": whole, "force": (frames, 3), "tip": ends, "shaft": ends}
+    shapes |= {"by_instrument": (frames, instruments, 3), **dict.fromkeys(_OPTIONAL, (frames,))}
+    for name, shape in shapes.items():
+        value = getattr(found, name)
+        if value is None and name in _OPTIONAL:
+            continue
+        if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.shape != shape:
+            given = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
+            raise UserError(f"mechanics: {name} must be float64 {shape}, not {given}")
+        if not np.isfinite(value).all():
+            raise UserError(f"mechanics: {name} has values that are not finite")
+    for name in ("displacement", "traction", "force", "by_instrument"):
+        size = np.abs(getattr(found, name))
+        if size[0].max(initial=0.0) > _ROUNDING * size.max(initial=0.0):
+            raise UserError(f"mechanics: {name} is not 0 in frame 0, the rest frame")
+    if np.abs(np.linalg.norm(found.shaft, axis=2) - 1).max(initial=0.0) > _ROUNDING:
+        raise UserError("mechanics: shaft must be unit vectors")
+    totals = {"traction times area": np.einsum("v,tvd->td", vertex_area(*surface), found.traction)}
+    if instruments:
+        totals["by_instrument"] = found.by_instrument.sum(axis=1)
+    for name, total in totals.items():
+        off = np.abs(total - found.force).max(axis=1)
+        if off.max() > _ROUNDING * np.abs(found.force).max():
+            t = int(off.argmax())
+            raise UserError(
+                f"mechanics: frame {t}: {name} adds up to {np.round(total[t], 4).tolist()} mN, "
+                f"but force is {np.round(found.force[t], 4).tolist()} mN"
+            )

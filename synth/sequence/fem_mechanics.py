@@ -1,0 +1,54 @@
+"""Mechanics of a sequence by our own finite elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from synth.fem import solver
+from synth.fem.deformation import Deformation
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.tool_gesture import ToolMotion
+from synth.sequence.scene import RestScene
+from synth.system.stopwatch import StageCallback, Stopwatch
+
+
+@dataclass(frozen=True)
+class FemMechanics:
+    """Finite elements in the volume under the surface, loaded by the scenario's gestures and pulse."""
+
+    motions: Sequence[ToolMotion] = ()
+    """Of the instruments, over T frames each; the gestures' own trajectories if there are none."""
+
+    def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
+        """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
+        job, case = rest.job, rest.scenario
+        with watch.stage("mesh"):
+            tets = build_volume(rest)
+        report("fem", 0, 1)
+        with watch.stage("fem"):
+            return solver.deform(
+                job.fem,
+                case.tissue,
+                case.gestures,
+                tets,
+                rest.shape,
+                job.frames,
+                job.fps,
+                case.pulse,
+                job.anatomy.craniotomy.radius_mm,
+                self.motions,
+            )
+
+
+def build_volume(rest: RestScene) -> Tets:
+    """The volume under the surface, meshed finest under the contacts. UserError: it can't be meshed."""
+    anatomy, surface = rest.job.anatomy, rest.surface
+    focus = [place for gesture in rest.scenario.gestures for place in gesture.focus]
+    mesh, slips = (rest.job.fem.tets, focus), rest.scenario.tissue.skull == "slip"
+    if rest.brain is not None:
+        return tetrahedra.from_brain(rest.brain, anatomy, *mesh, slips=slips)
+    height = HeightMap(surface.pia, surface.extent_mm)
+    return tetrahedra.block(anatomy, *mesh, height, slips=slips)

@@ -1,0 +1,60 @@
+"""Simulation of one sequence: drawn, built and deformed, ready to be rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from synth.errors import UserError
+from synth.fem.deformation import check_deformation
+from synth.fem.tool_gesture import ToolMotion
+from synth.job.reader import as_job
+from synth.job.schema import Job
+from synth.sequence.fem_mechanics import FemMechanics
+from synth.sequence.mechanics import Mechanics
+from synth.sequence.scenario import Scenario
+from synth.sequence.scene import Scene, at_rest
+from synth.system.stopwatch import StageCallback, Stopwatch
+
+
+def simulate(
+    job: Job | str | Path,
+    index: int = 0,
+    report: StageCallback | None = None,
+    watch: Stopwatch | None = None,
+    *,
+    case: Scenario | None = None,
+    motions: Sequence[ToolMotion] = (),
+    mechanics: Mechanics | None = None,
+) -> Scene:
+    """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
+
+    Without `case`, `motions` and `mechanics` the scene is the one that `synth render` computes for that job
+    and index.
+
+    Args:
+        job: the job, or its file or name as for `load_job`; its `sequences` only limits `index`.
+        index: number of the sequence, 0 <= index < job.sequences.
+        report: called with progress, stage by stage.
+        watch: adds up the time of each stage.
+        case: a scenario to use instead of the drawn one; its camera motion may be any dataclass with a method
+            `at` like that of `CameraMotion`.
+        motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
+        mechanics: what moves the surface instead of this package's finite elements; it has no `motions`.
+
+    Raises:
+        UserError: no such sequence, a job that cannot be carried out (surface, load, inverted element), or
+            mechanics with an invalid result.
+    """
+    job = as_job(job)
+    if index not in range(job.sequences):
+        raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
+    if mechanics is not None and len(motions):
+        raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
+    report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
+    report("mesh", 0, 1)
+    with watch.stage("mesh"):
+        rest = at_rest(job, index, case=case)
+    motion = (mechanics or FemMechanics(motions)).deform(rest, report, watch)
+    check_deformation(motion, rest.shape, job.frames, len(rest.scenario.gestures))
+    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, motion)
