@@ -91,13 +91,6 @@ def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: F
 
 
 @compiled
-def swellings(law: int, strain: Floats, value: Floats, slope: Floats) -> None:
-    """Swelling (n,) of (n, 3, 3) displacement gradients, and its derivative (n, 3, 3) by them, in place."""
-    for n in range(len(strain)):
-        value[n] = _swelling(law, strain[n], slope[n])
-
-
-@compiled
 def _swelling(law: int, h: Floats, slope: Floats) -> float:
     """Swelling at one displacement gradient; `slope` receives its derivative. Infinite where undefined."""
     f = h.copy()

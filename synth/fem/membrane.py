@@ -75,15 +75,10 @@ class Membrane:
             )
         )
 
-    def stiffness_at(self, u: Floats) -> sp.csr_array:
-        """(3N, 3N) mN/mm at (N, 3) mm, exact."""
+    def rest_stiffness(self) -> sp.csr_array:
+        """(3N, 3N) mN/mm at rest, exact; being stretched, it has no wrinkles."""
         place = self.tangent
-        if not self.linear:
-            place = place + np.einsum("fqnb,fni->fqib", self.slope, u[self.faces])
-        metric = self.square * np.einsum("fqia,fqib->fqab", place, place)
-        stress, moduli = _moduli(metric, self.stiffness)
-        if not self.linear:
-            _wrinkle(metric, self.stiffness, stress, moduli)
+        stress, moduli = _moduli(self.square * np.einsum("fqia,fqib->fqab", place, place), self.stiffness)
         stress, moduli = self.square * stress, self.square**2 * moduli
         bent = np.einsum("fqna,fqib->fqniab", self.slope, place)
         local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
@@ -91,7 +86,7 @@ class Membrane:
         local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
         faces, n = len(self.faces), 3 * self.faces.shape[1]
         dof = (3 * self.faces[:, :, None] + np.arange(3, dtype=np.int32)).reshape(faces, n)
-        return scatter(local, dof, u.size)
+        return scatter(local, dof, self.balance.size)
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
@@ -208,21 +203,3 @@ def _moduli(metric: Floats, stiffness: float) -> tuple[Floats, Floats]:
     crossed = 0.5 * (crossed + np.swapaxes(crossed, -1, -2))
     whole = np.einsum("...ab,...cd->...abcd", inverse, inverse) + crossed
     return stress, 2 * stiffness / 3 * whole / det[..., None, None]
-
-
-def _wrinkle(metric: Floats, stiffness: float, stress: Floats, moduli: Floats) -> None:
-    """Puts the relaxed stress and its derivative where the sheet wrinkles or is slack."""
-    values, ways = np.linalg.eigh(metric)
-    large, small = values[..., 1], values[..., 0]
-    slack = large <= 1
-    creased = ~slack & (small * large < np.sqrt(large))
-    stress[slack], moduli[slack] = 0, 0
-    c, n, m = large[creased], ways[creased][..., 1], ways[creased][..., 0]
-    pull = stiffness / 3 * (1 - c**-1.5)
-    along, aside = np.einsum("pa,pb->pab", n, n), np.einsum("pa,pb->pab", n, m)
-    aside = aside + np.swapaxes(aside, -1, -2)
-    stress[creased] = pull[:, None, None] * along
-    steep = stiffness * c**-2.5
-    turn = pull / (c - small[creased])
-    moduli[creased] = np.einsum("p,pab,pcd->pabcd", steep, along, along)
-    moduli[creased] += np.einsum("p,pab,pcd->pabcd", turn, aside, aside)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,14 +13,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from synth.errors import UserError
 from synth.fem import foreign_law
 from synth.fem.assembly import divergence, gradient, stiffness
-from synth.fem.laws import (
-    NUMBER,
-    lame,
-    least_determinant,
-    resist_swelling,
-    stress,
-    swellings,
-)
+from synth.fem.laws import NUMBER, lame, least_determinant, resist_swelling, stress
 from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
@@ -29,7 +21,6 @@ from synth.fem.mesh.tetrahedra import Tets
 Floats = NDArray[np.float64]
 
 _FLATTEST = 0.01  # mean ratio; measured: one sliver of 0.002 under a contact takes a quarter of the motion
-_STEP = 1e-5  # of a displacement gradient, for differences
 
 POINTWISE = 1.0
 """Part of lambda, in units of mu, that acts at quadrature points; the remainder acts on elements' means,
@@ -88,36 +79,11 @@ class System:
             energy += self.membrane.pull(u, force)
         return State(energy, force, least)
 
-    def tangent(self, u: Floats) -> sp.csr_array:
-        """Stiffness at (N, 3) mm, (3N, 3N) mN/mm, springs and membrane included; moduli by differences."""
-        strain, along, pressure = self._strain(u), None, None
-        if self.averaged:
-            along, pressure = average(self.mesh, self.law, strain, self.averaged)
-        moduli = np.empty((len(strain), 3, 3, 3, 3))
-        for k, m in product(range(3), repeat=2):
-            step = np.zeros((3, 3))
-            step[k, m] = _STEP
-            ahead, behind = (self._stress(strain + way * step, pressure) for way in (1, -1))
-            moduli[..., k, m] = (ahead - behind) / (2 * _STEP)
-        whole = stiffness(self.mesh, moduli, along) + _springs(self.hold, self.slip)
-        if self.membrane is not None:
-            whole = whole + self.membrane.stiffness_at(u)
-        return whole.tocsr()
-
     def _strain(self, u: Floats) -> Floats:
         """(M * Q, 3, 3) displacement gradients at the quadrature points."""
         strain = np.empty((self.mesh.weight.size, 3, 3))
         gradient(self.mesh.cells, self.mesh.slope, u, strain)
         return strain
-
-    def _stress(self, strain: Floats, pressure: Floats | None) -> Floats:
-        """Stress (n, 3, 3) kPa; `pressure` (n,) kPa on the swelling is constant."""
-        first, density = np.empty_like(strain), np.empty(len(strain))
-        self._law(strain, first, density)
-        if pressure is not None:
-            swellings(_swelling(self.law), strain, density, slope := np.empty_like(strain))
-            first += pressure[:, None, None] * slope
-        return first
 
     def _law(self, strain: Floats, stress_kpa: Floats, density: Floats) -> float:
         """The law without its part on elements' means, in place; returns the smallest det F."""
@@ -167,13 +133,15 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
     mean = max(lam - POINTWISE * mu, 0.0)
     along = None
     if mean:
-        along, _ = average(mesh, "linear", np.zeros((mesh.weight.size, 3, 3)), mean)
+        even = np.broadcast_to(np.eye(3), (*mesh.weight.shape, 3, 3))  # the swelling's derivative at rest
+        along = np.einsum("eq,eqij,eqnj->eni", mesh.weight, even, mesh.slope, optimize=True)
+        along *= np.sqrt(mean / mesh.weight.sum(axis=1))[:, None, None]
     moduli = hooke(1.0, poisson)
     moduli -= mean * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
     whole = (stiffness(mesh, moduli, along) + _springs(tets.hold, tets.slip)).tocsr()
     membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
     if membrane is not None:
-        whole = (whole + membrane.stiffness_at(np.zeros_like(tets.points))).tocsr()
+        whole = (whole + membrane.rest_stiffness()).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
     # Symmetric and positive definite: no pivoting, an ordering of A + A'.
     factor = splu(
@@ -184,22 +152,6 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
     )
     corners = quadrature(tets.points, tets.cells, np.eye(4))
     return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip)
-
-
-def average(mesh: Quadrature, law: str, strain: Floats, lam: float) -> tuple[Floats, Floats]:
-    """Contribution of `lam` kPa on each element's mean swelling to the stiffness at strains (M * Q, 3, 3).
-
-    Returns:
-        (M, n, 3) for `stiffness`, and the pressure (M * Q,) kPa that multiplies the second derivative.
-    """
-    value, slope = np.empty(len(strain)), np.empty_like(strain)
-    swellings(_swelling(law), strain, value, slope)
-    volume = mesh.weight.sum(axis=1)
-    mean = (value.reshape(mesh.weight.shape) * mesh.weight).sum(axis=1) / volume
-    slope = slope.reshape(*mesh.weight.shape, 3, 3)
-    along = np.einsum("eq,eqij,eqnj->eni", mesh.weight, slope, mesh.slope, optimize=True)
-    along *= np.sqrt(lam / volume)[:, None, None]
-    return along, np.repeat(lam * mean, mesh.weight.shape[1])
 
 
 def hooke(young: float, poisson: float) -> Floats:
