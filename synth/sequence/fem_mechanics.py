@@ -24,23 +24,13 @@ class FemMechanics:
 
     def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
         """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
-        job, case = rest.job, rest.scenario
+        job, case, opening_mm = rest.job, rest.scenario, rest.job.anatomy.craniotomy.radius_mm
         with watch.stage("mesh"):
             tets = build_volume(rest)
         report("fem", 0, 1)
         with watch.stage("fem"):
-            return solver.deform(
-                job.fem,
-                case.tissue,
-                case.gestures,
-                tets,
-                rest.shape,
-                job.frames,
-                job.fps,
-                case.pulse,
-                job.anatomy.craniotomy.radius_mm,
-                self.motions,
-            )
+            tissue, duration = (job.fem, case.tissue, case.gestures), (job.frames, job.fps)
+            return solver.deform(*tissue, tets, rest.shape, *duration, case.pulse, opening_mm, self.motions)
 
 
 def build_volume(rest: RestScene) -> Tets:

@@ -230,16 +230,12 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
     """The attribute `mechanics` of a sequence; what its mechanics did not compute is absent."""
     case, motion, fem = scene.scenario, scene.motion, scene.job.fem
     timeless = fem.time == "quasi-static" and not fem.relaxation
-    series = {
-        "min_jacobian": motion.min_jacobian,
-        "energy_mn_mm": motion.energy,
-        "residual": motion.residual,
-    }
+    law_from = LAWS.source(case.tissue.law)
+    series = {"min_jacobian": motion.min_jacobian, "energy_mn_mm": motion.energy, "residual": motion.residual}
     if case.pulse is not None:
         series["pulse_mm"] = case.pulse.height(scene.time)
-    if case.pulse is not None and timeless:
-        series |= {"tool_work_mn_mm": motion.tool_work, "pulse_work_mn_mm": motion.pulse_work}
-    law_from = LAWS.source(case.tissue.law)
+        if timeless:
+            series |= {"tool_work_mn_mm": motion.tool_work, "pulse_work_mn_mm": motion.pulse_work}
     return {
         "law": case.tissue.law,
         **({"law_from": law_from} if law_from else {}),
