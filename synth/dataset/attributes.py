@@ -20,9 +20,8 @@ _Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 _Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Triple = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Square = Annotated[list[_Triple], Field(min_length=3, max_length=3)]
-_Pose = Annotated[
-    list[Annotated[list[_Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-]
+_Four = Annotated[list[_Number], Field(min_length=4, max_length=4)]
+_Pose = Annotated[list[_Four], Field(min_length=4, max_length=4)]
 _Edge = Annotated[int, Field(ge=1, le=LARGEST_PIXELS)]
 
 

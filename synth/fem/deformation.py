@@ -78,9 +78,10 @@ def check_deformation(found: Deformation, surface: Shape, frames: int, instrumen
             raise UserError(f"mechanics: {name} is not 0 in frame 0, the rest frame")
     if np.abs(np.linalg.norm(found.shaft, axis=2) - 1).max(initial=0.0) > _ROUNDING:
         raise UserError("mechanics: shaft must be unit vectors")
-    total = np.einsum("v,tvd->td", vertex_area(*surface), found.traction)
+    area = vertex_area(*surface)
+    total, size = (np.einsum("v,tvd->td", area, t) for t in (found.traction, np.abs(found.traction)))
     off = np.abs(total - found.force).max(axis=1)
-    if off.max() > _ROUNDING * np.abs(found.force).max():
+    if off.max() > _ROUNDING * max(size.max(), np.abs(found.force).max()):
         t = int(off.argmax())
         sums = f"{np.round(total[t], 4).tolist()} mN, force is {np.round(found.force[t], 4).tolist()} mN"
         raise UserError(f"mechanics: traction times area in frame {t} is {sums}")

@@ -206,9 +206,8 @@ def _seal(task: _Task) -> Path:
     scene = task.scene
     case, view = scene.scenario, scene.view
     extra: dict[str, Any] = {}
-    if (opening := identity.identify_opening(task.job, case.index)) is not None:
-        extra["opening_id"] = opening  # of a user's brain
     if scene.brain is not None:
+        extra["opening_id"] = identity.identify_opening(task.job, case.index)
         extra["mesh_to_world"] = scene.brain.to_world.tolist()
     if (right := scene.renderer.right) is not None:
         extra["right"] = {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}
