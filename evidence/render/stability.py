@@ -52,7 +52,7 @@ def checked(ours: Case, changes: Changes) -> dict[str, Any]:
         assert np.isfinite(array).all()
     assert not (shot.visible & ~rest.tissue).any()
     assert not (shot.glare & shot.tool).any()
-    faces = ours.renderer.surface.faces[rest.face[rest.tissue]]
+    faces = ours.renderer.content.tissue.faces[rest.face[rest.tissue]]
     points = np.einsum("nk,nkc->nc", rest.bary[rest.tissue], posed["vertices"][faces])
     turn, _ = cv2.Rodrigues(lens.rotation)
     there, _ = cv2.projectPoints(points, turn, lens.translation, lens.K, lens.distortion)
@@ -72,7 +72,7 @@ def _steep(ours: Case) -> Changes:
 
 def _degenerate(ours: Case) -> Changes:
     """Faces of zero area, and all vertices at one place of the texture."""
-    ours.renderer.surface.uv[:] = 0.5
+    ours.renderer.content.tissue.uv[:] = 0.5
     vertices = ours.vertices.copy()
     vertices[5000:5400] = vertices[5000]
     return {"vertices": vertices}

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.errors import UserError
-from synth.geometry.triangles import grid_faces, lengths
+from synth.geometry.triangles import Shape, grid_faces, lengths
+from synth.render.appearance import reflection
+from synth.render.appearance.reflection import Theatre
 
 Floats = npt.NDArray[np.float64]
 Kind = Literal["forceps", "bayonet", "dissector", "suction", "spatula"]
@@ -45,13 +47,50 @@ class Part:
 
 
 @dataclass(frozen=True)
-class InstrumentMesh:
-    """All instruments of a scene as one mesh."""
+class SteelInstruments:
+    """All instruments of a scene as one mesh; see `content.Instruments`."""
 
     kinds: tuple[Kind, ...]
     parts: tuple[tuple[Part, ...], ...]  # the parts of each
     faces: npt.NDArray[np.int32]  # (F, 3) over all parts
     coat: npt.NDArray[np.float32]  # (V,) 0 bare steel to 1 under a black coating
+    theatre: Theatre  # that they mirror
+
+    @property
+    def tint(self) -> Floats:
+        return reflection.tint(self.coat)
+
+    def pose(self, tips: Floats, shafts: Floats) -> Shape:
+        """The mesh with its tips (2n, 3) mm, two per instrument; a single-tipped one is in their middle.
+
+        Raises:
+            UserError: the number of tips is not two per instrument.
+        """
+        if len(tips) != 2 * len(self.parts):
+            raise UserError(f"{len(tips)} tips for {len(self.parts)} instruments; give two for each")
+        placed = []
+        for k, parts in enumerate(self.parts):
+            ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
+            for part in parts:
+                follows = {1: 0, -1: 1}.get(part.side)
+                tip = ends.mean(axis=0) if follows is None else ends[follows]
+                shaft = ways.mean(axis=0) if follows is None else ways[follows]
+                # The flat sides of two tines face each other; a single blade's faces the tissue.
+                across = np.array([0.0, 0.0, 1.0]) if follows is None else ends[1] - ends[0]
+                placed.append(tip + part.profile @ _axes(shaft, across))
+        return Shape(np.concatenate(placed), self.faces)
+
+    def glow(self, posed: Shape) -> Floats:
+        return reflection.glow(posed, self.coat, self.theatre)
+
+    def film(self, tips: Floats, surface: Floats) -> Floats:
+        height = np.zeros(len(surface))
+        for k, kind in enumerate(self.kinds):
+            ends = tips[2 * k : 2 * k + 2]
+            for end in ends if len(self.parts[k]) == 2 else ends.mean(axis=0, keepdims=True):
+                away = lengths(surface - end) - _SHAPES[kind][1]
+                height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
+        return height
 
 
 def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
@@ -68,10 +107,10 @@ def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
     return tuple(bool(drawn) for drawn in rng.random(len(kinds)) < _COATED)
 
 
-def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
-    """The mesh of any number of instruments, to be placed by `pose`; the `coated` ones have black ends."""
+def build(kinds: Sequence[Kind], coated: Sequence[bool], theatre: Theatre) -> SteelInstruments:
+    """One or more instruments in a theatre; the `coated` ones have black ends."""
     parts = tuple(_SHAPES[kind][0]() for kind in kinds)
-    faces, coat, total = [np.zeros((0, 3), np.int32)], [np.zeros(0)], 0
+    faces, coat, total = [], [], 0
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
             rings = len(part.profile) // (_AROUND + 1)
@@ -79,49 +118,13 @@ def build(kinds: Sequence[Kind], coated: Sequence[bool]) -> InstrumentMesh:
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
             total += len(part.profile)
-    return InstrumentMesh(
+    return SteelInstruments(
         kinds=tuple(kinds),
         parts=parts,
         faces=np.concatenate(faces).astype(np.int32),
         coat=np.concatenate(coat).astype(np.float32),
+        theatre=theatre,
     )
-
-
-def pose(instrument: InstrumentMesh, tips: Floats, shafts: Floats) -> Floats:
-    """World vertices (V, 3) mm of the instruments.
-
-    Args:
-        instrument: n instruments.
-        tips: (2n, 3) mm, two per instrument; a single-tipped one is placed in their middle.
-        shafts: (2n, 3), from tip to hand.
-
-    Raises:
-        UserError: the number of tips is not two per instrument.
-    """
-    if instrument.parts and len(tips) != 2 * len(instrument.parts):
-        raise UserError(f"{len(tips)} tips for {len(instrument.parts)} instruments; give two for each")
-    placed = [np.zeros((0, 3))]
-    for k, parts in enumerate(instrument.parts):
-        ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
-        for part in parts:
-            follows = {1: 0, -1: 1}.get(part.side)
-            tip = ends.mean(axis=0) if follows is None else ends[follows]
-            shaft = ways.mean(axis=0) if follows is None else ways[follows]
-            # The flat sides of two tines face each other; a single blade's faces the tissue.
-            across = np.array([0.0, 0.0, 1.0]) if follows is None else ends[1] - ends[0]
-            placed.append(tip + part.profile @ _axes(shaft, across))
-    return np.concatenate(placed)
-
-
-def film(instrument: InstrumentMesh, tips: Floats, surface: Floats) -> Floats:
-    """Height (V,) mm of the wet film on a surface (V, 3) mm around tips (2n, 3) mm that touch it."""
-    height = np.zeros(len(surface))
-    for k, kind in enumerate(instrument.kinds):
-        ends = tips[2 * k : 2 * k + 2]
-        for end in ends if len(instrument.parts[k]) == 2 else ends.mean(axis=0, keepdims=True):
-            away = lengths(surface - end) - _SHAPES[kind][1]
-            height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
-    return height
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from synth.geometry.triangles import Shape, joined, normals
-from synth.job.schema import Job
-from synth.render import instrument, truth
-from synth.render.anatomy import noise, rim, scenery, texture
-from synth.render.anatomy.surface import CortexSurface
-from synth.render.appearance import light, reflection
-from synth.render.appearance.appearance import Appearance
+from synth.job.schema import RenderSection
+from synth.render import truth
+from synth.render.anatomy import noise
+from synth.render.appearance import light
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, right_camera
-from synth.render.mitsuba.adapter import Body, Metal, Stage, Wet, forget, pick
+from synth.render.camera.camera_sensor import CameraSensor
+from synth.render.content import SceneContent
+from synth.render.materials import Body, Metal, Wet
+from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
 
@@ -27,23 +27,25 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
-_MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
-_SATIN = 0.10  # share of light that steel's finish scatters diffusely
-_DULL = 0.8  # finish of a retractor, between steel (0) and black (1), against glare
-_AMBIENT = 0.05  # share of the lamps' light that comes from all directions
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
+_NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+_OUT_OF_SIGHT = Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32)), Metal(*np.zeros((2, 3, 3)))
 
 
 @dataclass(frozen=True)
 class SceneState:
     """State of the scene at one time."""
 
-    vertices: Floats  # (V, 3) mm, the surface
-    tips: Floats  # (2n, 3) mm, two for each of n instruments: ends of its tines
-    shafts: Floats  # (2n, 3) unit vectors from tip to hand
-    camera: Camera | None = None  # the microscope, if not in its pose at rest; with the same lens
-    power: float = 1.0  # of the lamps, relative to the rest frame
+    vertices: Floats
+    """(V, 3) mm, the tissue's."""
+    tips: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(2n, 3) mm, two for each of n instruments: ends of its tines."""
+    shafts: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """(2n, 3) unit vectors from tip to hand."""
+    camera: Camera | None = None
+    """The microscope, if not in its pose at rest; with the same lens."""
+    power: float = 1.0
+    """Of the lamps, relative to the rest frame."""
 
 
 @dataclass(frozen=True)
@@ -84,56 +86,43 @@ class Renderer:
     """Renderer of one scene. Every frame depends on its arguments alone.
 
     Args:
-        surface: the cortex at rest.
-        appearance: its appearance.
+        content: what is drawn.
         camera: the microscope at rest.
-        job: render settings, opening and photograph.
-        gestures: kind of each instrument's gesture, for which a suitable instrument is shown.
+        sensor: its chip and video processor.
+        settings: of them variant, light paths and the right camera's baseline are used.
+        extra: names of optional fields of a `RenderedFrame` to fill.
 
     Raises:
-        UserError: the variant cannot run here, or the photograph cannot be read.
+        UserError: the variant cannot run here.
+        ValueError: the tissue is of metal.
     """
 
     def __init__(
         self,
-        surface: CortexSurface,
-        appearance: Appearance,
+        content: SceneContent,
         camera: Camera,
-        job: Job,
-        gestures: Sequence[str] = ("pull",),
+        sensor: CameraSensor = CameraSensor(),
+        settings: RenderSection = RenderSection(),
+        extra: Sequence[str] = (),
     ) -> None:
         forget()  # earlier renderers
-        self.variant = pick(job.render.variant)
-        self.surface, self.camera = surface, camera
-        self._appearance, self._render, self._extra = appearance, job.render, job.store.extra
-        self._rim = rim.build(surface, job.anatomy.craniotomy.radius_mm, appearance, camera.mm_per_px)
-        self._coat = texture.cortex(
-            surface,
-            appearance,
-            texture.resolution(surface.chart.extent_mm, camera.mm_per_px),
-            job.appearance.photo,
-            rim.shade(self._rim, surface),
-        )
-        hand = np.random.default_rng([appearance.rim_seed, 2])
-        kinds = instrument.choose(gestures if job.render.tool else (), hand)
-        self._tool = instrument.build(kinds, instrument.finish(kinds, hand))
-        """Empty where the job shows no instruments."""
-        self._blade = self._retractor()
-        rest = Shape(surface.vertices, surface.faces)
-        self._static = joined(self._rim.shape, self._blade)
-        """Rim and retractor, which never move."""
-        self.rest = truth.trace_rest(camera, rest, self._static)
+        self.variant = pick(settings.variant)
+        self.content, self.camera = content, camera
+        self._sensor, self._settings, self._extra = sensor, settings, extra
+        if not isinstance(content.tissue.material, Wet):
+            raise ValueError("the tissue's material must be Wet")
+        self._albedo = content.tissue.material.coat.albedo
+        self._static = joined(_NOTHING, *(body.shape for body in content.static))
+        metal = [(one.shape, one.material) for one in content.static if isinstance(one.material, Metal)]
+        # A face of metal at least, if out of sight: with and without instruments kernels are the same.
+        self._static_metal = metal or ([] if content.instruments is not None else [_OUT_OF_SIGHT])
+        self.rest = truth.trace_rest(camera, content.tissue.shape, self._static)
         self.right: Camera | None = None
-        """The right camera at rest, if the job has one."""
+        """The right camera at rest, if there is one."""
         self._right_rest: RestFrame | None = None
-        if job.render.stereo_mm:
-            self.right = right_camera(camera, job.render.stereo_mm)
-            self._right_rest = truth.trace_rest(self.right, rest, self._static)
-        self.lamps = light.lamps(camera, appearance.light)
-        dull = np.full(len(self._blade.vertices), _DULL, np.float32)
-        self._coating = np.concatenate([self._tool.coat, dull])
-        """(V,) of `_steel`: 0 polished, 1 coated black, in between dull."""
-        self._theatre = self._surroundings()
+        if settings.stereo_mm:
+            self.right = right_camera(camera, settings.stereo_mm)
+            self._right_rest = truth.trace_rest(self.right, content.tissue.shape, self._static)
         self._stage: Stage | None = None
 
     def render(
@@ -153,20 +142,21 @@ class Renderer:
         """
         camera = state.camera or self.camera
         radiance, radiance_right = self._gathered(shutter or (state,), seed)
-        shapes = (Shape(state.vertices, self.surface.faces), self._static, self._posed(state))
+        faces = self.content.tissue.faces
+        shapes = (Shape(state.vertices, faces), self._static, self._posed(state))
         own = truth.trace_frame(camera, self.rest, *shapes)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
             extra["flow_next"] = truth.forward_flow(
-                own.hits, self.surface.faces, there.vertices, there.camera or self.camera
+                own.hits, faces, there.vertices, there.camera or self.camera
             )
         if "normals" in self._extra:
             extra["normals"] = truth.normal_map(camera, own.hits, shapes)
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, own.depth)
         if self._right_rest is not None:
-            lens = right_camera(camera, self._render.stereo_mm)
+            lens = right_camera(camera, self._settings.stereo_mm)
             other = truth.trace_frame(lens, self._right_rest, *shapes)
             picture = self.develop(radiance_right, seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
@@ -186,41 +176,49 @@ class Renderer:
         """Rest disparity (H, W) px without distortion, see `synth.fields`; 0 off the tissue.
 
         Raises:
-            ValueError: the job has no right camera.
+            ValueError: there is no right camera.
         """
         if self.right is None:
-            raise ValueError("the job is monocular")
+            raise ValueError("the scene is monocular")
         width, height = self.camera.size
         depth = self.rest.points[:, 2].reshape(height, width)
         shift = self.right.K[0, 2] - self.camera.K[0, 2]
         away = np.where(self.rest.tissue, depth, 1.0)
-        wide = self.camera.K[0, 0] * self._render.stereo_mm / away - shift
+        wide = self.camera.K[0, 0] * self._settings.stereo_mm / away - shift
         return np.where(self.rest.tissue, wide, 0.0).astype(np.float32)
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
-        return truth.at_rest_pixels(self.rest, self.surface.faces, nodal @ self.camera.rotation.T)
+        return truth.at_rest_pixels(self.rest, self.content.tissue.faces, nodal @ self.camera.rotation.T)
 
     def stage(self, state: SceneState, spp: int, integrator: str = "direct") -> Stage:
-        """A Mitsuba stage of a state, with bodies `cortex`, `rim` and `tool`."""
-        return Stage(self.variant, self.camera, self._bodies(state), self.lamps, spp, integrator)
+        """A Mitsuba stage of a state: bodies `tissue`, `metal`, and `static0` onwards."""
+        bodies = {"tissue": replace(self.content.tissue, vertices=state.vertices, film=self._film(state))}
+        wet = (body for body in self.content.static if isinstance(body.material, Wet))
+        bodies |= {f"static{k}": body for k, body in enumerate(wet)}
+        shape, metal = self._metal(state)
+        bodies["metal"] = Body(*shape, np.zeros((len(shape.vertices), 2), np.float32), metal)
+        return Stage(self.variant, self.camera, bodies, self.content.lamps, spp, integrator)
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Moves a stage to another state."""
-        stage.move("cortex", state.vertices, film=self._film(state))
-        if self._tool.parts:
-            steel = self._steel(state)
-            stage.move("tool", steel.vertices, glow=self._mirrored(steel))
+        stage.move("tissue", state.vertices, film=self._film(state))
+        if self.content.instruments is not None:
+            shape, metal = self._metal(state)
+            stage.move("metal", shape.vertices, glow=metal.glow)
 
     def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
-        return camera_sensor.record(radiance, self._appearance.sensor, np.random.default_rng([seed, 1]))
+        return camera_sensor.record(radiance, self._sensor, np.random.default_rng([seed, 1]))
 
     def _posed(self, state: SceneState) -> Shape:
-        return Shape(instrument.pose(self._tool, state.tips, state.shafts), self._tool.faces)
+        """The instruments."""
+        instruments = self.content.instruments
+        return _NOTHING if instruments is None else instruments.pose(state.tips, state.shafts)
 
-    def _film(self, state: SceneState) -> Floats:
-        return instrument.film(self._tool, state.tips, state.vertices)
+    def _film(self, state: SceneState) -> Floats | None:
+        instruments = self.content.instruments
+        return None if instruments is None else instruments.film(state.tips, state.vertices)
 
     def _gathered(self, states: Sequence[SceneState], seed: int) -> tuple[Map, Map]:
         """Mean radiance over some states in the camera and in the right one, which is 0 if there is none."""
@@ -230,12 +228,12 @@ class Renderer:
             camera = state.camera or self.camera
             power = np.float32(state.power)
             if self._stage is None:
-                self._stage = self.stage(state, self._render.spp)
+                self._stage = self.stage(state, self._settings.spp)
             else:
                 self.move(self._stage, state)
             left.append(power * self._expose(self._stage, camera, seed + 7919 * k))
             if self.right is not None:
-                other = right_camera(camera, self._render.stereo_mm)
+                other = right_camera(camera, self._settings.stereo_mm)
                 right.append(power * self._expose(self._stage, other, seed + 1 + 7919 * k))
         return (
             np.asarray(np.mean(left, axis=0), np.float32),
@@ -243,83 +241,45 @@ class Renderer:
         )
 
     def _expose(self, stage: Stage, camera: Camera, seed: int) -> Map:
-        spot = light.spot(camera, self.camera, self._appearance.light)
-        return stage.render(seed % 2**32, camera) * spot[..., None]
+        return stage.render(seed % 2**32, camera) * self._spot(camera)[..., None]
 
-    def _bodies(self, state: SceneState) -> dict[str, Body]:
-        """All bodies of the scene with their materials."""
-        surface, appearance = self.surface, self._appearance
-        pixels = texture.resolution(self._rim.extent_mm, 2.2 * self.camera.mm_per_px)
-        frame = rim.paint(self._rim, appearance, pixels)
-        ambient = _AMBIENT * appearance.light.power * light.blackbody(appearance.light.kelvin)
-        wet = Wet(self._coat, appearance.roughness, appearance.dry_roughness, ambient, appearance.fluid_index)
-        dura = Wet(frame, _RIM_ROUGHNESS, _RIM_DRY, ambient)
-        bodies = {
-            "cortex": Body(state.vertices, surface.faces, surface.uv, wet, self._film(state)),
-            "rim": Body(*self._rim.shape, self._rim.uv, dura),
-        }
-        if self._tool.parts or "retractor" in self._render.scenery:
-            steel = self._steel(state)
-            metal = Metal(reflection.tint(self._coating, _SATIN), glow=self._mirrored(steel))
-            uv = np.zeros((len(steel.vertices), 2), np.float32)
-            bodies["tool"] = Body(steel.vertices, steel.faces, uv, metal)
-        return bodies
+    def _spot(self, camera: Camera) -> Map:
+        return light.spot(camera, self.camera, self.content.spot)
 
-    def _retractor(self) -> Shape:
-        """The blade over the rim; if there is no instrument either, an invisible face.
-
-        A scene always has a mesh of steel with a face: with or without a retractor kernels are the same.
-        """
-        if "retractor" in self._appearance.scenery:
-            points = np.concatenate([self.surface.vertices, self._rim.shape.vertices])
-            return scenery.retractor(
-                self._rim.edge, points, np.random.default_rng([self._appearance.rim_seed, 5])
-            )
-        if self._tool.parts:
-            return Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-        return Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32))
-
-    def _steel(self, state: SceneState) -> Shape:
-        """All steel as one mesh, instruments first."""
-        return joined(self._posed(state), self._blade)
-
-    def _surroundings(self) -> reflection.Theatre:
-        """Surroundings that steel mirrors: the cortex with the rim around it, coarse, and the lamps."""
-        extent = self.surface.chart.extent_mm  # close enough to the projection for the finish
-        small = cv2.resize(self._coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
-        axis = noise.centres(_MIRRORED_PX, extent)
-        inside = rim.inside(self._rim, *np.meshgrid(axis, axis))[..., None]
-        around = 0.5 * (
-            np.asarray(self._appearance.dura_albedo) + np.asarray(self._appearance.surroundings_albedo)
+    def _metal(self, state: SceneState) -> tuple[Shape, Metal]:
+        """All metal as one mesh, instruments first."""
+        parts = list(self._static_metal)
+        if self.content.instruments is not None:
+            posed = self._posed(state)
+            material = Metal(self.content.instruments.tint, self.content.instruments.glow(posed))
+            parts.insert(0, (posed, material))
+        tint, glow = (
+            np.concatenate([getattr(metal, name) for _, metal in parts]) for name in ("tint", "glow")
         )
-        wound = (small * inside + around.astype(np.float32) * (1 - inside)).astype(np.float32)
-        lit = self._appearance.light.power * light.blackbody(self._appearance.light.kelvin)
-        return reflection.Theatre(wound, extent, tuple(self.lamps), lit, self._appearance.rim_seed)
-
-    def _mirrored(self, steel: Shape) -> Floats:
-        return reflection.glow(steel, self._coating, self.camera.centre, self._theatre)
+        return joined(*(shape for shape, _ in parts)), Metal(tint, glow)
 
     def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""
         height, width = radiance.shape[:2]
-        faces = self.surface.faces
-        on = (hits.face >= 0) & (hits.face < len(faces))
+        tissue = self.content.tissue
+        on = (hits.face >= 0) & (hits.face < len(tissue.faces))
         face, bary = hits.face[on], hits.bary[on]
-        uv = truth.blend(faces, face, bary, self.surface.uv)
-        albedo = noise.sample(self._coat.albedo, uv - 0.5, 1.0)
-        light_in = truth.blend(faces, face, bary, state.power * self._irradiance(state.vertices))
-        spot = light.spot(state.camera or self.camera, self.camera, self._appearance.light).ravel()[on]
+        uv = truth.blend(tissue.faces, face, bary, tissue.uv)
+        albedo = noise.sample(self._albedo, uv - 0.5, 1.0)
+        irradiance = state.power * self._irradiance(state.vertices)
+        light_in = truth.blend(tissue.faces, face, bary, irradiance)
+        spot = self._spot(state.camera or self.camera).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
         excess = _mean(radiance.reshape(-1, 3))[on] - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
-        glare[on] = excess * self._appearance.sensor.exposure > _GLARE
+        glare[on] = excess * self._sensor.exposure > _GLARE
         return glare.reshape(height, width)
 
     def _irradiance(self, vertices: Floats) -> Floats:
         """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
-        normal = normals(Shape(vertices, self.surface.faces))
+        normal = normals(Shape(vertices, self.content.tissue.faces))
         total = np.zeros((len(vertices), 3))
-        for lamp in self.lamps:
+        for lamp in self.content.lamps:
             _add_light(vertices, normal, lamp.position, lamp.intensity, total)
         return total
 

@@ -44,9 +44,9 @@ class Hits:
 class RestFrame:
     """Ground truth of the rest frame."""
 
-    tissue: Mask  # (H, W): brain in the opening
+    tissue: Mask  # (H, W)
     area: npt.NDArray[np.float32]  # (H, W) mm2 of rest surface in the pixel; 0 off the tissue
-    scale_mm_per_px: float  # at the craniotomy's centre
+    scale_mm_per_px: float  # at the world's origin
     face: Indices  # (H, W) triangle of the fine surface; -1 off the tissue
     bary: Floats  # (H, W, 3)
     directions: Floats  # (H*W, 3) of the pixels' centre rays, camera axes, unit z; the same for any pose
@@ -62,7 +62,7 @@ class FrameTruth:
     visible: Mask  # (H, W), rest pixels: the point is in the picture and not hidden
     depth: npt.NDArray[np.float32]  # (H, W) mm along the optical axis, this frame's pixels; 0 for none
     tool: Mask  # (H, W), this frame's pixels
-    hits: Hits  # this frame's pixels, over tissue, rim and tool, in this order
+    hits: Hits  # this frame's pixels, over tissue, static bodies and instruments, in this order
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,12 @@ class ProjectedScene:
         return Hits(*_cast(self.points, self.flat, self.faces, directions, order, start, width, height))
 
 
-def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
-    """Ground truth of the rest frame, from the fine surface at rest and the rim with its scenery."""
+def trace_rest(camera: Camera, surface: Shape, static: Shape) -> RestFrame:
+    """Ground truth of the rest frame, from the fine surface at rest and what never moves."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     directions = cameras.rays(camera, pixels)
-    hits = ProjectedScene.of(camera, joined(surface, rim)).cast(None, directions)
+    hits = ProjectedScene.of(camera, joined(surface, static)).cast(None, directions)
     on_tissue = (hits.face >= 0) & (hits.face < len(surface.faces))
     face = np.where(on_tissue, hits.face, -1).astype(np.int32)
     corners = cameras.to_camera(camera, surface.vertices)[surface.faces[face[on_tissue]]]
@@ -117,19 +117,19 @@ def trace_rest(camera: Camera, surface: Shape, rim: Shape) -> RestFrame:
     )
 
 
-def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, tool: Shape) -> FrameTruth:
+def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, tool: Shape) -> FrameTruth:
     """Ground truth of one frame.
 
     Args:
         camera: the camera of this frame, with the lens of the rest frame.
         rest: of the rest frame.
         surface: the fine surface in this frame.
-        rim: with its scenery.
+        static: what never moves.
         tool: the instruments in this frame.
     """
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
-    scene = ProjectedScene.of(camera, joined(surface, rim, tool))
+    scene = ProjectedScene.of(camera, joined(surface, static, tool))
     hits = scene.cast(None, rest.directions)
     depth = np.where(hits.face >= 0, hits.along, 0.0)  # directions have unit z
 
@@ -145,7 +145,7 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, rim: Shape, too
         motion=_picture(on, local - rest.points[on], camera),
         visible=_picture(on, clear & inside, camera, bool),
         depth=depth.reshape(height, width).astype(np.float32),
-        tool=(hits.face >= len(surface.faces) + len(rim.faces)).reshape(height, width),
+        tool=(hits.face >= len(surface.faces) + len(static.faces)).reshape(height, width),
         hits=hits,
     )
 

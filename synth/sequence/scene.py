@@ -22,6 +22,7 @@ from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
+from synth.render.craniotomy import craniotomy
 from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
@@ -84,7 +85,9 @@ class RestScene:
     def renderer(self) -> Renderer:
         """Renderer of this scene for any state of its surface and instruments."""
         kinds = [gesture.kind for gesture in self.scenario.gestures]
-        return Renderer(self.surface, self.scenario.appearance, self.view, self.job, kinds)
+        appearance, job = self.scenario.appearance, self.job
+        content = craniotomy(self.surface, appearance, self.view, job, kinds)
+        return Renderer(content, self.view, appearance.sensor, job.render, job.store.extra)
 
     @property
     def tissue(self) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from synth.render.anatomy.scenery import Patty
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
 from synth.render.appearance.appearance import Appearance
-from synth.render.mitsuba.adapter import Coat
+from synth.render.materials import Coat
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]

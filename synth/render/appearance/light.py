@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from synth.render.camera.camera import Camera
-from synth.render.mitsuba.adapter import Lamp
+from synth.render.materials import Lamp
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -44,7 +44,7 @@ class Lighting:
         return 1 + self.drift * 0.5 * float(np.sin(self.phase + np.pi * part) - np.sin(self.phase))
 
 
-def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
+def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
     """The lamps, which together give a white surface in the opening a radiance of about 1."""
     colour = blackbody(lighting.kelvin)
     distance = float(np.linalg.norm(camera.centre))
@@ -56,13 +56,13 @@ def lamps(camera: Camera, lighting: Lighting) -> list[Lamp]:
         towards = _towards(camera, lighting, side)
         intensity = share * total * colour / max(float(towards[2]), 0.3)
         made.append(Lamp(distance * towards, np.zeros(3), window, intensity))
-    return made
+    return tuple(made)
 
 
-def spot(camera: Camera, rest: Camera, lighting: Lighting) -> Map:
+def spot(camera: Camera, rest: Camera, even: float) -> Map:
     """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening.
 
-    Even in the middle and fading outside; fixed to the microscope's pose `rest`.
+    Even within a radius of `even` widths of the field, fading outside; fixed to the microscope's pose `rest`.
     """
     field = rest.size[0] * rest.mm_per_px
     axis = rest.centre / np.linalg.norm(rest.centre)
@@ -75,7 +75,7 @@ def spot(camera: Camera, rest: Camera, lighting: Lighting) -> Map:
     away = (np.linalg.norm(met, axis=-1) / field).astype(np.float32)
     across, down = (np.linspace(0, _RAYS - 1, n, dtype=np.float32) for n in (width, height))
     away = cv2.remap(away, *np.meshgrid(across, down), cv2.INTER_LINEAR)
-    return np.asarray(np.clip((lighting.even + _FADE - away) / _FADE, 0, 1), np.float32)
+    return np.asarray(np.clip((even + _FADE - away) / _FADE, 0, 1), np.float32)
 
 
 def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:

@@ -14,13 +14,14 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from synth.geometry.triangles import Shape, normals
-from synth.render.mitsuba.adapter import Lamp
+from synth.render.materials import Lamp
 
 Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 _STEEL, _BLACK = 0.58, 0.045
 """Reflectance at right angles of machined steel and of the coating."""
+_SATIN = 0.10  # share of light that steel's finish scatters diffusely
 _TINT = np.array([1.0, 0.985, 0.96])
 _DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.16, 0.17, 0.18])
 _LAMPS = 7
@@ -36,31 +37,32 @@ class Theatre:
     extent_mm: float  # side of the square that it covers
     lamps: tuple[Lamp, ...]  # of the microscope
     light: Floats  # (3,) colour and power of the light on wound and theatre; 1 is white that fills the sensor
+    lens: Floats  # (3,) mm, towards which steel mirrors them
     seed: int  # of the theatre's lamps
 
 
-def tint(coat: npt.NDArray[np.floating], satin: float) -> Floats:
-    """Diffuse reflectance (V, 3) of steel that scatters a share `satin`, under a black `coat` (V,) 0 to 1."""
-    bare, black = satin * _STEEL * _TINT, np.full(3, 0.03)
+def tint(coat: npt.NDArray[np.floating]) -> Floats:
+    """Diffuse reflectance (V, 3) of steel under a black `coat` (V,) 0 to 1."""
+    bare, black = _SATIN * _STEEL * _TINT, np.full(3, 0.03)
     return np.asarray(bare + coat[:, None] * (black - bare))
 
 
-def glow(tool: Shape, coat: npt.NDArray[np.floating], lens: Floats, theatre: Theatre) -> Floats:
-    """Radiance (V, 3) that the vertices of posed instruments mirror towards the lens at (3,) mm.
+def glow(steel: Shape, coat: npt.NDArray[np.floating], theatre: Theatre) -> Floats:
+    """Radiance (V, 3) that the vertices of steel mirror towards the theatre's lens.
 
     `coat`: (V,) 0 bare to 1 coated black.
     """
-    normal = normals(tool)
-    towards = lens - tool.vertices
+    normal = normals(steel)
+    towards = theatre.lens - steel.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     mirrored = 2 * facing * normal - towards
     straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
     # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
     share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
-    mirror = _surroundings(tool.vertices, mirrored, theatre) * theatre.light
+    mirror = _surroundings(steel.vertices, mirrored, theatre) * theatre.light
     for lamp in theatre.lamps:
-        mirror += _window(tool.vertices, normal, towards, lamp)
+        mirror += _window(steel.vertices, normal, towards, lamp)
     return np.asarray(share * mirror)
 
 

@@ -11,8 +11,8 @@ import functools
 import gc
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -22,6 +22,7 @@ import numpy.typing as npt
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
+from synth.render.materials import Body, Lamp, Metal, Wet
 from synth.render.mitsuba.direct_light import trace
 from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.glow import register_glow
@@ -32,55 +33,6 @@ Floats = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 _REGISTER = 64  # bytes of a vector register
-
-
-@dataclass(frozen=True)
-class Coat:
-    """Texture maps of one body of wet tissue."""
-
-    albedo: Map  # (n, n, 3) linear reflectance
-    normal: Map  # (n, n, 3) unit normals in the surface's tangent frame
-    dry: Map  # (m, m) share of the surface under a film too thin to be smooth
-
-
-@dataclass(frozen=True)
-class Wet:
-    """A diffuse body under a wet coat."""
-
-    coat: Coat
-    roughness: float  # GGX alpha of the coat under film
-    dry_roughness: float  # GGX alpha where the film is too thin
-    ambient: Floats  # (3,) light scattered into shadows by the wound, as a white diffuser's radiance
-    index: float = 1.33  # refractive index of the coat
-
-
-@dataclass(frozen=True)
-class Metal:
-    """A polished body, whose reflections are given rather than rendered."""
-
-    tint: Floats  # (V, 3) diffuse reflectance at vertices
-    glow: Floats  # (V, 3) mirrored radiance at vertices; `Stage.move` updates it
-
-
-@dataclass(frozen=True)
-class Body:
-    """A mesh and its material."""
-
-    vertices: Floats  # (V, 3) mm
-    faces: npt.NDArray[np.int32]
-    uv: npt.NDArray[np.float32]
-    material: Wet | Metal
-    film: Floats | None = None  # (V,) mm: height of a film on the vertices, for the normals
-
-
-@dataclass(frozen=True)
-class Lamp:
-    """A round window that emits light."""
-
-    position: Floats  # (3,) mm, its middle
-    target: Floats  # (3,) mm: point that it faces
-    radius: float  # mm
-    intensity: Floats  # (3,) radiant intensity towards its target, linear RGB
 
 
 def pick(variant: str) -> str:
@@ -116,7 +68,7 @@ class Stage:
         variant: str,
         camera: Camera,
         bodies: dict[str, Body],
-        lamps: list[Lamp],
+        lamps: Sequence[Lamp],
         spp: int,
         integrator: str = "direct",
     ) -> None:
@@ -166,7 +118,7 @@ class Stage:
             self._lens.place(camera)
         lens = self._lens
         if self._layered:
-            light = trace(self._scene, lens.sensor, self._size, "tool", lens.spp, seed)
+            light = trace(self._scene, lens.sensor, self._size, "metal", lens.spp, seed)
             radiance = soften(light, self._power, lens.spp)
         else:
             image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from synth.job import reader
-from synth.job.schema import AnatomySection, Job, RenderSection, StoreSection
+from synth.job.schema import AnatomySection, Job, RenderSection
+from synth.render.anatomy import rim
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
+from synth.render.craniotomy import craniotomy
 from synth.render.mitsuba.adapter import pick
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
@@ -33,13 +35,14 @@ def made(
     job = Job(
         anatomy=AnatomySection(vertices=2500),
         render=RenderSection.model_validate(settings),
-        store=StoreSection(extra=extra),
     )
     surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
     appearance = replace(appearance, scenery=job.render.scenery)
-    return Renderer(surface, appearance, camera.place(view, job.render), job), surface.vertices
+    lens = camera.place(view, job.render)
+    content = craniotomy(surface, appearance, lens, job, ["pull"])
+    return Renderer(content, lens, appearance.sensor, job.render, extra), surface.vertices
 
 
 @pytest.mark.slow
@@ -108,7 +111,8 @@ def test_tissue_is_visible_through_the_opening_only() -> None:
     for seed in range(3):
         job = Job(seed=seed, anatomy=AnatomySection(vertices=6000), render={"size": (320, 240)})
         scene = at_rest(job)
-        rest, edge = scene.renderer.rest, scene.renderer._rim.edge
+        rest, drawn = scene.renderer.rest, scene.scenario.appearance
+        edge = rim.build(scene.surface, job.anatomy.craniotomy.radius_mm, drawn, scene.view.mm_per_px).edge
         points = scene.view.rotation.T @ (rest.points[rest.tissue.ravel()] - scene.view.translation).T
         even = 2 * np.pi * np.arange(len(edge)) / len(edge)
         opening = np.interp(np.arctan2(points[1], points[0]), even, edge, period=2 * np.pi)

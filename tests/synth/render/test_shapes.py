@@ -14,6 +14,7 @@ from synth.render import instrument
 from synth.render.anatomy import surface
 from synth.render.anatomy.chart import Chart, unroll
 from synth.render.anatomy.tree import murray
+from synth.render.appearance.reflection import Theatre
 from synth.sequence import scenario
 
 Floats = NDArray[np.float64]
@@ -92,12 +93,13 @@ def test_every_twig_has_a_parent() -> None:
 
 TIPS = np.array([[-1.0, 0.5, 2.0], [1.0, 0.5, 2.0]])
 SHAFTS = np.array([[0.3, 0.2, 0.9], [0.3, 0.2, 0.9]])
+DARK = Theatre(np.zeros((2, 2, 3), np.float32), 30.0, (), np.zeros(3), np.array([0, 0, 300.0]), seed=0)
 
 
 @pytest.mark.parametrize("kind", get_args(instrument.Kind))
 def test_an_instrument_ends_at_its_tips(kind: instrument.Kind) -> None:
-    made = instrument.build([kind], [False])
-    points = instrument.pose(made, TIPS, SHAFTS)
+    made = instrument.build([kind], [False], DARK)
+    points, _ = made.pose(TIPS, SHAFTS)
     assert np.isfinite(points).all()
     assert made.faces.max() == len(points) - 1
     goals = TIPS if kind in ("forceps", "bayonet") else TIPS.mean(axis=0, keepdims=True)

@@ -1,0 +1,48 @@
+"""Content of a scene: what the renderer is given to draw, and builds nothing of itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from synth.geometry.triangles import Shape
+from synth.render.materials import Body, Lamp
+
+Floats = npt.NDArray[np.float64]
+
+
+class Instruments(Protocol):
+    """Instruments as one mesh of polished metal that follows tips and shafts.
+
+    `tips` (2n, 3) mm and `shafts` (2n, 3), unit vectors from tip to hand: two of each for every instrument.
+    """
+
+    @property
+    def tint(self) -> Floats:
+        """(V, 3) diffuse reflectance at vertices."""
+
+    def pose(self, tips: Floats, shafts: Floats) -> Shape:
+        """The mesh in its place; only its vertices depend on it."""
+
+    def glow(self, posed: Shape) -> Floats:
+        """Radiance (V, 3) that the mesh in its place mirrors towards the camera at rest."""
+
+    def film(self, tips: Floats, surface: Floats) -> Floats:
+        """Height (V,) mm of the liquid that climbs to the tips from a tissue's vertices (V, 3) mm."""
+
+
+@dataclass(frozen=True)
+class SceneContent:
+    """What a scene shows, world axes: a tissue, bodies around it, instruments, lamps."""
+
+    tissue: Body
+    """At rest. Frames move its vertices; flow, depth and highlights are of it. Its material is `Wet`."""
+    lamps: tuple[Lamp, ...]
+    static: tuple[Body, ...] = ()
+    """Bodies that never move and are neither tissue nor instruments, though they hide both."""
+    instruments: Instruments | None = None
+    spot: float = np.inf
+    """Radius of the field that the lamps light evenly, in widths of the picture; outside light fades."""
