@@ -15,6 +15,16 @@ from .job.laws import add_law as add_law
 from .job.reader import load_job as load_job
 from .job.schema import Job as Job
 from .render.camera.camera import Camera as Camera
+from .render.content import Instruments as Instruments
+from .render.content import SceneContent as SceneContent
+from .render.materials import Body as Body
+from .render.materials import Coat as Coat
+from .render.materials import Lamp as Lamp
+from .render.materials import Metal as Metal
+from .render.materials import Wet as Wet
+from .render.scene import RenderedFrame as RenderedFrame
+from .render.scene import Renderer as Renderer
+from .render.scene import SceneState as SceneState
 from .sequence.mechanics import Mechanics as Mechanics
 from .sequence.pipeline import write_scene as write_scene
 from .sequence.scenario import Scenario as Scenario

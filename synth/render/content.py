@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -40,8 +41,8 @@ class SceneContent:
 
     tissue: Body
     """At rest. Frames move its vertices; flow, depth and highlights are of it. Its material is `Wet`."""
-    lamps: tuple[Lamp, ...]
-    static: tuple[Body, ...] = ()
+    lamps: Sequence[Lamp]
+    static: Sequence[Body] = ()
     """Bodies that never move and are neither tissue nor instruments, though they hide both."""
     instruments: Instruments | None = None
     spot: float = np.inf

@@ -59,7 +59,7 @@ def craniotomy(
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
-        static=tuple(static),
+        static=static,
         instruments=instrument.build(kinds, instrument.finish(kinds, hand), theatre) if shown else None,
         spot=appearance.light.even,
     )

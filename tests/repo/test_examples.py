@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import runpy
+import sys
 from pathlib import Path
 
+import cv2
 import dataset as dataset_recipe
 import numpy as np
 import own_flow
@@ -12,6 +15,7 @@ import own_method
 import pytest
 import read_dataset
 import render_frame
+from sources import ROOT
 
 import synth
 from synth.checks.verify import verify_dataset
@@ -54,6 +58,40 @@ def test_rendering_a_frame() -> None:
     half = render_frame.push(0.15)
     assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
+
+
+def test_a_block_of_liver_under_two_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["liver_block.py", str(tmp_path)])
+    made = runpy.run_path(str(ROOT / "examples" / "liver_block.py"))
+    block, lens, rest, truth = made["block"], made["camera"], made["rest"], made["renderer"].rest
+    turn, _ = cv2.Rodrigues(lens.rotation)
+
+    def projected(points: np.ndarray) -> np.ndarray:
+        return np.asarray(cv2.projectPoints(points, turn, lens.translation, lens.K, None)[0][:, 0])
+
+    outline = np.rint(cv2.convexHull(projected(rest).astype(np.float32))).astype(np.int32)
+    covered = cv2.fillConvexPoly(np.zeros((240, 320), np.uint8), outline, 1) > 0
+    assert (truth.tissue & covered).sum() / (truth.tissue | covered).sum() > 0.98
+    corners = (rest + 3 * made["dent"])[block.faces[truth.face[truth.tissue]]]
+    moved = projected(np.einsum("nk,nkc->nc", truth.bary[truth.tissue], corners))
+    flow, pixels = np.load(tmp_path / "3.npy"), np.argwhere(truth.tissue)[:, ::-1]
+    np.testing.assert_allclose(flow[truth.tissue], moved - pixels, rtol=0, atol=1e-6)
+    sunk_px = 3 * np.sin(np.radians(15)) * 2200 / 291  # 3 mm along z, 9 mm above the plane at 300 mm
+    assert np.linalg.norm(flow, axis=2).max() == pytest.approx(sunk_px, rel=0.03)
+    assert not flow[~truth.tissue].any()
+    pictures = np.stack([cv2.imread(str(tmp_path / f"{k}.png")) for k in range(4)]).astype(float)
+    assert np.abs(np.diff(pictures, axis=0)).max(axis=(1, 2, 3)).min() > 100, "highlights move with the dent"
+    # Each lamp has a highlight on its own side, and both have two.
+    sides = []
+    for lamps in (made["lamps"][:1], made["lamps"][1:], made["lamps"]):
+        shot = synth.Renderer(synth.SceneContent(block, lamps), lens).render(synth.SceneState(rest), 0)
+        assert not shot.tool.any()
+        sides.append([int(half.sum()) for half in np.split(shot.glare, 2, axis=1)])
+    (left, none), (empty, right), both = sides
+    assert none < 0.02 * left
+    assert empty < 0.02 * right
+    assert both == [pytest.approx(left, rel=0.2), pytest.approx(right, rel=0.2)]
+    assert min(left, right) > 100
 
 
 def test_a_custom_law_stiffens() -> None:
