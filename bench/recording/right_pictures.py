@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from bench.recording.stereo_pairing import StereoPairing
 from bench.recording.stereo_timing import StereoTiming
+from synth.errors import UserError
+from synth.flow import image, mask_detection
+from synth.flow.estimator import Flags, Rgb
+from synth.flow.stereo import rest
+from synth.flow.stereo.rig import Rectified
 from synth.recording_flow import stereo
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass
 from synth.recording_flow.stereo import RightCamera
+
+_SAME = 0.2  # share of the left picture's change below which the right picture is frozen
+_COPY = 0.03  # share of the picture's detail: the noise of two cameras differs by more
+_LEAST_TOOL = 300  # px
+_NEAR = np.ones((25, 25), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -20,8 +30,8 @@ class StereoQuality(stereo.StereoQuality):
 
     copied: bool = False  # whether the right pictures are copies of the left ones
     frozen: int = 0  # frames in which only the left picture changes
-    tool_behind_px: float = 0.0  # disparity of tissue minus that of the tool; 0: unknown
-    lag_s: float = 0.0  # of the right camera; negative: early
+    tool_behind_px: float = 0.0  # disparity of the surrounding tissue minus that of the tool; 0: unknown
+    lag_s: float = 0.0  # of the right camera; negative: early; 0: none, or unknown
     lag_from_s: float | None = None  # time from which on it is late or early; None: the start
 
     def describe(self) -> str:
@@ -36,21 +46,32 @@ class RightPictures:
     """Compares the pictures of both cameras, frame by frame, the rest frame first."""
 
     def __init__(self, video: VideoPass) -> None:
-        self._video, self._pairing = video, StereoPairing()
+        self._video = video
         self._timing: StereoTiming | None = None
+        self._last: tuple[Rgb, Rgb] | None = None
+        self._copied, self._frozen, self._largest = True, 0, 0
+        self._tool: tuple[Flags, Rgb, Rgb] | None = None  # the largest tool mask, and its frame's pictures
 
     def add(self, frame: FrameMotion) -> None:
         """Adds a frame; one without a right picture is ignored."""
-        camera = self._video.stereo
-        if frame.right is None or not isinstance(camera, RightCamera) or camera.stereo is None:
+        camera, left, right = self._video.stereo, frame.rgb, frame.right
+        if right is None or not isinstance(camera, RightCamera) or camera.stereo is None:
             return
         tissue = self._video.rest.tissue
         masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
-        self._pairing.add(frame.rgb, frame.right, masked)
         if self._timing is None:
-            self._timing = StereoTiming(camera.stereo, frame.rgb, frame.right, tissue & ~masked)
+            self._timing = StereoTiming(camera.stereo, left, right, tissue & ~masked)
         else:
-            self._timing.add(frame.rgb, frame.right, frame.time_s or 0.0)
+            self._timing.add(left, right, frame.time_s or 0.0)
+        # A flat surface may look the same in both cameras, but not in every frame.
+        self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
+        if self._last is not None:
+            before_left, before_right = self._last
+            self._frozen += _change(right, before_right) < _SAME * _change(left, before_left)
+        self._last = left, right
+        tool = masked & ~mask_detection.glare(left, 3)
+        if tool.sum() > max(_LEAST_TOOL, self._largest):
+            self._largest, self._tool = int(tool.sum()), (tool, left, right)
 
     @property
     def quality(self) -> StereoQuality | None:
@@ -61,6 +82,27 @@ class RightPictures:
             return None
         if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
             return StereoQuality(**vars(found))
-        behind_px = self._pairing.find_tool_behind_px(camera.stereo.rectified)
-        pair = self._pairing.copied, self._pairing.frozen, behind_px, *self._timing.find_lag_s()
-        return StereoQuality(*vars(found).values(), *pair)
+        pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
+        return StereoQuality(*vars(found).values(), *pair, *self._timing.find_lag_s())
+
+    def _tool_behind_px(self, rectified: Rectified) -> float:
+        """See `StereoQuality`."""
+        if self._tool is None:
+            return 0.0
+        tool, *pair = self._tool
+        left, right = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
+        everywhere = np.ones(tool.shape, bool)
+        try:
+            found = rest.match(left, right, everywhere, everywhere, refine=False)
+        except UserError:  # too little in common
+            return 0.0
+        inner = found.found & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)
+        around = found.found & ~rectified.flags(tool, 0) & (cv2.dilate(inner.astype(np.uint8), _NEAR) > 0)
+        if min(inner.sum(), around.sum()) < _LEAST_TOOL / 2:
+            return 0.0
+        return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
+
+
+def _change(one: Rgb, other: Rgb) -> float:
+    """Mean difference of two pictures [grey levels]."""
+    return float(cv2.absdiff(np.ascontiguousarray(one), np.ascontiguousarray(other)).mean())
