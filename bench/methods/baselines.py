@@ -56,8 +56,7 @@ class Baseline:
         if self._view is None or self._view[0] is not scene:
             self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         view = self._view[1]
-        mean = view.resample.mean
-        fields = mean(shift.transpose(2, 0, 1), scene.tissue), view.mask, mean(confidence, scene.tissue)
+        fields = view.mean(shift.transpose(2, 0, 1)), view.mask, view.mean(confidence)
         return ForceEstimate(assumed_young(scene.young_kpa) * self._rule(*fields))
 
 

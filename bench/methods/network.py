@@ -39,15 +39,8 @@ class Model:
 
     def described(self) -> dict[str, object]:
         """The model's properties, for the report."""
-        settings = self.predictor.card.settings
-        return {
-            "preset_size": settings.size,
-            "extent_mm": settings.extent_mm,
-            "width": settings.arch.width,
-            "stem": settings.arch.stem,
-            "input": settings.input,
-            "force_gain": self.predictor.card.force_gain,
-        }
+        card = self.predictor.card
+        return {**card.settings.model_dump(mode="json"), "force_gain": card.force_gain}
 
     @property
     def notes(self) -> list[str]:

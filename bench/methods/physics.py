@@ -87,8 +87,7 @@ class Physics:
             moved, spread = frame.motion.motion, frame.motion.deviation
         if self._scene is not scene:
             self._begin(scene, moved.shape[2])
-        mean = self._view.resample.mean
-        moved, spread = (mean(field.transpose(2, 0, 1), scene.tissue) for field in (moved, spread))
+        moved, spread = (self._view.mean(field.transpose(2, 0, 1)) for field in (moved, spread))
         observed = observe(moved, spread, self._view.mask)
         self._frames.append(observed)
         if not picture:
@@ -137,7 +136,7 @@ class Physics:
     def _picture(self, found: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
-        known, resample = basis.known, self._view.resample
+        known, view = basis.known, self._view
         step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
         at = np.rint(known.nodes / step).astype(int)
         lattice = np.zeros((2 * at.max() + 1,) * 2)
@@ -145,8 +144,8 @@ class Physics:
             np.linalg.norm(found.load, axis=1) / known.node_area
         )
         axes = [
-            (np.arange(n) - centre) * resample.scale_mm_per_px / step + at.max()
-            for n, centre in zip(resample.shape, resample.centre_px[::-1], strict=True)
+            (np.arange(n) - centre) * view.scale_mm_per_px / step + at.max()
+            for n, centre in zip(view.shape, view.centre_px[::-1], strict=True)
         ]
         shown = map_coordinates(lattice, np.meshgrid(*axes, indexing="ij"), order=1, mode="constant")
         return np.asarray(shown, np.float32)

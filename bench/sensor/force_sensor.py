@@ -28,7 +28,6 @@ class Processed:
     time_s: Curve  # (N,) rising [s]
     force_mn: Curve  # (N, 3) mN; NaN in gaps
     noise_floor_mn: float  # filtered standard deviation without contact, all components; 0: unknown
-    drift_mn: float  # largest drift that was removed
     steps: tuple[str, ...]  # of the processing, in order, in words
 
 
@@ -48,12 +47,12 @@ def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processe
     if sensor.to_camera is not None:
         values = values @ np.array(sensor.to_camera).T
         steps.append("rotated to the camera's axes")
-    values, drift = _tared(force.time_s, values, sensor, steps)
+    values = _tared(force.time_s, values, sensor, steps)
     values = _smooth(force.time_s, values, sensor.low_pass_hz, steps)
     floor = _floor(force.time_s, values, sensor)
     if offset_s:
         steps.append(f"clock shifted by {offset_s * 1000:+.1f} ms")
-    return Processed(force.time_s + offset_s, values, floor, drift, tuple(steps))
+    return Processed(force.time_s + offset_s, values, floor, tuple(steps))
 
 
 def force_at(processed: Processed, time_s: Curve) -> Curve:
@@ -84,10 +83,10 @@ def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Curve:
     return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
 
 
-def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -> tuple[Curve, float]:
+def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -> Curve:
     """Subtracts tare and drift: interpolated medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
-        return values, 0.0
+        return values
     found = []
     for start, stop in sensor.free_s:
         inside = (time_s >= start) & (time_s <= stop) & np.isfinite(values).all(axis=1)
@@ -100,7 +99,7 @@ def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -
     drift = float(np.linalg.norm(zero - zero[0], axis=1).max())
     word = "tare" if len(middles) == 1 else f"tare and drift ({drift:.1f} mN)"
     steps.append(f"{word} from {len(middles)} contact-free span{'s' * (len(middles) > 1)}")
-    return values - zero, drift
+    return np.asarray(values - zero, np.float64)
 
 
 def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]) -> Curve:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evidence import cache as stored
 from learn.data.clips import Clip
-from learn.data.grid import Grid, Resampler, centre, settled
+from learn.data.grid import Grid, GridView, settled
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.anatomy import rim
@@ -82,10 +82,7 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
     case, view, surface, motion = scene.scenario, scene.view, scene.surface, scene.motion
     frame = rim.build(surface, job.anatomy.craniotomy.radius_mm, case.appearance, view.mm_per_px).shape
     still = truth.trace_rest(view, scene.shape, frame)
-    resample = Resampler(
-        (still.tissue.shape[0], still.tissue.shape[1]), still.scale_mm_per_px, centre(still.tissue), grid
-    )
-    mask = (resample.cover(still.tissue) > 0.5).astype(np.float32)
+    cells = GridView(still.tissue, still.scale_mm_per_px, grid)
     moved = np.empty((job.frames, 2, grid.size, grid.size), np.float32)
     density = np.empty((job.frames, 3, grid.size, grid.size), np.float32)
     rest = None
@@ -94,19 +91,17 @@ def clip(job: Job, index: int, grid: Grid, name: str) -> Clip:
         pixel = camera.project(view, place.reshape(-1, 3).astype(np.float64)).reshape(*place.shape[:2], 2)
         rest = pixel if rest is None else rest
         flow = np.where(still.tissue[..., None], pixel - rest, 0.0).transpose(2, 0, 1)
-        moved[t] = resample.mean(flow * still.scale_mm_per_px, still.tissue) * mask
+        moved[t] = cells.mean(flow * still.scale_mm_per_px) * cells.mask
         load = truth.at_rest_pixels(still, surface.faces, motion.traction[t] @ view.rotation.T)
         amount = load.transpose(2, 0, 1) * still.area
-        per_cell = settled(resample.sum(amount), mask)
+        per_cell = settled(cells.sum(amount), cells.mask)
         density[t] = per_cell / np.float32(grid.pitch_mm**2 * case.tissue.young_kpa)
     return Clip(
         name=f"{index:06d}",
         content_hash=name,
         group=str(case.relief.seed),
-        family=case.family,
-        gesture=case.gestures[0].kind,
         young_kpa=case.tissue.young_kpa,
-        mask=mask,
+        mask=cells.mask,
         displacement={"ideal": moved},
         confidence=np.ones((job.frames, grid.size, grid.size), np.float32),
         density=density,

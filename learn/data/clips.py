@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
 
 Input = Literal["ideal", "recovered", "noisy", "mixed", "motion", "motion-ideal", "motion-mixed"]
-INPUTS = get_args(Input)
 FIELDS = {
     "ideal": "flow",
     "recovered": "flow_recovered",
@@ -48,7 +47,7 @@ _CURE = {
     "motion-ideal": "render with render.stereo_mm",
 }
 _ARRAYS = ("mask", "confidence", "density", "force", "motion_confidence")
-_PLAIN = ("name", "content_hash", "group", "family", "gesture", "young_kpa", "opening", "membrane")
+_PLAIN = ("name", "content_hash", "group", "young_kpa", "opening", "membrane")
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,6 @@ class Clip:
     name: str
     content_hash: str
     group: str  # sequences of equal group are never on both sides of a split
-    family: str
-    gesture: str
     young_kpa: float
     mask: NDArray[np.float32]  # (N, N) 0/1, tissue
     displacement: dict[str, NDArray[np.float32]]
@@ -106,8 +103,6 @@ def scored_source(wanted: Input) -> str:
 
 def sources(wanted: Input) -> tuple[str, ...]:
     """Displacements that an input kind uses."""
-    if wanted not in INPUTS:
-        raise UserError(f"unknown input {wanted!r}: one of {', '.join(INPUTS)}")
     return _MIXED.get(wanted, (wanted,))
 
 
@@ -126,7 +121,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     def on_grid(field: str, prepare: Callable[[Any], Any]) -> NDArray[np.float32]:
         """Means over the tissue of each frame of a field."""
         frames = (prepare(values) for values in sequence.read_sealed(field))
-        return np.stack([view.resample.mean(frame, tissue) * view.mask for frame in frames])
+        return np.stack([view.mean(frame) * view.mask for frame in frames])
 
     confidence, spatial = np.ones((sequence.frames, grid.size, grid.size), np.float32), None
     if "recovered" in wanted and "flow_confidence" in sequence:
@@ -134,7 +129,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     if "motion" in wanted:
         spatial = on_grid("motion_deviation", certainty)
     loads = (traction.transpose(2, 0, 1) * area for traction in sequence.read_sealed("traction"))
-    density = np.stack([settled(view.resample.sum(load), view.mask) for load in loads])
+    density = np.stack([settled(view.sum(load), view.mask) for load in loads])
     density /= np.float32(grid.pitch_mm**2 * young)
     return Clip(
         **_plain(sequence),
@@ -155,8 +150,6 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
 def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
     """Raises UserError if a store lacks a displacement of `FIELDS`, its scale or its stiffness."""
     for source in wanted:
-        if source not in FIELDS:
-            raise UserError(f"unknown input {source!r}: {', '.join(FIELDS)}")
         if FIELDS[source] not in sequence:
             what = "stereo motion" if has_depth(source) else f"{source} flow"
             alike = (one for one in FIELDS if has_depth(one) is has_depth(source))
@@ -175,8 +168,6 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "name": sequence.path.name,
         "content_hash": sequence.attrs["content_hash"],
         "group": name_anatomy(sequence.attrs),
-        "family": scenario.get("family") or "",
-        "gesture": first_gesture(scenario).get("kind") or "",
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "opening": sequence.attrs.get("opening_id") or "",
         "membrane": ("intact" if tissue.get("membrane") else "stripped") if tissue else "unknown",

@@ -32,12 +32,6 @@ class Grid:
     size: int
     extent_mm: float = 36.0
 
-    def __post_init__(self) -> None:
-        if self.size < 16 or self.size % 16:
-            raise UserError(f"grid size {self.size}: must be a multiple of 16, at least 16")
-        if not self.extent_mm > 0:
-            raise UserError(f"grid extent {self.extent_mm:g} mm: must be positive")
-
     @property
     def pitch_mm(self) -> float:
         return self.extent_mm / self.size
@@ -70,42 +64,48 @@ def check_scale(scale_mm_per_px: float) -> float:
     return as_positive("scale [mm/px]", scale_mm_per_px, largest=100)
 
 
-class Resampler:
-    """Resampling of a picture's pixel arrays to the grid, by hat functions as wide as the coarser of both.
+class GridView:
+    """The grid on the pictures of one video: its tissue, and the resampling of arrays of pixels to cells.
 
-    `mean` is a weighted average (for displacement), `sum` preserves the total (for force). Both apply the
-    same two small sparse matrices, to rows and columns.
+    `mean` is an average over tissue (for displacement), `sum` preserves the total (for force). Both weight
+    pixels by hat functions as wide as the coarser of pixel and cell: two small sparse matrices, for rows and
+    columns.
     """
 
     def __init__(
-        self, shape: tuple[int, int], scale_mm_per_px: float, centre_px: tuple[float, float], grid: Grid
+        self,
+        tissue: NDArray[np.bool_],
+        scale_mm_per_px: float,
+        grid: Grid,
+        centre_px: tuple[float, float] | None = None,
     ) -> None:
-        """`shape`: (H, W) of the picture; `centre_px`: (x, y) px of the grid's centre."""
-        self.grid = grid
-        self.shape = shape
-        self.scale_mm_per_px = check_scale(scale_mm_per_px)
-        self.centre_px = centre_px
-        self._rows = _hats(shape[0], centre_px[1], self.scale_mm_per_px, grid)
-        self._cols = _hats(shape[1], centre_px[0], self.scale_mm_per_px, grid)
+        """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid.
 
-    def mean(
-        self, values: NDArray[np.floating], weight: NDArray[np.floating | np.bool_]
-    ) -> NDArray[np.float32]:
-        """Weighted mean over each cell; 0 where no weight falls.
-
-        `values`: (..., H, W); `weight`: (H, W), ≥ 0. Returns (..., N, N) float32 in the unit of `values`.
+        Raises UserError for another shape, an invalid scale, or a grid without tissue.
         """
-        share = weight.astype(np.float32)
-        under = self._apply(share, self._rows, self._cols)
-        over = self._each(values * share, self._rows, self._cols)
-        good = under > 1e-6
-        return np.where(good, over / np.where(good, under, 1.0), 0.0).astype(np.float32)
+        if tissue.ndim != 2:
+            raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
+        self.tissue, self.grid, self.shape = tissue.astype(bool), grid, (tissue.shape[0], tissue.shape[1])
+        self.scale_mm_per_px = check_scale(scale_mm_per_px)
+        self.centre_px, self._centred_on = centre_px or centre(self.tissue), centre_px
+        self._cols, self._rows = (
+            _hats(self.shape[1 - axis], self.centre_px[axis], self.scale_mm_per_px, grid) for axis in (0, 1)
+        )
+        self._share = self._apply(self.tissue.astype(np.float32), self._rows, self._cols)
+        full = float(self._apply(np.ones(self.shape, np.float32), self._rows, self._cols).max(initial=0.0))
+        self.mask = (self._share / (full or 1.0) > 0.5).astype(np.float32)
+        """(N, N) 1 where more than half of a cell is tissue, else 0."""
+        if not self.mask.any():
+            raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue covers no cell of the network's grid")
 
-    def cover(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Share of each cell that `mask` (H, W) covers, 0 outside the picture. Returns (N, N) float32."""
-        inside = self._apply(np.ones(self.shape, np.float32), self._rows, self._cols)
-        full = float(inside.max(initial=0.0)) or 1.0
-        return (self._apply(mask.astype(np.float32), self._rows, self._cols) / full).astype(np.float32)
+    def mean(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Mean over the tissue in each cell; 0 where there is none.
+
+        `values`: (..., H, W). Returns (..., N, N) float32 in their unit.
+        """
+        over = self._each(values * self.tissue.astype(np.float32), self._rows, self._cols)
+        good = self._share > 1e-6
+        return np.where(good, over / np.where(good, self._share, 1.0), 0.0).astype(np.float32)
 
     def sum(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
         """Totals over each cell, which preserve the sum inside the grid.
@@ -113,6 +113,17 @@ class Resampler:
         `values`: (..., H, W), amount per pixel. Returns (..., N, N) float32, amount per cell.
         """
         return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
+
+    def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """See `to_image`: (..., N, N) → (..., H, W) float32."""
+        return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
+
+    def matches(
+        self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None
+    ) -> bool:
+        """Whether it was made from these arguments."""
+        same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.scale_mm_per_px)
+        return same and np.array_equal(self.tissue, tissue)
 
     def _each(
         self, values: NDArray[np.floating], rows: sparse.csr_array, cols: sparse.csr_array
@@ -128,10 +139,6 @@ class Resampler:
         half: NDArray[np.floating] = rows @ np.ascontiguousarray(values, np.float32)
         out: NDArray[np.floating] = (cols @ np.ascontiguousarray(half.T)).T
         return out
-
-    def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
-        """See `to_image`: (..., N, N) → (..., H, W) float32."""
-        return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
 
 
 def to_image(
@@ -156,36 +163,6 @@ def to_image(
     top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
     low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
     return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
-
-
-class GridView:
-    """The grid on one video: its resampler and tissue mask, made once for all frames."""
-
-    def __init__(
-        self,
-        tissue: NDArray[np.bool_],
-        scale_mm_per_px: float,
-        grid: Grid,
-        centre_px: tuple[float, float] | None = None,
-    ) -> None:
-        """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid."""
-        if tissue.ndim != 2:
-            raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
-        self.tissue = tissue.astype(bool)
-        self._centred_on = centre_px
-        self.resample = Resampler(
-            (tissue.shape[0], tissue.shape[1]), scale_mm_per_px, centre_px or centre(self.tissue), grid
-        )
-        self.mask = (self.resample.cover(self.tissue) > 0.5).astype(np.float32)
-        if not self.mask.any():
-            raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue covers no cell of the network's grid")
-
-    def matches(
-        self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None
-    ) -> bool:
-        """Whether it was made from these arguments."""
-        same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.resample.scale_mm_per_px)
-        return same and np.array_equal(self.tissue, tissue)
 
 
 def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -16,7 +16,6 @@ from learn.inference.predict import Predictor
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
 from learn.uncertainty.intervals import Intervals, Prediction
-from synth.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,9 @@ class Coverage:
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
-    """Coverage of a model's intervals at every level. Raises UserError if it has none."""
+    """Coverage at every level, of a model with intervals."""
     found = predictor.card.intervals
-    if found is None:
-        raise UserError("the model has no intervals; `learn calibrate` fits them")
+    assert found is not None
     rows: dict[float, list[dict[str, float]]] = {level: [] for level in LEVELS}
     far = [np.zeros(0)]
     for clip in clips:

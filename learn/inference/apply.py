@@ -48,7 +48,7 @@ def apply(
     force = np.where(trusted[:, None], [each.force_mn for each in found], np.nan)
     last = found[-1].map
     # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-    centres = motion.shrink * (np.array([each.map.view.resample.centre_px for each in found]) + 0.5) - 0.5
+    centres = motion.shrink * (np.array([each.map.view.centre_px for each in found]) + 0.5) - 0.5
     out: dict[str, Any] = {
         "density": np.stack([one.map.density for one in found]),
         "total_force_mn": np.where(trusted, force_size(force), np.nan),

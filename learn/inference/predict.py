@@ -121,17 +121,15 @@ class Predictor:
         height, width = view.tissue.shape
         if flow.shape != (height, width, 2):
             raise UserError(f"flow: expected ({height}, {width}, 2), got {flow.shape}")
-        mean = view.resample.mean
         if not self.card.settings.arch.depth:
-            shift = mean(flow.transpose(2, 0, 1) * view.resample.scale_mm_per_px, view.tissue)
-            return shift, None if confidence is None else mean(confidence, view.tissue)[None]
+            shift = view.mean(flow.transpose(2, 0, 1) * view.scale_mm_per_px)
+            return shift, None if confidence is None else view.mean(confidence)[None]
         if moved is None:
             raise UserError("this model needs motion in three dimensions: give it stereo or depth images")
         for what, values in (("motion", moved.motion), ("its deviation", moved.deviation)):
             if values.shape != (height, width, 3):
                 raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")
-        shift = mean(moved.motion.transpose(2, 0, 1), view.tissue)
-        return shift, mean(certainty(moved.deviation), view.tissue)
+        return view.mean(moved.motion.transpose(2, 0, 1)), view.mean(certainty(moved.deviation))
 
     @torch.inference_mode()
     def density(
@@ -216,7 +214,7 @@ class ForceMap:
 
     def to_image(self) -> NDArray[np.float32]:
         """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
-        return self.view.resample.to_image(self.magnitude)
+        return self.view.to_image(self.magnitude)
 
 
 def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:

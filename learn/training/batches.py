@@ -101,8 +101,6 @@ class FrameDataset:
     def __init__(self, clips: Sequence[Clip], settings: TrainingSettings) -> None:
         self.clips, self.settings = list(clips), settings
         self.sources = sources(settings.input)
-        if not self.clips:
-            raise UserError("no sequence to train on")
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
                 raise UserError(

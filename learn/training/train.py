@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 from lightning_fabric import Fabric
 from numpy.typing import NDArray
+from tensorboardX import SummaryWriter
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 from torchmetrics.aggregation import MeanMetric
 
@@ -28,7 +30,6 @@ from learn.settings import TrainingSettings, replace
 from learn.split import Split, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
 from learn.training.gpu_batches import place_frames
-from learn.training.log import Log
 from learn.training.threads import make_fabric
 from synth.errors import UserError, as_user_error
 from synth.system.terminal import ProgressCallback
@@ -68,14 +69,17 @@ def train(
         run = _start(card, state)
         net, run.optimizer = fabric.setup(run.model, run.optimizer)
         frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
-        with Log(out, run.epoch) if fabric.is_global_zero else nullcontext() as write:
+        board = None
+        if fabric.is_global_zero:  # events after the epoch that a run is continued from are dropped
+            board = SummaryWriter(str(out / "tensorboard"), purge_step=run.epoch)
+        with board or nullcontext():
             for epoch in range(run.epoch, settings.epochs):
                 numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
                 numbers |= select_score(net, chooser, scales, fabric.device)
                 improved = run.end_epoch(numbers["select_r2"], settings)
                 numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
-                if write is not None:
-                    write(epoch, numbers)
+                if board is not None:
+                    _write_numbers(out / "history.jsonl", board, epoch, numbers)
                     if improved:
                         gain = numbers["select_gain"]
                         best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
@@ -89,6 +93,15 @@ def train(
             shutil.rmtree(out)
         raise
     return checkpoint.read_card(out)
+
+
+def _write_numbers(file: Path, board: SummaryWriter, epoch: int, numbers: dict[str, float]) -> None:
+    """Writes the numbers of epoch `epoch`, counted from 0, as a line of JSON and as TensorBoard events."""
+    lines = file.read_text().splitlines()[:epoch] if file.exists() else []
+    file.write_text("\n".join([*lines, json.dumps(numbers)]) + "\n")
+    for name, value in numbers.items():
+        board.add_scalar(name.replace("_", "/", 1), value, epoch)
+    board.flush()
 
 
 @dataclasses.dataclass

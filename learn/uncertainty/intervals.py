@@ -115,9 +115,7 @@ class Intervals:
             raise ValueError(f"the distribution doesn't have {count} features")
 
     def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:
-        """Intervals of the frames' forces, per unit stiffness. Raises UserError for an unknown level."""
-        if str(level) not in self.size.factors:
-            raise UserError(f"level {level:g}: the model has intervals of {', '.join(self.size.factors)}")
+        """Intervals of the frames' forces at a level of `LEVELS`, per unit stiffness."""
         features = frame_features(predicted, self.force_unit)
         wide = _widen(self.distribution, self.size.scale, predicted.motion, features)
         half = wide * self.size.half(features, level)

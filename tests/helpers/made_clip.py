@@ -20,8 +20,6 @@ def made_clip(
         name=str(name),
         content_hash=str(name),
         group=str(name),
-        family="",
-        gesture="pull",
         young_kpa=2.0,
         mask=np.ones((n, n), np.float32) if mask is None else mask,
         displacement={"ideal": moved, "recovered": moved},

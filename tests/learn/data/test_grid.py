@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 import torch
 
-from learn.data.grid import CHANNELS, Grid, Resampler, Scales, channels, divergence, settled
+from learn.data.grid import CHANNELS, Grid, GridView, Scales, channels, divergence, settled
 from learn.training.batches import turned
 
 GRID = Grid(64, 36.0)
 
 
-def resampler(shape: tuple[int, int], scale: float) -> Resampler:
-    return Resampler(shape, scale, ((shape[1] - 1) / 2, (shape[0] - 1) / 2), GRID)
+def whole(shape: tuple[int, int], scale: float) -> GridView:
+    return GridView(np.ones(shape, bool), scale, GRID)
 
 
 @pytest.mark.parametrize(("shape", "scale"), [((300, 400), 0.06), ((40, 52), 0.5), ((30, 36), 1.1)])
 def test_totals_are_preserved_at_any_scale(shape: tuple[int, int], scale: float) -> None:
     y, x = np.indices(shape)
     blob = np.exp(-((x - shape[1] / 2 - 3) ** 2 + (y - shape[0] / 2) ** 2) * (scale / 3) ** 2)
-    carried = resampler(shape, scale).sum(blob)
+    carried = whole(shape, scale).sum(blob)
     assert carried.sum(dtype=np.float64) == pytest.approx(blob.sum(), rel=1e-4)
 
 
@@ -28,7 +28,7 @@ def test_totals_are_preserved_at_any_scale(shape: tuple[int, int], scale: float)
 def test_a_linear_field_stays_the_same_field_in_mm(shape: tuple[int, int], scale: float) -> None:
     y, x = np.indices(shape)
     field = 0.02 * (x - (shape[1] - 1) / 2) * scale - 0.01 * (y - (shape[0] - 1) / 2) * scale
-    carried = resampler(shape, scale).mean(field, np.ones(shape, bool))
+    carried = whole(shape, scale).mean(field)
     node = (np.arange(64) - 31.5) * GRID.pitch_mm
     expected = 0.02 * node[None, :] - 0.01 * node[:, None]
     inner = slice(26, 38)
@@ -39,13 +39,13 @@ def test_pixels_outside_the_mask_do_not_count() -> None:
     tissue = np.zeros((72, 72), bool)
     tissue[:, 20:] = True
     field = np.where(tissue, 1.0, 1e6)
-    carried = resampler((72, 72), 0.5).mean(field, tissue)
+    carried = GridView(tissue, 0.5, GRID, (35.5, 35.5)).mean(field)
     assert set(np.unique(carried)) <= {0.0, 1.0}
 
 
 def test_grid_values_on_the_picture() -> None:
     field = np.indices((64, 64))[1].astype(np.float32) * GRID.pitch_mm
-    back = resampler((72, 72), 0.5).to_image(field)
+    back = whole((72, 72), 0.5).to_image(field)
     np.testing.assert_allclose(np.diff(back[36, 5:-5]), 0.5, atol=1e-5)
 
 

@@ -76,7 +76,9 @@ def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, 
     cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
     place = found["centres_px"][2], float(found["scale_mm_per_px"]), float(found["pitch_mm"])
     there = to_image(cells, motion.tissue.shape, *place)
-    back = view.resample.mean(there, np.ones(motion.tissue.shape, bool))
+    back = GridView(np.ones_like(motion.tissue), motion.scale_mm_per_px, predictor.grid, view.centre_px).mean(
+        there
+    )
     assert np.abs(back - cells)[view.mask > 0].max() < 0.1
     row, column = (np.average(axis, weights=there) for axis in np.indices(there.shape))
     x, y = found["centres_px"][2]
