@@ -30,11 +30,6 @@ class Field:
         """Whether it has one slice per frame of the size of the picture."""
         return self.dims[:3] == (TIME, ROW, COLUMN)
 
-    @property
-    def optional(self) -> bool:
-        """Whether a sequence of the default job may lack it."""
-        return self.stored not in ("always", "usually")
-
     def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
         """Shape for `frames` frames of `size` = (height, width) [px]."""
         lengths = {TIME: frames, ROW: size[0], COLUMN: size[1]}

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
@@ -85,14 +85,12 @@ def parse_rule(
 ) -> DatasetSplit:
     """A split without sides, parsed from a command line; `by` opening implies `share_anatomy`. May raise
     UserError."""
-    if by not in get_args(By):
-        raise UserError(f"by {by}: is not one of {', '.join(get_args(By))}")
-    try:
-        train, validation, test = (float(word) for word in shares.split(","))
-    except ValueError:
-        raise UserError(f"shares {shares}: must be three numbers, as 0.7,0.15,0.15") from None
     shared = share_anatomy or by == "opening"
-    return DatasetSplit(cast(By, by), (train, validation, test), tuple(held_out), shared, apart_mm)
+    given = {"by": by, "shares": shares.split(","), "held_out": held_out, "share_anatomy": shared}
+    try:
+        return TypeAdapter(DatasetSplit).validate_python({**given, "apart_mm": apart_mm})
+    except ValidationError as error:
+        raise UserError(f"by {by}, shares {shares}: {first_mistake(error)}") from None
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:

@@ -199,7 +199,6 @@ class FieldReader:
         self.shape: tuple[int, ...] = array.shape
         self.stored: np.dtype[Any] = array.dtype  # type on disk; values are returned in the table's type
         self.dtype: np.dtype[Any] = dtype
-        self.ndim = len(self.shape)
         self.attrs: dict[str, Any] = dict(array.attrs)
         self.dims: tuple[str, ...] = tuple(array.metadata.dimension_names or ())
 

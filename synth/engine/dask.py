@@ -166,11 +166,11 @@ def open_to(cluster: str | dict[str, Any]) -> str:
         return "" if kind == "tls" or local else f"{host} is reached unencrypted (tls://... is not)"
     scheduler = cluster.get("scheduler_options")
     stated = {*cluster, *(scheduler if isinstance(scheduler, dict) else ())}
-    found = (
-        [] if {"interface", "host"} & stated else ["the scheduler listens on every interface (`interface:`)"]
-    )
-    found += [] if cluster.get("security") else ["and is reached unencrypted (`security: true`)"]
-    return " ".join(found).removeprefix("and ")
+    risks = {
+        "the scheduler listens on every interface (`interface:`)": not {"interface", "host"} & stated,
+        "it is reached unencrypted (`security: true`)": not cluster.get("security"),
+    }
+    return " and ".join(risk for risk, holds in risks.items() if holds)
 
 
 def _note(who: str) -> None:

@@ -25,7 +25,6 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from synth.errors import UserError
 from synth.flow import kernels
 from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import GREY
@@ -91,9 +90,7 @@ class CorrectionNet(nn.Module):
 
 @cache
 def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
-    """A network with its weights. Raises UserError if the file is missing."""
-    if not path.is_file():
-        raise UserError(f"{path.name}: this installation lacks the weights of the flow correction")
+    """A network with its weights."""
     net = CorrectionNet(channels, parts)
     state = torch.load(path, map_location="cpu", weights_only=True)
     net.load_state_dict({name: value.float() for name, value in state.items()})

@@ -44,10 +44,9 @@ def tool(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Instrument mask (H, W) of `rgb` (H, W, 3) uint8, grown by 2 px.
 
     It joins the output of the U-Net of `toolnet`, trained on rendered instruments, with grey bodies (steel)
-    that the network does not reject. Without weights it consists of the grey bodies alone.
+    that the network does not reject.
     """
-    net = toolnet.load()
-    return _grow(grey_bodies(rgb) if net is None else both(rgb, net), 2)
+    return _grow(both(rgb, toolnet.load()), 2)
 
 
 def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:

@@ -58,12 +58,10 @@ def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 @cache
-def load(path: Path = WEIGHTS) -> ToolNet | None:
-    """The network with its weights; None if the file is missing."""
-    if not path.is_file():
-        return None
+def load() -> ToolNet:
+    """The network with its weights."""
     net = ToolNet()
-    net.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))  # half precision, widened
+    net.load_state_dict(torch.load(WEIGHTS, map_location="cpu", weights_only=True))  # half precision, widened
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 

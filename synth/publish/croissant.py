@@ -36,17 +36,22 @@ def describe(folder: Folder) -> dict[str, Any]:
         f"{len(facts['done'])} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain "
         "surface under load, with true motion, traction, force, depth and visibility."
     )
+    base = json.loads(_BASE.read_text("utf-8"))
+    table = (folder.root / index.NAME).read_bytes()
+    base["distribution"][0] |= {
+        "contentSize": f"{len(table)} B",
+        "sha256": hashlib.sha256(table).hexdigest(),
+    }
+    base["recordSet"][0]["field"] = _columns()
     creators = [{"@type": "sc:Person", "name": name} for name in about.authors]
     stated = {"creator": creators, "license": about.licence}
     fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
     return {
-        **json.loads(_BASE.read_text("utf-8")),
+        **base,
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
         "description": about.summary or summary,
         **{key: value for key, value in stated.items() if value},
-        "distribution": _distribution(folder),
-        "recordSet": [_sequences()],
         "rai:dataAnnotationProtocol": f"Labels are the simulation's own state. Fields: {fields}",
         "rai:dataLimitations": facts["limits"],
         "rai:dataBiases": [
@@ -56,32 +61,9 @@ def describe(folder: Folder) -> dict[str, Any]:
     }
 
 
-def _distribution(folder: Folder) -> list[dict[str, Any]]:
-    data = (folder.root / index.NAME).read_bytes()
+def _columns() -> list[dict[str, Any]]:
+    """The columns of the index."""
     return [
-        {
-            "@type": "cr:FileObject",
-            "@id": "index",
-            "name": "index",
-            "description": "One row per sequence.",
-            "contentUrl": index.NAME,
-            "contentSize": f"{len(data)} B",
-            "encodingFormat": "application/x-parquet",
-            "sha256": hashlib.sha256(data).hexdigest(),
-        },
-        {
-            "@type": "cr:FileSet",
-            "@id": "stores",
-            "name": "stores",
-            "description": "Zarr v3 groups, one per sequence; the column path of the index has their names.",
-            "encodingFormat": "application/vnd.zarr",
-            "includes": "*.zarr/**",
-        },
-    ]
-
-
-def _sequences() -> dict[str, Any]:
-    fields = [
         {
             "@type": "cr:Field",
             "@id": f"sequences/{column.name}",
@@ -92,11 +74,3 @@ def _sequences() -> dict[str, Any]:
         }
         for column in index.COLUMNS
     ]
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "sequences",
-        "name": "sequences",
-        "description": "The index.",
-        "key": {"@id": "sequences/index"},
-        "field": fields,
-    }

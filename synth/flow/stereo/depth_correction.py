@@ -65,11 +65,7 @@ def describe(
 
 
 def correct(features: NDArray[np.float32]) -> tuple[Map, Map]:
-    """Correction of the depth motion and its standard deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w).
-
-    Raises:
-        UserError: the weights are missing.
-    """
+    """Correction of the depth motion and its deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w)."""
     height, width = features.shape[1:]
     found = correction.predict(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]
     return UNIT_MM * found[0], UNIT_MM * np.exp(0.5 * found[1].clip(-8, 5))
