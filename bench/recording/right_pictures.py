@@ -82,8 +82,15 @@ class RightPictures:
             return None
         if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
             return StereoQuality(**vars(found))
-        pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
-        return StereoQuality(*vars(found).values(), *pair, *self._timing.find_lag_s())
+        lag_s, from_s = self._timing.find_lag_s()
+        return StereoQuality(
+            **vars(found),
+            copied=self._copied,
+            frozen=self._frozen,
+            tool_behind_px=self._tool_behind_px(camera.stereo.rectified),
+            lag_s=lag_s,
+            lag_from_s=from_s,
+        )
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
         """See `StereoQuality`."""

@@ -17,7 +17,6 @@ from safetensors.numpy import save_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
 from synth.dataset import provenance
-from synth.dataset.attributes import first_gesture
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError, as_user_error
