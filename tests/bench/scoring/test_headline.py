@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
-from synth.recording_flow.local_flow import LocalFlow
+from synth.recording_flow.flow import LocalFlow
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.protocol import ForceEstimate, Method, MethodContext
