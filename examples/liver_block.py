@@ -16,7 +16,7 @@ uv = np.stack(np.meshgrid(*[np.linspace(0, 1, 120)] * 2), axis=-1).reshape(-1, 2
 x, y = np.sin(np.pi * (uv - 0.5)).T
 rest = np.stack([17 * x, 13 * y, 9 * ((1 - x**8) * (1 - y**8)) ** 0.25 - 1.2 * (x**2 + y**2)], axis=1)
 
-# Maps: lobules of dark red liver, more or less full of fat, under a wet film with dry patches.
+# Maps: lobules of dark red liver, more or less full of fat, under a wet layer with dry patches.
 waves = [ndimage.gaussian_filter(np.random.default_rng(s).normal(size=(1024, 1024)), s) for s in (90, 7, 2)]
 regions, lobules, grain = (wave / wave.std() for wave in waves)
 fat = 1 / (1 + np.exp(1.2 - 0.6 * regions - 0.7 * lobules - 0.4 * grain))[..., None]
