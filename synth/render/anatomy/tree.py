@@ -63,9 +63,8 @@ def grow(
     nearest = np.flatnonzero(buds)[nearest]
     # A trunk supplies what is next to it, also where it has no bud.
     distance = np.where(cKDTree(nodes).query(attractors)[0] < kill, 0.0, distance)
-    total = len(nodes)
-    children = np.bincount(parent[parent >= 0], minlength=total)
-    heading = np.zeros((total, 2))  # of new nodes; those at the start sprout to any side
+    children = np.bincount(parent[parent >= 0], minlength=len(nodes))
+    heading = np.zeros((len(nodes), 2))  # of new nodes; those at the start sprout to any side
     for _ in range(int(4 * _REACH_MM / step) + 400):
         keep = distance > kill
         attractors, distance, nearest = attractors[keep], distance[keep], nearest[keep]
@@ -73,20 +72,12 @@ def grow(
         if not pulls.any():
             break
         positions = np.concatenate(all_nodes)
-        toward: Floats = attractors[pulls] - positions[nearest[pulls]]
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        pulled, index = np.unique(nearest[pulls], return_inverse=True)
-        direction: Floats = np.stack(
-            [np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1
-        )
-        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+        pulled, direction = _pulls(nearest[pulls], attractors[pulls] - positions[nearest[pulls]])
         direction += _INERTIA * heading[pulled] + wander * rng.standard_normal(direction.shape)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         # A node pulled evenly from two sides would sprout the same twig again and again.
         free = children[pulled] < 3
-        stuck = np.isin(nearest, pulled[~free])
-        if stuck.any():
-            distance = np.where(stuck, 0.0, distance)
+        distance = np.where(np.isin(nearest, pulled[~free]), 0.0, distance)
         if not free.any():
             continue
         sprouts = positions[pulled[free]] + step * direction[free]
@@ -98,9 +89,19 @@ def grow(
         near, which = cKDTree(sprouts).query(attractors)
         closer = (near < distance) & (distance > 0)
         distance = np.where(closer, near, distance)
-        nearest = np.where(closer, which + total, nearest)
-        total += len(sprouts)
+        nearest = np.where(closer, which + len(positions), nearest)
     return np.concatenate(all_nodes), np.concatenate(all_parent)
+
+
+def _pulls(nearest: Ints, toward: Floats) -> tuple[Ints, Floats]:
+    """Nodes (P,) with attractors, and the unit mean (P, 2) of the directions to theirs.
+
+    `nearest`: (A,) the node of each attractor; `toward`: (A, 2) mm, from the node to it.
+    """
+    toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+    pulled, index = np.unique(nearest, return_inverse=True)
+    mean = np.stack([np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1)
+    return pulled, mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
 
 
 def murray(parent: Ints, leaf: float) -> Floats:

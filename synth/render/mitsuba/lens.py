@@ -124,6 +124,18 @@ def _film(width: int, height: int) -> dict[str, Any]:
     }
 
 
+def _undistorted(goal_x: Any, goal_y: Any, v: dict[str, Any]) -> tuple[Any, Any]:
+    """Normalised coordinates that Brown-Conrady coefficients `v` take to the goal."""
+    x, y = goal_x, goal_y
+    for _ in range(6):  # each round reduces the error by the size of the distortion
+        r2 = x * x + y * y
+        radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * v["k3"]))
+        dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)
+        dy = 2 * v["p2"] * x * y + v["p1"] * (r2 + 2 * y * y)
+        x, y = (goal_x - dx) / radial, (goal_y - dy) / radial
+    return x, y
+
+
 @functools.cache
 def _register(variant: str) -> None:
     """Registers the sensor `sulcus_lens`, a thin lens with Brown-Conrady distortion, in one variant."""
@@ -156,15 +168,9 @@ def _register(variant: str) -> None:
             self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
         ) -> tuple[Any, Any]:
             v = self.v
-            goal_x = (position.x * self.width - 0.5 - self.middle[0]) / v["fx"]
-            goal_y = (position.y * self.height - 0.5 - self.middle[1]) / v["fy"]
-            x, y = goal_x, goal_y
-            for _ in range(6):  # each round reduces the error by the size of the distortion
-                r2 = x * x + y * y
-                radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * v["k3"]))
-                dx = 2 * v["p1"] * x * y + v["p2"] * (r2 + 2 * x * x)
-                dy = 2 * v["p2"] * x * y + v["p1"] * (r2 + 2 * y * y)
-                x, y = (goal_x - dx) / radial, (goal_y - dy) / radial
+            x = (position.x * self.width - 0.5 - self.middle[0]) / v["fx"]
+            y = (position.y * self.height - 0.5 - self.middle[1]) / v["fy"]
+            x, y = _undistorted(x, y, v)
             lens = mi.warp.square_to_uniform_disk_concentric(aperture) * v["aperture"]
             right, down, forward = self.rows
             origin = self.centre + right * lens.x + down * lens.y
