@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats
 from synth.geometry.triangles import Shape
 from synth.render.materials import Body, Lamp
-
-Floats = npt.NDArray[np.float64]
 
 
 class Instruments(Protocol):

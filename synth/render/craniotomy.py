@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Map
 from synth.job.schema import Job
 from synth.render import instrument
 from synth.render.anatomy import noise, rim, scenery, texture
@@ -74,9 +74,7 @@ def _retractor(surface: CortexSurface, around: Rim, theatre: Theatre) -> Body:
     return Body(*blade, np.zeros((len(dull), 2), np.float32), steel)
 
 
-def _wound(
-    surface: CortexSurface, around: Rim, coat: Coat, appearance: Appearance
-) -> npt.NDArray[np.float32]:
+def _wound(surface: CortexSurface, around: Rim, coat: Coat, appearance: Appearance) -> Map:
     """Colour (n, n, 3) of the cortex with the rim around it, coarse, as steel mirrors it."""
     small = cv2.resize(coat.albedo, (_MIRRORED_PX, _MIRRORED_PX), interpolation=cv2.INTER_AREA)
     # The chart's extent is close enough to the projection's for the finish.

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces, lengths
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
 
-Floats = npt.NDArray[np.float64]
 Kind = Literal["forceps", "bayonet", "dissector", "suction", "spatula"]
 
 _AROUND = 40
@@ -52,8 +51,8 @@ class SteelInstruments:
 
     kinds: tuple[Kind, ...]
     parts: tuple[tuple[Part, ...], ...]  # the parts of each
-    faces: npt.NDArray[np.int32]  # (F, 3) over all parts
-    coat: npt.NDArray[np.float32]  # (V,) 0 bare steel to 1 under a black coating
+    faces: Indices  # (F, 3) over all parts
+    coat: Map  # (V,) 0 bare steel to 1 under a black coating
     theatre: Theatre  # that they mirror
 
     @property

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
+from synth.arrays import Floats, Indices, Map
 from synth.geometry.triangles import Shape
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -56,9 +51,9 @@ class Body:
 
     vertices: Floats
     """(V, 3) mm."""
-    faces: npt.NDArray[np.int32]
+    faces: Indices
     """(F, 3), counter-clockwise from outside."""
-    uv: npt.NDArray[np.float32]
+    uv: Map
     """(V, 2) from 0 to 1: place in the maps."""
     material: Wet | Metal
     film: Floats | None = None

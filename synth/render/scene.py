@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Array, Floats, Map, Mask, Pixels
 from synth.geometry.triangles import Shape, joined, normals
 from synth.job.schema import RenderSection
 from synth.render import truth
@@ -22,10 +22,6 @@ from synth.render.materials import Body, Metal, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -52,7 +48,7 @@ class SceneState:
 class RenderedFrame:
     """One frame and its ground truth. Fields that are not in the job's `store.extra` are None."""
 
-    rgb: npt.NDArray[np.uint8]
+    rgb: Pixels
     """(H, W, 3) sRGB."""
     radiance: Map
     """(H, W, 3) linear, before the sensor."""
@@ -72,7 +68,7 @@ class RenderedFrame:
     """(H, W, 3) camera axes, this frame's pixels; 0 where there is nothing."""
     blur: Map | None = None
     """(H, W) px: radius of the circle of confusion, this frame's pixels."""
-    rgb_right: npt.NDArray[np.uint8] | None = None
+    rgb_right: Pixels | None = None
     flow_right: Map | None = None
     visible_right: Mask | None = None
     depth_right: Map | None = None
@@ -132,7 +128,7 @@ class Renderer:
         shutter: Sequence[SceneState] = (),
         after: SceneState | None = None,
     ) -> RenderedFrame:
-        """Picture and ground truth of one frame.
+        """Pixels and ground truth of one frame.
 
         Args:
             state: the scene at the frame's time, for the ground truth.
@@ -207,7 +203,7 @@ class Renderer:
             shape, metal = self._metal(state)
             stage.move("metal", shape.vertices, glow=metal.glow)
 
-    def develop(self, radiance: Map, seed: int) -> npt.NDArray[np.uint8]:
+    def develop(self, radiance: Map, seed: int) -> Pixels:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
         return camera_sensor.record(radiance, self._sensor, np.random.default_rng([seed, 1]))
 
@@ -284,7 +280,7 @@ class Renderer:
         return total
 
 
-def _mean(colour: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _mean(colour: Array) -> Array:
     """Mean (N,) of colours (N, 3), in their type; over so short an axis `np.mean` takes ten times as long."""
     return np.asarray((colour[:, 0] + colour[:, 1] + colour[:, 2]) / colour.dtype.type(3))
 

@@ -9,19 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from synth.arrays import Array, Floats, Indices, Map, Mask
 from synth.geometry.triangles import Shape, joined, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
 from synth.system.jit import compiled
-
-Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 
 _HIDDEN_MM = 1e-3  # a surface that is nearer than a point by more than this hides it
 _NEAR_MM = 1.0
@@ -45,7 +41,7 @@ class RestFrame:
     """Ground truth of the rest frame."""
 
     tissue: Mask  # (H, W)
-    area: npt.NDArray[np.float32]  # (H, W) mm2 of rest surface in the pixel; 0 off the tissue
+    area: Map  # (H, W) mm2 of rest surface in the pixel; 0 off the tissue
     scale_mm_per_px: float  # at the world's origin
     face: Indices  # (H, W) triangle of the fine surface; -1 off the tissue
     bary: Floats  # (H, W, 3)
@@ -57,10 +53,10 @@ class RestFrame:
 class FrameTruth:
     """Ground truth of one frame, at the rest frame's pixels (material points) or at the frame's own."""
 
-    flow: npt.NDArray[np.float32]  # (H, W, 2) px, rest pixels; 0 off the tissue
-    motion: npt.NDArray[np.float32]  # (H, W, 3) mm, rest pixels, each frame's camera axes; 0 off the tissue
+    flow: Map  # (H, W, 2) px, rest pixels; 0 off the tissue
+    motion: Map  # (H, W, 3) mm, rest pixels, each frame's camera axes; 0 off the tissue
     visible: Mask  # (H, W), rest pixels: the point is in the picture and not hidden
-    depth: npt.NDArray[np.float32]  # (H, W) mm along the optical axis, this frame's pixels; 0 for none
+    depth: Map  # (H, W) mm along the optical axis, this frame's pixels; 0 for none
     tool: Mask  # (H, W), this frame's pixels
     hits: Hits  # this frame's pixels, over tissue, static bodies and instruments, in this order
 
@@ -150,7 +146,7 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
     )
 
 
-def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> npt.NDArray[np.float32]:
+def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> Map:
     """Flow (H, W, 2) px from each pixel of one frame to another frame; 0 off the tissue.
 
     Args:
@@ -164,7 +160,7 @@ def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -
     return _picture(on, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on], camera)
 
 
-def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArray[np.float32]:
+def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> Map:
     """Smoothed unit normals (H, W, 3), camera axes, at each pixel; 0 where there is nothing.
 
     `shapes`: of `hits`, in their order.
@@ -175,7 +171,7 @@ def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> npt.NDArr
     return _picture(on, smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12), camera)
 
 
-def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> npt.NDArray[np.float32]:
+def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> Map:
     """A quantity of vertices (V, C) of the fine surface at rest pixels (H, W, C); 0 off the tissue."""
     values = blend(faces, rest.face.ravel(), rest.bary.reshape(-1, 3), nodal)
     return values.reshape(*rest.face.shape, -1).astype(np.float32)
@@ -190,7 +186,7 @@ def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.flo
     return found
 
 
-def _picture(on: Mask, values: npt.NDArray[Any], camera: Camera, kind: type = np.float32) -> npt.NDArray[Any]:
+def _picture(on: Mask, values: Array, camera: Camera, kind: type = np.float32) -> Array:
     """Values (M, ...) of the pixels that are `on` (H*W,) as a picture (H, W, ...); 0 elsewhere."""
     found = np.zeros((len(on), *values.shape[1:]), kind)
     found[on] = values
@@ -213,7 +209,8 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
     return np.asarray(np.linalg.norm(np.cross(*spread), axis=1))
 
 
-def _sort_loop(pixels, width, height):  # type: ignore[no-untyped-def]
+@compiled
+def _sort(pixels, width, height):  # type: ignore[no-untyped-def]
     """Rays sorted by their pixel: order (M,) and each pixel's start in it (H*W + 1,)."""
     key = np.full(len(pixels), -1, np.int64)
     start = np.zeros(width * height + 1, np.int64)
@@ -233,7 +230,8 @@ def _sort_loop(pixels, width, height):  # type: ignore[no-untyped-def]
     return order, start
 
 
-def _cast_loop(points, flat, faces, directions, order, start, width, height):  # type: ignore[no-untyped-def]
+@compiled
+def _cast(points, flat, faces, directions, order, start, width, height):  # type: ignore[no-untyped-def]
     count = len(directions)
     face = np.full(count, -1, np.int32)
     bary = np.zeros((count, 3))
@@ -289,7 +287,8 @@ def _cast_loop(points, flat, faces, directions, order, start, width, height):  #
     return face, bary, best
 
 
-def _blend_loop(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
+@compiled
+def _blend(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
     found = np.zeros((len(face), nodal.shape[1]))
     for n in range(len(face)):
         if face[n] < 0 or face[n] >= len(faces):
@@ -299,8 +298,3 @@ def _blend_loop(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
         for k in range(nodal.shape[1]):
             found[n, k] = u * nodal[a, k] + v * nodal[b, k] + w * nodal[c, k]
     return found
-
-
-_sort: Any = compiled(_sort_loop)
-_cast: Any = compiled(_cast_loop)
-_blend: Any = compiled(_blend_loop)

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 import xatlas
 from scipy.ndimage import distance_transform_edt
 
+from synth.arrays import Floats, Map
 from synth.geometry.triangles import grid_faces
 from synth.render.anatomy import noise
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 _COARSE = 48  # side of the unrolled grid: a quarter of a CPU-second; 72 takes one
 _STEEP = 1.2  # stretch up to which the projection serves, exceeded at 1% of the opening

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[Any]
+from synth.arrays import Array, Map
+
 Rgb = tuple[float, float, float]
 
 
-def step(x: Array) -> npt.NDArray[np.float32]:
+def step(x: Array) -> Map:
     """A smooth step of `x` (...), from 0 at -0.5 to 1 at 0.5."""
     t = np.clip(x + 0.5, 0, 1)
     return np.asarray(t * t * (3 - 2 * t), np.float32)

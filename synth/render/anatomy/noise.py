@@ -10,10 +10,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-Map = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.float64]
+from synth.arrays import Floats, Map
 
 _ROWS = 8  # of a map at a time: intermediate results stay in the processor's cache
 
@@ -62,7 +60,7 @@ def in_rows(paint: Callable[..., tuple[Map, ...]], *maps: Map) -> tuple[Map, ...
     return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
-def sample(image: Map, xy: Floats, extent_mm: float) -> npt.NDArray[np.float32]:
+def sample(image: Map, xy: Floats, extent_mm: float) -> Map:
     """Map (n, n, ...) at world x, y (N, 2) mm, bilinear, constant beyond its border: (N, ...)."""
     pixel = ((xy / extent_mm + 0.5) * image.shape[0] - 0.5).astype(np.float32)
     width = 32_000  # cv2.remap takes pictures no longer than a short integer
@@ -72,7 +70,7 @@ def sample(image: Map, xy: Floats, extent_mm: float) -> npt.NDArray[np.float32]:
     return np.asarray(read, np.float32).reshape(-1, *image.shape[2:])[: len(pixel)]
 
 
-def centres(pixels: int, extent_mm: float) -> npt.NDArray[np.float32]:
+def centres(pixels: int, extent_mm: float) -> Map:
     """World coordinate of the centres of a map's columns (or rows), (pixels,) mm."""
     return (((np.arange(pixels) + 0.5) / pixels - 0.5) * extent_mm).astype(np.float32)
 

@@ -11,9 +11,9 @@ from functools import partial
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render.anatomy import noise, scenery, tube
 from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, through
@@ -22,9 +22,6 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
 from synth.render.appearance.appearance import Appearance
 from synth.render.materials import Coat
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 _AROUND, _OUT = 320, 42  # at most: points around the opening, rings outwards
 _SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is built anew every frame
@@ -91,12 +88,10 @@ class Rim:
     """The rim as a mesh, and the outlines that its maps are painted by."""
 
     shape: Shape
-    uv: npt.NDArray[np.float32]  # (V, 2)
+    uv: Map  # (V, 2)
     extent_mm: float  # side of the square that uv spans
     edge: Floats  # (A,) mm: radius of the opening's edge at even angles
-    cotton: tuple[
-        Patty, ...
-    ]  # drawn in the texture; one in its unused middle is the felt of the patties over the edge
+    cotton: tuple[Patty, ...]  # drawn in the texture; one in its unused middle is the felt over the edge
     stitches: Floats  # (n,) rad: angles of threads that hold the dura
     dura: Floats  # (A,) mm beyond the edge: end of the folded dura, start of the gutter
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall

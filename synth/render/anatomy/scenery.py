@@ -8,20 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, maximum_filter1d
 from scipy.spatial import cKDTree
 
+from synth.arrays import Array, Floats, Indices, Map
 from synth.geometry.triangles import Shape, grid_faces
 from synth.render.anatomy.layers import Rgb, over, speckled, step, through
 from synth.render.anatomy.tree import Tree
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int32]
 
 PATTY_MM = (5.0, 2.3)
 """Half length and half width of the patties over the opening's edge."""
@@ -76,7 +71,7 @@ def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(2 * np.pi * widest / len(edge))
 
 
-def aside(angle: npt.NDArray[Any], stitch: float) -> npt.NDArray[Any]:
+def aside(angle: Array, stitch: float) -> Array:
     """Signed angle (...) from a stitch, the shorter way [rad]."""
     return np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi
 
@@ -160,7 +155,7 @@ def with_patty(
     return np.asarray(over(shaded, felt, cover), np.float32), np.asarray(rough, np.float32)
 
 
-def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tuple[Floats, Ints, Floats]]:
+def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tuple[Floats, Indices, Floats]]:
     """One or two cotton patties that lie half in the opening.
 
     Args:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
+from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces
 from synth.job import schema
@@ -20,9 +20,6 @@ from synth.render.anatomy import noise, tube, vessels
 from synth.render.anatomy.chart import Chart, unroll
 from synth.render.anatomy.tree import Tree
 from synth.render.anatomy.vessels import Vessels
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 MARGIN_MM = 5.0
 """Extent under the rim, so that no drawn tilt or pull reveals the patch's edge."""
@@ -48,8 +45,8 @@ class CortexSurface:
     """The fine surface at rest, in world axes, with its chart, sulci and vessels."""
 
     vertices: Floats  # (V, 3) mm
-    faces: npt.NDArray[np.int32]  # (F, 3), counter-clockwise from outside
-    uv: npt.NDArray[np.float32]  # (V, 2): place on the chart, from 0 to 1
+    faces: Indices  # (F, 3), counter-clockwise from outside
+    uv: Map  # (V, 2): place on the chart, from 0 to 1
     pia: Floats  # (n, n) mm, height at the vertices without vessels; rows go with y, columns with x
     extent_mm: float  # side of the square patch
     chart: Chart  # the square that sulci, vessels and every map lie on

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Map
 from synth.errors import UserError
 from synth.render.anatomy import noise, tube
 from synth.render.anatomy.layers import Rgb, over, ridge, through
@@ -24,7 +24,6 @@ from synth.render.materials import Coat
 from synth.system import checked_file
 from synth.system.jit import vectorised
 
-Map = npt.NDArray[np.float32]
 Tubes = dict[str, tuple[Map, Map]]
 Random = np.random.Generator
 

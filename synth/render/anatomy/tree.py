@@ -10,14 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from synth.arrays import Floats, Ints, Map, Mask
 from synth.render.anatomy import noise
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Map = npt.NDArray[np.float32]
 
 _REACH_MM = 9.0  # range of an attractor
 _INERTIA = 1.2  # weight of a twig's own direction: it bends rather than turning abruptly
@@ -37,7 +33,7 @@ def grow(
     parent: Ints,
     attractors: Floats,
     *,
-    buds: npt.NDArray[np.bool_],
+    buds: Mask,
     step: float,
     kill: float,
     wander: float,

@@ -7,16 +7,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from synth.arrays import Floats, Ints, Map
 from synth.render.anatomy import noise
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Map = npt.NDArray[np.float32]
 
 _SHORTEST = 8  # steps of a path: a shorter one joins another vessel at once and is dropped
 

@@ -6,13 +6,10 @@ import itertools
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Indices, Map
 from synth.render.anatomy.tree import Tree
 from synth.system.jit import vectorised
-
-Map = npt.NDArray[np.float32]
-Labels = npt.NDArray[np.int32]
 
 
 def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
@@ -54,7 +51,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
 
 
 @vectorised
-def _deepen(away: Map, label: Labels, table: Map, scale: np.float32, distance: Map, radius: Map) -> None:
+def _deepen(away: Map, label: Indices, table: Map, scale: np.float32, distance: Map, radius: Map) -> None:
     """Draws vessels of radius table[label] mm, `away` texels from their lines, over shallower ones."""
     for y in range(away.shape[0]):
         for x in range(away.shape[1]):

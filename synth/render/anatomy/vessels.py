@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats, Ints, Map, Mask
 from synth.render.anatomy import noise, trunk, tube
 from synth.render.anatomy.tree import Tree, grow, murray, pruned, relaxed, scattered, taper
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Map = npt.NDArray[np.float32]
 Trunks = tuple[tuple[Floats, Ints], Floats]
 
 _STIFF_MM = 0.15  # radius of a vessel that winds half as far as the finest
@@ -114,7 +111,7 @@ def _wound(
     return np.asarray(amplitude * stiff[:, None] * np.stack(bends, axis=1), np.float64)
 
 
-def _sprouting(count: int, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _sprouting(count: int, share: float, rng: np.random.Generator) -> Mask:
     """A random share of nodes, at least one."""
     buds = rng.random(count) < share
     buds[count // 2] |= not buds.any()

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats, Map
 from synth.render.camera.camera import Camera
 from synth.render.materials import Lamp
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 _APART = 2.2  # between the lamps, round the optical axis [rad]
 _STEEPEST_DEG = 6.5

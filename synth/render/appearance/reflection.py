@@ -13,11 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
+from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
 from synth.render.materials import Lamp
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 _STEEL, _BLACK = 0.58, 0.045
 """Reflectance at right angles of machined steel and of the coating."""

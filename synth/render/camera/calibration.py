@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
-
-Floats = npt.NDArray[np.float64]
 
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "intrinsic_matrix", "mtx")
 _LENS = (

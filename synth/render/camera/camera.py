@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from synth.arrays import Floats, Map
 from synth.errors import UserError
 from synth.job.schema import RenderSection
 from synth.render.camera import calibration
-
-Floats = npt.NDArray[np.float64]
 
 _NEWTON = 20
 _BORDER = 65  # points on a side of the picture
@@ -136,7 +135,7 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
 
 
-def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> Map:
     """Radius of the circle of confusion [px] of points at depths (...) mm; 0 where depth is 0."""
     away = np.maximum(depth, 1e-9)
     radius = camera.K[0, 0] * camera.aperture_mm * np.abs(1 / away - 1 / camera.focus_mm)

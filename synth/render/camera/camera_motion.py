@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Floats
 from synth.render.camera.camera import Camera
-
-Floats = npt.NDArray[np.float64]
 
 _SLOW_HZ = (0.05, 0.25)
 _WAVES = 3

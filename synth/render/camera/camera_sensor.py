@@ -7,13 +7,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 
+from synth.arrays import Map, Pixels
 from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, Matrix, encoded
 from synth.system.jit import vectorised
-
-Map = npt.NDArray[np.float32]
 
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
 _STEPS = 4096  # of the tabulated tone curves per full scale
@@ -38,7 +36,7 @@ class CameraSensor:
     coded: bool = False  # whether a codec follows, which subsamples colours itself
 
 
-def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Pixels:
     """The 8-bit sRGB picture of a linear one.
 
     Args:

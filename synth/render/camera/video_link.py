@@ -6,18 +6,16 @@ import io
 from fractions import Fraction
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Pixels
 from synth.errors import UserError
 from synth.job import schema
 from synth.video.write import encode
 
-Pictures = npt.NDArray[np.uint8]
-
 _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 
 
-def recorded(pictures: Pictures, section: schema.SensorSection, fps: float) -> Pictures:
+def recorded(pictures: Pixels, section: schema.SensorSection, fps: float) -> Pixels:
     """Pictures (T, H, W, 3) sRGB after the recorder's codec; the same pictures without a bitrate.
 
     Deterministic, since it runs on one thread.

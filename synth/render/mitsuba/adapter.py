@@ -17,8 +17,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Array, Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
@@ -28,9 +28,6 @@ from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
-
-Floats = npt.NDArray[np.float64]
-Map = npt.NDArray[np.float32]
 
 _REGISTER = 64  # bytes of a vector register
 
@@ -217,7 +214,7 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     return mesh
 
 
-def _bent(vertices: Floats, faces: npt.NDArray[np.int32], film: Floats | None) -> Floats:
+def _bent(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
     """Unit normals (V, 3) of a mesh under a film of heights (V,) mm."""
     if film is not None:
         vertices = vertices.copy()
@@ -225,7 +222,7 @@ def _bent(vertices: Floats, faces: npt.NDArray[np.int32], film: Floats | None) -
     return normals(Shape(vertices, faces))
 
 
-def _aligned(values: npt.NDArray[Any], kind: type[np.generic]) -> npt.NDArray[Any]:
+def _aligned(values: Array, kind: type[np.generic]) -> Array:
     """The values as one row of a type, in memory aligned to vector registers.
 
     Dr.Jit uses NumPy's memory in place, and compiles separate kernels for aligned and unaligned arrays;

@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Map = npt.NDArray[np.float32]
+from synth.arrays import Map
 
 _BLURRED_PX = 0.75  # least radius of the circle of confusion of steel that is separated
 _AT_ONCE = 256  # paths per pixel: more would exceed indices of 32 bits

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Map
 from synth.render.mitsuba.direct_light import Light
 from synth.system.jit import vectorised
-
-Map = npt.NDArray[np.float32]
 
 _REACH = 4  # px along an edge
 _ENOUGH = 16  # paths per pixel from which on nothing is filtered

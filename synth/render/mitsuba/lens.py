@@ -12,12 +12,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Map
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
-
-Map = npt.NDArray[np.float32]
 
 
 class Compiled:
@@ -87,9 +85,10 @@ class Scalar:
         # Mitsuba's cameras have x to the left and y up.
         to_world[:3, :3] = (camera.rotation * np.array([[-1.0], [-1.0], [1.0]])).T
         to_world[:3, 3] = camera.centre
+        thin = {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
         self.sensor = mi.load_dict(
             {
-                "type": "thinlens" if camera.aperture_mm > 0 else "perspective",
+                **({"type": "thinlens", **thin} if camera.aperture_mm > 0 else {"type": "perspective"}),
                 "fov": self._fov,
                 "fov_axis": "x",
                 "near_clip": 1.0,
@@ -97,11 +96,6 @@ class Scalar:
                 "to_world": mi.ScalarTransform4f(to_world.tolist()),
                 "film": _film(self._width, self._height),
                 "sampler": {"type": "multijitter", "sample_count": self.spp},
-                **(
-                    {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
-                    if camera.aperture_mm > 0
-                    else {}
-                ),
             }
         )
 
