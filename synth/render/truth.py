@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from synth.arrays import Array, Floats, Indices, Map, Mask
+from synth.arrays import Array, Floats, Indices, Ints, Map, Mask
 from synth.geometry.triangles import Shape, joined, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
@@ -90,7 +90,7 @@ class ProjectedScene:
         else:
             order, start = _sort(pixels, width, height)
         directions = np.ascontiguousarray(directions)
-        return Hits(*_cast(self.points, self.flat, self.faces, directions, order, start, width, height))
+        return Hits(*_cast(self.points, self.flat, self.faces, directions, order, start, self.size))
 
 
 def trace_rest(camera: Camera, surface: Shape, static: Shape) -> RestFrame:
@@ -210,7 +210,7 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
 
 
 @compiled
-def _sort(pixels, width, height):  # type: ignore[no-untyped-def]
+def _sort(pixels: Floats, width: int, height: int) -> tuple[Ints, Ints]:
     """Rays sorted by their pixel: order (M,) and each pixel's start in it (H*W + 1,)."""
     key = np.full(len(pixels), -1, np.int64)
     start = np.zeros(width * height + 1, np.int64)
@@ -231,7 +231,16 @@ def _sort(pixels, width, height):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _cast(points, flat, faces, directions, order, start, width, height):  # type: ignore[no-untyped-def]
+def _cast(
+    points: Floats,
+    flat: Floats,
+    faces: Indices,
+    directions: Floats,
+    order: Ints,
+    start: Ints,
+    size: tuple[int, int],
+) -> tuple[Indices, Floats, Floats]:
+    width, height = size
     count = len(directions)
     face = np.full(count, -1, np.int32)
     bary = np.zeros((count, 3))
@@ -288,7 +297,7 @@ def _cast(points, flat, faces, directions, order, start, width, height):  # type
 
 
 @compiled
-def _blend(faces, face, bary, nodal):  # type: ignore[no-untyped-def]
+def _blend(faces: Indices, face: Indices, bary: Floats, nodal: Floats) -> Floats:
     found = np.zeros((len(face), nodal.shape[1]))
     for n in range(len(face)):
         if face[n] < 0 or face[n] >= len(faces):
