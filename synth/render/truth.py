@@ -19,6 +19,9 @@ from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
 from synth.system.jit import compiled
 
+Size = tuple[int, int]
+"""Width, height [px]."""
+
 _HIDDEN_MM = 1e-3  # a surface that is nearer than a point by more than this hides it
 _NEAR_MM = 1.0
 # Distortion bends triangles, small ones less: margin around their corners in which rays are tested.
@@ -68,7 +71,7 @@ class ProjectedScene:
     points: Floats  # (V, 3) mm, camera axes; NaN at the lens or behind it, which drops their faces
     flat: Floats  # (V, 2) px
     faces: Indices  # (F, 3)
-    size: tuple[int, int]  # width, height [px]
+    size: Size
 
     @classmethod
     def of(cls, camera: Camera, scene: Shape) -> ProjectedScene:
@@ -182,8 +185,7 @@ def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.flo
 
     0 where `face` is negative or beyond `faces`.
     """
-    found: Floats = _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
-    return found
+    return _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
 
 
 def _picture(on: Mask, values: Array, camera: Camera, kind: type = np.float32) -> Array:
@@ -232,14 +234,9 @@ def _sort(pixels: Floats, width: int, height: int) -> tuple[Ints, Ints]:
 
 @compiled
 def _cast(
-    points: Floats,
-    flat: Floats,
-    faces: Indices,
-    directions: Floats,
-    order: Ints,
-    start: Ints,
-    size: tuple[int, int],
+    points: Floats, flat: Floats, faces: Indices, directions: Floats, order: Ints, start: Ints, size: Size
 ) -> tuple[Indices, Floats, Floats]:
+    """Hits of rays (N, 3), sorted by their pixel of a picture, on triangles; see `Hits`."""
     width, height = size
     count = len(directions)
     face = np.full(count, -1, np.int32)
