@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from synth.arrays import Floats
 from synth.render.camera.camera import Camera
@@ -26,7 +27,7 @@ class CameraMotion:
         if self.drift_mm == 0:
             return camera
         shift = self._waves(seconds) * self.drift_mm / np.sqrt(_WAVES)
-        turn = _rotation(shift[3:] * _TURN)
+        turn = Rotation.from_rotvec(shift[3:] * _TURN).as_matrix()
         # The rotation is about the craniotomy, which so stays in view.
         return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])
 
@@ -37,13 +38,3 @@ class CameraMotion:
         phase = rng.uniform(0, 2 * np.pi, (_WAVES, 6))
         total = np.sin(2 * np.pi * hertz * seconds + phase) - np.sin(phase)
         return np.asarray(total.sum(axis=0))
-
-
-def _rotation(turn: Floats) -> Floats:
-    """Rotation matrix of a rotation vector (3,) rad, by Rodrigues' formula."""
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-15:
-        return np.eye(3)
-    x, y, z = turn / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
