@@ -25,7 +25,7 @@ from synth.system.jit import vectorised
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-_OUT_OF_SIGHT = Shape(np.full((3, 3), -1e3), np.array([[0, 1, 2]], np.int32)), Metal(*np.zeros((2, 3, 3)))
+_OUT_OF_SIGHT = Shape(np.eye(3) - 1e3, np.array([[0, 1, 2]], np.int32)), Metal(*np.zeros((2, 3, 3)))
 
 
 @dataclass(frozen=True)
