@@ -74,7 +74,7 @@ COLUMNS = (
                 source="opening_id"),
     IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
     IndexColumn("gesture", _TEXT, "kind of gesture of each instrument",
-                source=lambda one: name_gestures(one.attrs.get("scenario", {})) or None),
+                source=lambda one: name_gestures(one.attrs.get("scenario") or {}) or None),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",

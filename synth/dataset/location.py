@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +37,7 @@ def find_location(where: Path | str) -> StoreLocation:
 
     Raises UserError if it does not exist or cannot be opened.
     """
-    if isinstance(where, Path) or "://" not in where:
-        folder = Path(where)
-        if not folder.is_dir():
-            raise UserError(f"{folder}: no such sequence")
-        return StoreLocation(str(folder), str(folder), partial(_size, folder), folder)
+    where, remote = str(where), "://" in str(where)
     fs, base = _open(where)
     if not fs.isdir(base):
         raise UserError(f"{where}: no such sequence")
@@ -53,6 +48,8 @@ def find_location(where: Path | str) -> StoreLocation:
         except FileNotFoundError:
             return 0
 
+    if not remote:
+        return StoreLocation(where, where, size, Path(where))
     from zarr.storage import FsspecStore
 
     return StoreLocation(where, FsspecStore.from_url(_absolute(where), read_only=True), size)
@@ -83,7 +80,3 @@ def _absolute(where: str) -> str:
     if chain and "://" not in last:
         last = f"file://{Path(last).resolve()}"
     return "::".join([*chain, last])
-
-
-def _size(folder: Path, key: str) -> int:
-    return (folder / key).stat().st_size if (folder / key).is_file() else 0

@@ -47,9 +47,8 @@ def read_source(source: str) -> tuple[str, str, Path]:
         text = checked_file.read_text(Path(source), checked_file.LARGEST_YAML)
         return text, source, Path(source).resolve().parent
     if source not in names():
-        shown = [
-            name for name in names() if name != "mission"
-        ]  # the training data of the pretrained networks
+        # All but the training data of the pretrained networks.
+        shown = [name for name in names() if name != "mission"]
         hint = did_you_mean(source, names()) or f", and no named job ({', '.join(shown)})"
         raise UserError(f"{source[:80]}: no such file{hint}")
     text = (resources.files("synth.job") / "named" / f"{source}.yaml").read_text("utf-8")
