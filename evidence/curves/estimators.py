@@ -131,8 +131,7 @@ def _load(root: Path, work: Path) -> list[Clip]:
 @cache
 def generation_cpu_s(root: Path) -> float:
     """Median CPU time of rendering a sequence [s]; the first of a process includes compilation."""
-    timings = [one.attrs["timings"].values() for one in Dataset(root)]
-    return float(np.median([sum(t["cpu_s"] for t in spent if isinstance(t, dict)) for spent in timings]))
+    return float(np.median([sum(one.stages_cpu_s.values()) for one in Dataset(root)]))
 
 
 @cache

@@ -78,7 +78,7 @@ COLUMNS = (
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
-                source=lambda one: first_gesture(one.attrs.get("scenario", {})).get("load")),
+                source=lambda one: first_gesture(one.attrs.get("scenario") or {}).get("load")),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
     IndexColumn("peak_flow_px", _REAL, "largest true motion", "px", "summary.peak_flow_px"),
     IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm",
