@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from skimage import data
 
 from bench.checks import stereo
+from bench.checks.judgement import judge
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import writer
 from bench.recording.folder import open_recording
@@ -125,6 +126,7 @@ def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> Non
     if second == "right":
         assert done.stereo.baseline_mm == pytest.approx(BASE, rel=1e-3)
         assert done.stereo.epipolar_px < 0.1
+        assert (done.stereo.copied, done.stereo.frozen) == (False, 0)
     else:
         assert np.isnan(done.stereo.baseline_mm)
     assert done.stereo.noise_mm > 0
@@ -190,6 +192,25 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
     left, right = (lens.rotation @ point + lens.translation for lens in lenses)
     np.testing.assert_allclose(found.rotation @ left + found.translation, right, atol=1e-6)
     np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)
+
+
+PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [{"copied": True}, {"frozen": 3}, {"tool_behind_px": 2.0}, {"lag_s": -0.1}, {"epipolar_px": 3.0}],
+)
+def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: dict[str, float]) -> None:
+    recording = open_recording(make("right"))
+
+    def severities(quality: StereoQuality) -> set[str]:
+        tracked = TrackedRecording(stereo=quality, scale_mm_per_px=AWAY / FOCAL)
+        return {one.severity for one in judge(recording, tracked) if one.cause == "stereo"}
+
+    assert severities(PAIR) == {"ok"}
+    assert severities(replace(PAIR, noise_mm=0.3)) == {"warning"}
+    assert "error" in severities(replace(PAIR, **fault))
 
 
 def test_a_baseline_in_metres_is_reported(make: Make) -> None:
