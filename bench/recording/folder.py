@@ -19,19 +19,22 @@ import os
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.recording import csv_table, meta
-from bench.recording.meta import Meta, Span
+from bench.recording.meta import Meta
 from synth.errors import UserError
+from synth.job.types import Section
 from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture
 
+S = TypeVar("S", bound=Section)
 Video = Path | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
 
 _LARGEST_FORCE_N = 50.0
@@ -234,23 +237,18 @@ def _from_start(
     return _spans_from(about, start), times, force
 
 
-def _spans_from(about: Meta, start: float) -> Meta:
-    """meta.yaml with the spans that count from 1970 counted from `start` [s]."""
+def _spans_from(about: S, start: float) -> S:
+    """A section of meta.yaml with its spans that count from 1970 counted from `start` [s]."""
 
-    def moved(span: Span | None) -> Span | None:
-        return span if span is None or span[0] < _EPOCH_S else (span[0] - start, span[1] - start)
+    def moved(value: object) -> object:
+        if isinstance(value, Section):
+            return _spans_from(value, start)
+        if not isinstance(value, tuple):
+            return value
+        since_1970 = len(value) == 2 and isinstance(value[0], float) and value[0] > _EPOCH_S
+        return (value[0] - start, value[1] - start) if since_1970 else tuple(map(moved, value))
 
-    def every(spans: tuple[Span, ...]) -> tuple[Span | None, ...]:
-        return tuple(moved(span) for span in spans)
-
-    sync, sensor, pulse = about.sync, about.sensor, about.pulse
-    parts = {
-        "sync": sync.model_copy(update={"calibration_s": moved(sync.calibration_s)}),
-        "sensor": sensor.model_copy(update={"free_s": every(sensor.free_s), "turn_s": moved(sensor.turn_s)}),
-        "pulse": pulse.model_copy(update={"free_s": every(pulse.free_s)}),
-        "press_s": moved(about.press_s),
-    }
-    return about.model_copy(update=parts)
+    return about.model_copy(update={name: moved(value) for name, value in about})
 
 
 def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[int, float] | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,23 +231,14 @@ def _caption(result: Result, snap: Snapshot) -> str:
     return caption
 
 
-_DISTANCE: dict[str, Callable[[float], float]] = {
-    "low": lambda value: value,
-    "high": lambda value: -value,
-    "zero": abs,
-    "one": lambda value: abs(value - 1),
-}
-"""Functions that are smallest at the best value, by `Metric.best`."""
-
-
 def _best(result: Result) -> dict[str, float]:
     """The best value of each column, for bold type."""
     best = {}
     for key, metric in _COLUMNS.items():
         found = [method.scores.get(key, math.nan) for method in result.methods.values()]
         values = {value for value in found if math.isfinite(value)}
-        if len(values) > 1 and metric.best:
-            best[key] = min(values, key=_DISTANCE[metric.best])
+        if len(values) > 1 and metric.ideal is not None:
+            best[key] = min((abs(value - metric.ideal), value) for value in values)[1]
     return best
 
 

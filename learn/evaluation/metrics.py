@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,11 @@ class Metric:
     name: str
     unit: str = ""  # as displayed: ms and % are converted from s and shares; empty if dimensionless
     about: str = ""
-    best: Literal["low", "high", "zero", "one", ""] = ""  # the best value; empty if there is none
+    ideal: float | None = None  # 0 or 1; None if there is none
     digits: int = 3  # significant digits displayed
     relative: bool = False  # whether a constant factor on the prediction doesn't change it
     column: str = ""  # heading in a narrow table; empty: not listed there
-    listed: bool = True  # whether `learn eval --all` lists it; its JSON has it in any case
+    listed: bool = True  # whether `learn eval --all` lists it
 
     @property
     def cell_unit(self) -> str:
@@ -35,52 +34,40 @@ class Metric:
         return f"{self.name} [{self.unit}]" if self.unit and not self.cell_unit else self.name
 
 
-_DENSITY = "mN/mm²"
 METRICS = {
     "force_r2_pooled": Metric("total force: R², all frames", column="force R²"),
-    "force_r2": Metric("total force: R²", listed=False),
     "force_mae": Metric("total force: MAE", "mN", column="total force MAE [mN]"),
     "force_rmse": Metric("total force: RMSE", "mN"),
-    "force_bias": Metric("total force: bias", "mN", "Mean of prediction minus truth."),
-    "force_r": Metric("total force: correlation", about="Pearson's r over frames."),
-    "force_ccc": Metric("total force: concordance", about="Lin's concordance over frames."),
-    "vector_error_mn": Metric("total force: error of the vector", "mN", "Mean length of its error."),
+    "force_bias": Metric("total force: bias", "mN"),  # prediction minus truth
+    "force_r": Metric("total force: correlation"),  # over frames, as the next
+    "force_ccc": Metric("total force: concordance"),
+    "vector_error_mn": Metric("total force: error of the vector", "mN"),
     "peak_error_share": Metric("peak force: relative error", column="peak force error"),
     "map_r2_pooled": Metric("force map: R², all cells", column="map R²"),
-    "map_r2": Metric("force map: R²", about="Over tissue cells.", column="map R²", listed=False),
-    "map_mae": Metric("force map: MAE", _DENSITY),
-    "map_rmse": Metric("force map: RMSE", _DENSITY, column="map RMSE [mN/mm²]"),
-    "map_bias": Metric("force map: bias", _DENSITY, "Mean of prediction minus truth.", listed=False),
-    "map_r": Metric("force map: correlation", about="Pearson's r over tissue cells."),
-    "map_ccc": Metric("force map: concordance", about="Lin's concordance over cells.", listed=False),
-    "vector_r2": Metric("force map: R² of components", about="1 − SSE/SST of x, y and z."),
-    "false_positive": Metric(
-        "false positives: contact-free area above 5 mN",
-        about="Share of it where a contact-sized patch would carry more.",
-    ),
+    "map_r2": Metric("force map: R²", column="map R²", listed=False),
+    "map_mae": Metric("force map: MAE", "mN/mm²"),
+    "map_rmse": Metric("force map: RMSE", "mN/mm²", column="map RMSE [mN/mm²]"),
+    "map_r": Metric("force map: correlation"),  # over tissue cells
+    "vector_r2": Metric("force map: R² of components"),  # x, y and z together
+    # Where a contact-sized patch would carry more.
+    "false_positive": Metric("false positives: contact-free area above 5 mN"),
+    # The scale is the training data's 99.9th percentile.
     "false_positive_relative": Metric(
-        "false positives: contact-free area above 5% of scale",
-        about="Share of it; the scale is the training data's 99.9th percentile.",
-        column="false-positive area",
+        "false positives: contact-free area above 5% of scale", column="false-positive area"
     ),
+    # Without the rim, where a contact that is estimated one cell off counts too.
     "false_positive_far": Metric(
-        "false positives: the same beyond 2 mm of a contact",
-        about="Leaves out the rim, where a contact that is estimated one cell off counts too.",
-        column="false-positive area beyond 2 mm",
+        "false positives: the same beyond 2 mm of a contact", column="false-positive area beyond 2 mm"
     ),
-    "off_target_mn": Metric(
-        "off-target force: on contact-free area", "mN", "Mean over frames.", column="off-target force [mN]"
-    ),
+    "off_target_mn": Metric("off-target force: on contact-free area", "mN", column="off-target force [mN]"),
     "low_over_mn": Metric(
-        "over-prediction in low-force frames", "mN", "Of the total force.", column="over in low frames [mN]"
-    ),
-    "localisation_mm": Metric(
-        "contact centre: median error", "mm", "Over frames above low force.", column="contact centre [mm]"
-    ),
-    "calibration_slope": Metric("calibration: slope of truth on prediction", about="By least squares."),
-    "calibration_offset_mn": Metric("calibration: offset of truth on prediction", "mN", listed=False),
+        "over-prediction in low-force frames", "mN", column="over in low frames [mN]"
+    ),  # of the total force
+    # Over frames above low force.
+    "localisation_mm": Metric("contact centre: median error", "mm", column="contact centre [mm]"),
+    "calibration_slope": Metric("calibration: slope of truth on prediction"),  # least squares
 }
-"""Every score by its key in `learn eval --json`."""
+"""Scores that `learn eval` lists, by their key in its JSON, which has some more."""
 
 
 def moments(true: Floats, predicted: Floats) -> Floats:
