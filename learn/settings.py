@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
@@ -13,6 +14,7 @@ from learn.loss import Loss
 from learn.network.d2fnet import Architecture
 from synth.errors import UserError
 from synth.job.types import NonNegative, Positive, Section
+from synth.system import checked_file
 
 Count = Annotated[int, Field(ge=0)]
 AtLeastOne = Annotated[int, Field(ge=1)]
@@ -71,48 +73,9 @@ def replace(settings: S, **changes: Any) -> S:
     return type(settings).model_validate(dict(settings) | changes)
 
 
-_SHORT: dict[str, Any] = {"epochs": 24, "schedule": "cosine", "frames": 12, "epoch_frames": 4000}
-# Stereo also measures the lift of the whole surface: without surface motion a breath was taken for a press.
-_STEREO: dict[str, Any] = {
-    "input": "motion-mixed",
-    "loss": "mse-frame",
-    "surface_motion_mm": 0.5,
-    "learning_rate": 1e-3,
-}
-_STEREO_ARCH = Architecture(width=16, stem=4, confidence=True, depth=True, dropout=0.05, relative=True)
 PRESETS: dict[str, TrainingSettings] = {
-    # Seconds to minutes: for tests.
-    "tiny": TrainingSettings(
-        size=64,
-        arch=Architecture(width=16, stem=2, levels=3, dropout=0.0),
-        epochs=20,
-        # In so short a run the losses against off-target force only lower all forces (docs/results/learn).
-        loss="mse",
-        learning_rate=2e-3,
-        schedule="cosine",
-    ),
-    # At most 20 minutes on one core, for any number of sequences.
-    "cpu": TrainingSettings(
-        size=128,
-        # A stem of 2 has the same error at twice the time, in training too (docs/results/learn/pareto).
-        # Magnitudes: with vectors this loss has an R² 0.10 below squared error's (docs/results/learn).
-        arch=Architecture(width=16, stem=4, output="magnitude", dropout=0.05),
-        loss="off-target",
-        learning_rate=1e-3,
-        **_SHORT,
-    ),
-    # d2fnet-s: 256², 10 ms a frame on one core (12 with a fourth halving).
-    "live": TrainingSettings(
-        arch=Architecture(width=16, stem=4, levels=3, output="magnitude", dropout=0.05),
-        loss="off-target",
-        learning_rate=1e-3,
-    ),
-    # `cpu` and `live` for stereo motion. Force along the optical axis is then observable, so their output is
-    # vectors, for which squared error with R² by frame is best.
-    "stereo": TrainingSettings(size=128, arch=_STEREO_ARCH, **_SHORT, **_STEREO),
-    "stereo-live": TrainingSettings(arch=replace(_STEREO_ARCH, levels=3), **_STEREO),
-    # The network, loss and schedule of Heraoui et al., on our targets.
-    "paper": TrainingSettings(arch=Architecture(width=32, stem=1, dropout=0.1)),
+    name: TrainingSettings.model_validate(values)
+    for name, values in checked_file.read_yaml(Path(__file__).with_name("presets.yaml")).items()
 }
 
 
