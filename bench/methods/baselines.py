@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sklearn.decomposition import TruncatedSVD
 from sklearn.linear_model import Ridge
 from sklearn.model_selection import PredefinedSplit, cross_val_predict
-from sklearn.neighbors import KNeighborsRegressor
 
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext
 from learn.data.clips import assumed_young
@@ -33,7 +32,6 @@ only, in x. In stereo displacement is (3, N, N) mm and confidence (2, N, N), lat
 RIDGE = "ridge on PCA of flow"
 GRID = Grid(48)
 _COMPONENTS = 20
-_NEIGHBOURS = 5
 
 
 class Baseline:
@@ -114,11 +112,6 @@ def ridge(
         for part in parts:
             best[part] = alphas[errors[:, part].sum(axis=1).argmin()]
     return Ridge(best, fit_intercept=False, solver="cholesky").fit(x, y)
-
-
-def nearest(x: Floats, y: Floats) -> KNeighborsRegressor:
-    """Regression by the mean of the most similar samples."""
-    return KNeighborsRegressor(min(_NEIGHBOURS, len(x)), algorithm="brute").fit(x, y)
 
 
 def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:

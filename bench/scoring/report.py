@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from numpy.typing import NDArray
-from rich import box
 from rich.markup import escape
 from rich.table import Table
 
@@ -22,6 +21,7 @@ from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
 from bench.tracking.tracking import Snapshot, TrackedRecording, picture_masks
 from learn.evaluation.metrics import Metric
+from learn.evaluation.tables import open_table
 from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
@@ -91,21 +91,16 @@ def render_report(result: Result, title: str = "") -> str:
 
 def terminal_table(result: Result) -> Table:
     """The methods' scores for a terminal."""
-    # In 80 columns a name may take two lines, a number only one.
-    title = escape(result.recording)
-    tight = (0, 1, 0, 0)
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=tight, pad_edge=False)
-    table.add_column("method", overflow="fold")
-    if not result.methods[result.main].scores:
-        table.add_column(escape("largest force [mN]"), justify="right")
-        for name, method in result.methods.items():
+    title, methods = escape(result.recording), result.methods
+    if not methods[result.main].scores:
+        table = open_table(title, escape("largest force [mN]"), label="method")
+        for name, method in methods.items():
             sizes = method.size_mn[np.isfinite(method.size_mn)]
             table.add_row(escape(name), shown(float(sizes.max()) if len(sizes) else None))
         return table
     columns = {key: metric for key, metric in _columns(result).items() if key in _NARROW}
-    for metric in columns.values():
-        table.add_column(escape(metric.column), justify="right", no_wrap=True)
-    for name, method in result.methods.items():
+    table = open_table(title, *(escape(metric.column) for metric in columns.values()), label="method")
+    for name, method in methods.items():
         table.add_row(escape(name), *(shown(method.scores[key], m.cell_unit) for key, m in columns.items()))
     return table
 

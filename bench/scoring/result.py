@@ -93,7 +93,9 @@ class Result:
     """Errors, then warnings."""
     absolute: bool = True
     """Whether E is known, so that forces are in newtons and not those of tissue of 1 kPa."""
-    environment: dict[str, str] = field(default_factory=lambda: _environment())
+    environment: dict[str, str] = field(
+        default_factory=lambda: {"system": f"{platform.system()} {platform.machine()}", **packages.versions()}
+    )
 
     @property
     def fault(self) -> str:
@@ -180,11 +182,6 @@ def as_json(result: Result) -> dict[str, Any]:
     }
     plain: dict[str, Any] = _plain(tree)
     return plain
-
-
-def _environment() -> dict[str, str]:
-    """System and versions of packages."""
-    return {"system": f"{platform.system()} {platform.machine()}", **packages.versions()}
 
 
 def _plain(value: Any) -> Any:

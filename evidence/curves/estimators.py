@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.decomposition import TruncatedSVD
 
-from bench.methods import baselines
 from evidence import cache as stored
 from evidence.end_to_end import models
 from evidence.mechanics.conditions import coarse
@@ -153,7 +152,7 @@ def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
         forces.append(force)
         groups.append(group + start)
     x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
-    regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else baselines.nearest(x, force)
+    regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else models.fit_nearest(x, force)
     return lambda clip: (
         clip.young_kpa * np.asarray(regressor.predict(basis.transform(models.rows(coarse(clip), one.source))))
     )

@@ -18,7 +18,7 @@ FIRST = ("force_mae", "force_r2_pooled", "peak_error_share", "map_r2_pooled")  #
 def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
     """Means over sequences; `all`: every score, in every column of `YOUNG`."""
     heads = ("E known [95%]", "E × ½", "E × 2", "E unknown")[: 4 if all else 1]
-    table = _open_table(title, *heads)
+    table = open_table(title, *heads)
     columns, sure = [report.summary(y) for y in YOUNG[: len(heads)]], report.intervals()
     for key, metric in METRICS.items():
         if not (metric.listed if all else key in FIRST) or key not in columns[0]:
@@ -32,7 +32,7 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
 
 def coverage_table(covered: Sequence[Coverage]) -> Table:
     """Coverage and width of the model's intervals."""
-    table = _open_table("intervals", *(f"{one.level:.0%}" for one in covered))
+    table = open_table("intervals", *(f"{one.level:.0%}" for one in covered))
     for name, key in (("force", "size"), ("x", "x"), ("y", "y"), ("z", "z")):
         shares = [one.shares[key] for one in covered]
         table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
@@ -46,7 +46,7 @@ def coverage_table(covered: Sequence[Coverage]) -> Table:
 
 def paired_table(pairs: Mapping[str, Paired], title: str, all: bool) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
-    table = _open_table(title, "difference [95%]", "p", "larger on")
+    table = open_table(title, "difference [95%]", "p", "larger on")
     for key, metric in METRICS.items():
         if (metric.listed if all else key in FIRST) and key in pairs:
             d, pair = pairs[key].difference, pairs[key]
@@ -55,10 +55,10 @@ def paired_table(pairs: Mapping[str, Paired], title: str, all: bool) -> Table:
     return table
 
 
-def _open_table(title: str, *heads: str) -> Table:
+def open_table(title: str, *heads: str, label: str = "") -> Table:
     """A table that fits eighty columns without breaking numbers: labels wrap, no vertical lines."""
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("", overflow="fold")
+    table.add_column(label, overflow="fold")
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     return table

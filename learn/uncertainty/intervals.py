@@ -102,18 +102,6 @@ class Intervals:
     units: int  # exchangeable units in the calibration: brains, or sequences if a brain is on several sides
     sequences: int  # in the calibration
 
-    def __post_init__(self) -> None:
-        frame, count = len(self.features), len(self.features) - len(ESTIMATE)
-        for spread in (self.size, *self.axes):
-            rule = spread.scale
-            if not len(rule.slopes) == len(rule.low) == len(rule.high) == frame:
-                raise ValueError(f"an error model doesn't have {frame} features")
-            if spread.factors.keys() != {str(level) for level in LEVELS}:
-                raise ValueError(f"levels are not {', '.join(map(str, LEVELS))}")
-        rows = self.distribution.mean, *self.distribution.precision
-        if [len(row) for row in rows] != [count] * (count + 1):
-            raise ValueError(f"the distribution doesn't have {count} features")
-
     def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:
         """Intervals of the frames' forces at a level of `LEVELS`, per unit stiffness."""
         features = frame_features(predicted, self.force_unit)

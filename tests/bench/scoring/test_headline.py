@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
-from synth.recording_flow.flow import LocalFlow
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.protocol import ForceEstimate, Method, MethodContext
@@ -17,6 +16,7 @@ from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
 from synth.flow.estimator import Flags, Rgb
+from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 
 SIZE = (96, 128)
