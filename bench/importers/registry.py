@@ -103,20 +103,18 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
         found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
+    def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[NDArray[Any]]:
         with _damage_as_user_error(source):
             size = None
-            for k, picture in enumerate(map(_as_rgb, found.pictures())):
+            for k, picture in enumerate(map(_as_rgb, view.pictures()) if rgb else view.pictures()):
                 if picture.shape != (size := size or picture.shape):
                     raise UserError(f"{source}: frame {k} has another size than the frames before it")
                 yield picture
 
-    def second_pictures(view: SecondView) -> Iterator[NDArray[Any]]:
-        with _damage_as_user_error(source):
-            yield from map(_as_rgb, view.pictures()) if view.kind == "right" else view.pictures()
-
-    second = found.second and replace(found.second, pictures=partial(second_pictures, found.second))
-    return replace(found, pictures=pictures, second=second)
+    second = found.second
+    if second is not None:
+        second = replace(second, pictures=partial(decoded, second, second.kind == "right"))
+    return replace(found, pictures=partial(decoded, found), second=second)
 
 
 @contextmanager

@@ -243,7 +243,7 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
     if scene.membrane != "unknown":
         return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
-    young = assumed_young(scene.young_kpa) if scene.young_kpa else 1.0
+    young = assumed_young(scene.young_kpa)
     bare, covered = max(1 - weights.membrane, 1e-3), max(weights.membrane, 1e-3)
     if covered <= bare:
         least = f"no evidence for a membrane above {TISSUES.thin_mm * young:.2g} {unit}"

@@ -260,12 +260,6 @@ def _smoother(size: int, sigma_px: float) -> Tensor:
     return weight / weight[size // 2].sum()
 
 
-def channel_names(confidence: bool, depth: bool, membrane: bool) -> tuple[str, ...]:
-    """Names of the network's channels, with those of confidence, of stereo depth and of the membrane."""
-    along = ("dz", "confidence of dz") if confidence else ("dz",)
-    return (*CHANNELS, *["confidence"] * confidence, *along[: 2 * depth], *["membrane"] * membrane)
-
-
 def membrane_code(known: MembraneState) -> float:
     """Value of the membrane channel: -1 stripped, 0 unknown, 1 intact."""
     return get_args(MembraneState).index(known) - 1.0
@@ -279,7 +273,7 @@ def channels(
     confidence: Tensor | None = None,
     membrane: Tensor | None = None,
 ) -> Tensor:
-    """The network's input, in the order of `channel_names`.
+    """The network's input, in the order of `Architecture.channels`.
 
     `displacement`: (B, 2, N, N) mm in picture axes, or (B, 3, N, N) mm in camera axes; `mask`: (B, 1, N, N)
     0/1; `confidence`: (B, 1, N, N) in 0..1, with depth (B, 2, N, N); `membrane`: (B,) of `membrane_code`.

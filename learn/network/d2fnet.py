@@ -23,7 +23,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from learn.data.grid import channel_names
+from learn.data.grid import CHANNELS
 from synth.job.types import Section
 
 BOUNDS = (0.25, 0.75, 1.5)
@@ -60,8 +60,10 @@ class Architecture(Section):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the input channels."""
-        return channel_names(self.confidence, self.depth, self.membrane)
+        """Names of the input channels, in order."""
+        along = ("dz", *["confidence of dz"] * self.confidence)
+        flow = (*CHANNELS, *["confidence"] * self.confidence)
+        return (*flow, *along * self.depth, *["membrane"] * self.membrane)
 
     @property
     def displacements(self) -> int:
