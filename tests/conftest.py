@@ -8,6 +8,7 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+pytest_plugins = ["clip_fixtures"]
 
 SLOW = Path(__file__).parent / "slow"
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run
 from fake_model import write_model
 from fake_recording import Maker
-from typer.testing import CliRunner
 
 import bench.cli
 import learn.cli
@@ -34,15 +34,10 @@ def test_predict_and_score_agree_at_every_frame(
     # The other methods are slow and not tested here.
     monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})
 
-    words = [str(model), str(folder / "video.mp4"), "--scale", "0.2", "--tissue", str(folder / "tissue.png")]
-    words += [] if young is None else ["--young", str(young)]
-    words += ["-o", str(tmp_path / "forces"), "--flow", "dis", "--json"]
-    predicted = CliRunner().invoke(learn.cli.app, ["predict", *words])
-    assert predicted.exit_code == 0, predicted.output
-    words = [str(folder), "--model", str(model), "-o", str(tmp_path / "score"), "--flow", "dis", "--json"]
-    scored = CliRunner().invoke(bench.cli.app, ["score", *words])
-    assert scored.exit_code == 0, scored.output
-
+    words = [model, folder / "video.mp4", "--scale", 0.2, "--tissue", folder / "tissue.png"]
+    words += [] if young is None else ["--young", young]
+    run(learn.cli.app, "predict", *words, "-o", tmp_path / "forces", "--flow", "dis")
+    run(bench.cli.app, "score", folder, "--model", model, "-o", tmp_path / "score", "--flow", "dis")
     curve = json.loads((tmp_path / "score" / "score.json").read_text())["curve"]
     with np.load(tmp_path / "forces" / "video.npz") as found:
         # Every third of 25 frames a second, as close to ten as whole frames come; half as large as filmed.

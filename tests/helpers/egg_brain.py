@@ -21,19 +21,12 @@ def soup() -> np.ndarray:
 
 def written(path: Path, corner: np.ndarray) -> Path:
     """Triangles (F, 3, 3) as a file of the format that its name says, vertices unmerged."""
+    if path.suffix != ".vtk":
+        trimesh.Trimesh(**trimesh.triangles.to_kwargs(corner), process=False).export(path)
+        return path
     flat = [f"{x:.6f} {y:.6f} {z:.6f}" for x, y, z in corner.reshape(-1, 3)]
-    three = np.arange(len(flat)).reshape(-1, 3)
-    if path.suffix == ".obj":
-        lines = [f"v {v}" for v in flat] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in three]
-    elif path.suffix == ".stl":
-        lines = ["solid egg"]
-        for triple in three:
-            corners = [f"vertex {flat[i]}" for i in triple]
-            lines += ["facet normal 0 0 0", "outer loop", *corners, "endloop", "endfacet"]
-        lines.append("endsolid egg")
-    else:
-        rows = [f"3 {a} {b} {c}" for a, b, c in three]
-        lines = ["# vtk DataFile Version 3.0", "egg", "ASCII", "DATASET POLYDATA"]
-        lines += [f"POINTS {len(flat)} float", *flat, f"POLYGONS {len(rows)} {4 * len(rows)}", *rows]
+    rows = [f"3 {3 * k} {3 * k + 1} {3 * k + 2}" for k in range(len(corner))]
+    lines = ["# vtk DataFile Version 3.0", "egg", "ASCII", "DATASET POLYDATA"]
+    lines += [f"POINTS {len(flat)} float", *flat, f"POLYGONS {len(rows)} {4 * len(rows)}", *rows]
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -12,7 +12,7 @@ from pathlib import Path
 from synth.dataset.folder import claim
 from synth.dataset.index import write_index
 from synth.engine.child import Attempt
-from synth.engine.journal import RunProgress, Watcher
+from synth.engine.journal import Watcher
 from synth.engine.run import Options, run_job
 from synth.job.schema import Job
 from synth.publish import card
@@ -26,17 +26,11 @@ class Silent(Watcher):
     def __init__(self) -> None:
         self.attempts: list[tuple[Attempt, bool]] = []
 
-    def begin(self, total: int, already: int, failed: int) -> None:
-        self.begun = (total, already, failed)
-
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         assert 0 <= done <= of
 
     def end(self, attempt: Attempt, again: bool) -> None:
         self.attempts.append((attempt, again))
-
-    def account(self, progress: RunProgress) -> None:
-        self.last = progress
 
 
 def options(work: str, **more: object) -> Options:

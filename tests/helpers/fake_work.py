@@ -50,7 +50,7 @@ def attributes(index: int, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """Sequence 1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 is refused, 7 succeeds when repeated."""
+    """Sequence 1 aborts, 2 fills memory, 3 is NaN, 4 raises, 6 and 8 are refused, 7 fails once."""
     if index == 1:
         report("render", 0, 1)
         os.abort()
@@ -64,7 +64,7 @@ def troubled(job: Job, index: int, folder: Path, report: ProgressCallback) -> No
         writer.put("force", np.full((job.frames, 3), np.nan))
     if index == 4:
         raise ZeroDivisionError("by nought")
-    if index == 6:
+    if index in (6, 8):
         raise UserError("the load is past the material's range")
     if index == 7:
         tried = folder / ".run" / "tried"
@@ -83,13 +83,6 @@ def seeing(job: Job, index: int, folder: Path, report: ProgressCallback) -> None
 def hanging(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
     """A sequence that takes ten minutes."""
     time.sleep(600)
-
-
-def trying(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:
-    """A sequence; 2 and 6 are refused."""
-    if index in (2, 6):
-        raise UserError("the load is past the material's range")
-    sequence(job, index, folder, report)
 
 
 def full(job: Job, index: int, folder: Path, report: ProgressCallback) -> None:

@@ -90,9 +90,8 @@ def epoch(work: Path) -> tuple[Numbers, dict[str, str]]:
     answers = answer if isinstance(answer, list | tuple) else [answer]
     numbers = {f"answer {k}": mean_and_maximum(one) for k, one in enumerate(answers)}
     numbers |= {"loss": mean_and_maximum([losses[-1]["loss"]])}
-    weights = (work / "model" / "weights.safetensors", work / "model" / "weights.pt")
-    found = next(path for path in weights if path.exists())
-    return numbers, {"weights": hashlib.blake2b(found.read_bytes(), digest_size=16).hexdigest()}
+    weights = (work / "model/weights.safetensors").read_bytes()
+    return numbers, {"weights": hashlib.blake2b(weights, digest_size=16).hexdigest()}
 
 
 def scores(recording: Path, out: Path) -> tuple[Numbers, dict[str, str]]:

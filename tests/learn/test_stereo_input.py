@@ -11,7 +11,7 @@ import numpy as np
 import phantom
 import pytest
 import torch
-from typer.testing import CliRunner
+from command import run
 
 from learn.checkpoint import read_model
 from learn.cli import app
@@ -27,7 +27,6 @@ from learn.training.gpu_batches import DeviceDataset
 from learn.training.train import train
 from synth.job.types import MembraneState
 
-run = CliRunner().invoke
 SCALES = Scales(0.5, 0.02, 0.3, 12.5, 0.07)
 
 
@@ -130,14 +129,12 @@ def test_batches_on_a_device_are_equal_to_those_read_one_by_one(stereo: list[Cli
 
 @pytest.mark.slow
 def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> None:
-    done = run(app, ["predict", str(model), str(data), "-o", str(tmp_path / "f"), "--json"])
-    assert done.exit_code == 0, done.output
+    run(app, "predict", model, data, "-o", tmp_path / "f")
     stored = np.load(tmp_path / "f/000000.npz")
     assert stored["force_mn"].shape == (6, 3)
-    scored = run(app, ["eval", str(model), str(data), "--all", "--json"])
-    assert scored.exit_code == 0, scored.output
+    scored = run(app, "eval", model, data, "--all", "--json")
     assert json.loads(scored.stdout)["input"] == "motion"
-    assert run(app, ["eval", str(model), str(data), "--all", "--input", "recovered"]).exit_code != 0
+    run(app, "eval", model, data, "--all", "--input", "recovered", code=2)
     assert export(load_model(model), tmp_path / "net.onnx") < 1e-4
     about = json.loads((tmp_path / "net.onnx.json").read_text())
     assert "stereo" in about["preprocessing"][0]

@@ -8,7 +8,7 @@ from typing import Any
 
 import phantom
 import pytest
-from typer.testing import CliRunner
+from command import run
 
 from learn.checkpoint import read_card
 from learn.cli import app
@@ -19,10 +19,8 @@ BRAINS = 90
 TINY = ["--preset", "tiny", "size=32", "arch.width=8", "--json"]
 
 
-def run(*words: str) -> dict[str, Any]:
-    done = CliRunner().invoke(app, list(words))
-    assert done.exit_code == 0, done.output
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+def reported(*words: object) -> dict[str, Any]:
+    return dict(json.loads(run(app, *words).stdout.splitlines()[-1]))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +35,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def model(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("trained") / "model"
-    result = run("train", str(dataset), "-o", str(out), "--input", "recovered", "--epochs", "6", *TINY)
+    result = reported("train", dataset, "-o", out, "--input", "recovered", "--epochs", 6, *TINY)
     assert result["intervals"] >= 9
     return out
 
@@ -67,7 +65,7 @@ def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     others = {*card.groups["fit"], *card.groups["select"], *card.groups["test"]}
     assert not set(card.groups["intervals"]) & others
     assert card.no_intervals == ""
-    wide, _ = run("eval", str(model), str(dataset), "--json")["coverage"]
+    wide, _ = reported("eval", model, dataset, "--json")["coverage"]
     assert wide["level"] == 0.9
     # 27 sequences: a share of 0.9 has a standard error of 0.06 if each held or failed as a whole.
     for name in ("size", "x", "y", "z"):
@@ -75,7 +73,7 @@ def test_new_brains_are_covered_and_other_mechanics_widen_intervals(
     assert wide["out_of_distribution"] < 0.15
     # A component that one camera can't measure has an interval too.
     assert wide["width_z_mn"] > 0
-    other, _ = run("eval", str(model), str(foreign), "--json")["coverage"]
+    other, _ = reported("eval", model, foreign, "--json")["coverage"]
     assert other["out_of_distribution"] > 0.5
     assert other["width_mn"] > 2 * wide["width_mn"]
     assert other["size"]["mean"] > 0.8

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command import run
 from fake_recording import texture
 from numpy.typing import NDArray
-from typer.testing import CliRunner
 
 from bench.cli import app
 from bench.importers import registry
@@ -106,8 +106,7 @@ def test_imported_data_equal_the_source(
     make: Callable[[Path], Path], name: str, use: list[str], tmp_path: Path
 ) -> None:
     source, out = make(tmp_path / name), tmp_path / "rec"
-    result = CliRunner().invoke(app, ["import", str(source), "-o", str(out), "--scale", "0.1", *use])
-    assert result.exit_code == 0, result.output
+    run(app, "import", source, "-o", out, "--scale", 0.1, *use)
     recording = open_recording(out)
     pictures = list(recording.frames())
     assert np.array([p.time_s for p in pictures]) == pytest.approx(TIMES, abs=1e-6)
@@ -178,10 +177,8 @@ def test_a_folder_of_pictures_with_a_ros_table_becomes_a_recording(pictures: Pat
     stamps = tmp_path / "stamps.csv"
     stamps.write_text("\n".join(["t_s", *(f"{1.7e9 + k / 4:.3f}" for k in range(12))]) + "\n")
     out = tmp_path / "rec"
-    words = ["import", str(pictures), "-o", str(out), "--scale", "0.1"]
-    words += ["--use", f"force={table}", "--use", f"frame_time={stamps}"]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    times = ["--use", f"force={table}", "--use", f"frame_time={stamps}"]
+    run(app, "import", pictures, "-o", out, "--scale", 0.1, *times)
     recording = open_recording(out)
     assert recording.force is not None
     assert recording.force.time_s == pytest.approx([0, 1, 2, 3], abs=1e-5)

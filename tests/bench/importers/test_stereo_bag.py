@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,16 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fake_recording import texture
+from command import run
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from bench.cli import app
 from bench.importers import registry
 from bench.importers.rosbag import _depth, partners
-from bench.methods import comparison
 from bench.recording.folder import open_recording
-from evidence.scoring.cost import pushed
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 
@@ -97,12 +93,6 @@ def write_bag(
     return path
 
 
-def bring_in(source: Path, out: Path) -> Any:
-    words = ["import", str(source), "-o", str(out), "--scale", str(AWAY_MM / FOCAL), "--json"]
-    words += ["--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}"]
-    return CliRunner().invoke(app, words)
-
-
 def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:
     """Of six frames the right camera lacks the first, fourth and last."""
     bent = [k * np.array([-0.3, 0.1, 0.001, -0.002, 0.05]) for k in (1.0, 0.9)]
@@ -113,8 +103,8 @@ def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:
     for t in (0, 3, 5):
         video[t].pop("right")
     source = write_bag(tmp_path / "bag", video, np.zeros((60, 3)), lenses(TOED_IN, bent))
-    done = bring_in(source, tmp_path / "rec")
-    assert done.exit_code == 0, done.output
+    words = ["import", source, "-o", tmp_path / "rec", "--scale", AWAY_MM / FOCAL]
+    run(app, *words, "--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}")
     rig = read_rig(tmp_path / "rec/stereo.yaml", SIZE)
     assert rig.rotation == pytest.approx(TOED_IN[0], abs=1e-9)
     assert rig.translation == pytest.approx(TOED_IN[1], abs=1e-9)
@@ -169,28 +159,6 @@ def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, st
     for further in ({}, {"right": CAMERAS["right"]}):
         with pytest.raises(UserError):
             registry.read_source(source, {"force": ARMS[0], **further, **use})
-
-
-@pytest.mark.slow
-def test_a_bag_becomes_a_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tissue moves with the force, equally in both cameras."""
-    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})  # slow
-    apart = round(FOCAL * BASE_MM / AWAY_MM)
-    rest = texture(SIZE[1], SIZE[0] + apart)
-    newtons = np.zeros((200, 3))
-    newtons[:, 0] = 0.05 * np.clip(np.sin(np.arange(-40, 160) / 100 * np.pi), 0, None)
-    wide = [pushed(rest, 160 * force) for force in newtons[::10, 0]]
-    video = [{"left": one[:, : SIZE[0]], "right": one[:, apart:]} for one in wide]
-    source = write_bag(tmp_path / "bag", video, newtons, lenses(PARALLEL, 2 * [np.zeros(5)]))
-    done = bring_in(source, tmp_path / "rec")
-    assert done.exit_code == 0, done.output
-    score = ["score", str(tmp_path / "rec"), "--flow", "dis", "--no-pulse", "-o", str(tmp_path / "score")]
-    done = CliRunner().invoke(app, score)
-    assert done.exit_code == 0, done.output
-    curve = json.loads((tmp_path / "score/score.json").read_text())["curve"]
-    sensor, predicted = np.array(curve["sensor_mn"]), np.array(curve["predicted_mn"]["D2FNet"])
-    assert sensor.max() == pytest.approx(50, rel=0.05)
-    assert np.corrcoef(sensor, predicted)[0, 1] > 0.9
 
 
 def test_inverse_depth_is_refused() -> None:

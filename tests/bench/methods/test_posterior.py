@@ -152,7 +152,6 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
         frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
         found = physics.weigh_tissues(scene, frames, STILL)
         stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
-    assert "evidence for a membrane of about" in physics.describe(found, scene)
     # On another mesh bare tissue may be taken for a thin membrane, never for a thick one.
     assert stiff[0] <= 5 + 1e-9
     assert stiff[1] > 20

@@ -40,11 +40,7 @@ def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
 def test_stated_rotation_is_applied(tmp_path: Path) -> None:
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[:8, :8] = 255  # top left as recorded
-    with av.open(str(tmp_path / "v.mp4"), "w") as out:
-        stream = out.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt, stream.time_base = 64, 32, "yuv420p", Fraction(1, 10)
-        for packet in [*stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")), *stream.encode()]:
-            out.mux(packet)
+    writer.write_video(tmp_path / "v.mp4", iter([rgb]), np.zeros(1))
     data = bytearray((tmp_path / "v.mp4").read_bytes())
     # The track header's display matrix [ISO 14496-12, 8.3.2]: 90 degrees clockwise.
     at = data.find(b"tkhd") + 4 + 40

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,28 +69,29 @@ def write_pair(folder: Path) -> dict[str, object]:
 
 @pytest.fixture
 def make(tmp_path: Path) -> Make:
-    """Three frames: rest, half a dent, a dent. Tissue lies where disparity is 0."""
+    """Frames by the size of the dent and the height of the whole surface, at rest where disparity is 0."""
 
-    def made(second: str) -> Path:
-        folder = tmp_path / second
-        for name in ("frames", "right", "depth"):
-            (folder / name).mkdir(parents=True)
-        for t, amount in enumerate((0.0, 0.3, 0.6)):
-            u, d = 2.5 * amount * DENT, -amount * DENT
-            cv2.imwrite(str(folder / f"frames/{t}.png"), warped(u)[..., ::-1])
+    def made(
+        second: str,
+        dents: Sequence[float] = (0.0, 0.3, 0.6),
+        lift_mm: Sequence[float] = (0, 0, 0),
+        fps: float = 10,
+    ) -> Path:
+        for name in ("frames", second):
+            (tmp_path / name).mkdir()
+        for t, (amount, lift) in enumerate(zip(dents, lift_mm, strict=True)):
+            u, depth = 2.5 * amount * DENT, np.float32(AWAY + lift + rise(amount))
+            cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), warped(u)[..., ::-1])
             if second == "right":
-                cv2.imwrite(str(folder / f"right/{t}.png"), warped(u - d)[..., ::-1])
-            if second == "depth":
-                now = AWAY + cv2.remap(rise(amount), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
-                points = np.stack([np.zeros_like(now), np.zeros_like(now), now], axis=-1)
-                np.save(folder / f"depth/{t}.npy", (points if t else now).astype(np.float32))
-        about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": 10.0}
-        if second == "right":
-            about["stereo"] = write_pair(folder)
-        else:
-            about["depth"] = {"focal_px": FOCAL}
-        writer.write_meta(folder, about)
-        return folder
+                d = FOCAL * BASE * (1 / depth - 1 / AWAY)
+                cv2.imwrite(str(tmp_path / f"right/{t:03d}.png"), warped(u - d)[..., ::-1])
+            else:
+                now = cv2.remap(depth, *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
+                np.save(tmp_path / f"depth/{t:03d}.npy", np.dstack([0 * now, 0 * now, now]) if t else now)
+        about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": fps}
+        about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
+        writer.write_meta(tmp_path, about)
+        return tmp_path
 
     return made
 
@@ -132,7 +133,7 @@ def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> Non
     assert done.stereo.noise_mm > 0
 
 
-@pytest.mark.parametrize(("second", "lost"), [("right", "1.png"), ("depth", "1.npy")])
+@pytest.mark.parametrize(("second", "lost"), [("right", "001.png"), ("depth", "001.npy")])
 def test_a_missing_right_or_depth_picture_is_a_gap(make: Make, second: str, lost: str) -> None:
     folder = make(second)
     (folder / second / lost).unlink()
@@ -142,28 +143,15 @@ def test_a_missing_right_or_depth_picture_is_a_gap(make: Make, second: str, lost
 
 @pytest.mark.slow
 @pytest.mark.parametrize("second", ["right", "depth"])
-def test_breathing_along_the_optical_axis_is_removed_from_depth(tmp_path: Path, second: str) -> None:
+def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, second: str) -> None:
     """The whole surface moves in depth, which one picture hardly shows, and is pressed meanwhile."""
     rate_hz, lift_mm, fps, count = 0.4, 0.5, 6.0, 72
     time = np.arange(count) / fps
     load = 0.5 * np.clip(np.sin(np.pi * (time - 5) / 2.5), 0, None) * ((time > 5) & (time < 7.5))
     breath = lift_mm * (np.cos(2 * np.pi * rate_hz * time) - 1)
-    for name in ("frames", second):
-        (tmp_path / name).mkdir()
-    for t, (amount, lift) in enumerate(zip(load, breath, strict=True)):
-        u, depth = 2.5 * amount * DENT, AWAY + lift + rise(amount)
-        cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), warped(u)[..., ::-1])
-        if second == "right":
-            d = FOCAL * BASE * (1 / depth - 1 / AWAY)
-            cv2.imwrite(str(tmp_path / f"right/{t:03d}.png"), warped(u - d)[..., ::-1])
-        else:
-            now = cv2.remap(depth.astype(np.float32), *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
-            np.save(tmp_path / f"depth/{t:03d}.npy", now)
-    about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": fps}
-    about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
-    writer.write_meta(tmp_path, about)
     method, settings = Recorder(), replace(SETTINGS, pulse=True)
-    done = track_recording(open_recording(tmp_path), {"it": method}, AWAY / FOCAL, settings)
+    recording = open_recording(make(second, load, breath, fps))
+    done = track_recording(recording, {"it": method}, AWAY / FOCAL, settings)
     assert len(method.inputs) == 2 * count, "two passes: the first finds the pulse, the second removes it"
     motion = np.stack([moved.motion for moved in method.inputs]).reshape(2, count, *DENT.shape, 3)
     (rhythm,) = done.pulse

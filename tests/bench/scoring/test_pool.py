@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from command import run
 
 from bench.cli import app
 from bench.scoring import pool
@@ -75,8 +75,7 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
         (tmp_path / name).mkdir()
         (tmp_path / name / "score.json").write_text(json.dumps(score(name, 2.0, name)))
     out = tmp_path / "out"
-    done = CliRunner().invoke(app, ["pool", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(out)])
-    assert done.exit_code == 0, done.output
+    run(app, "pool", tmp_path / "a", tmp_path / "b", "-o", out)
     assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.svg"}
     with pytest.raises(UserError, match="given twice"):
         pool.read([tmp_path / "a", tmp_path / "a"])

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 from fake_model import write_model
 from fake_recording import texture
-from typer.testing import CliRunner
 
 from bench.cli import app
 from bench.methods.network import Model
@@ -110,8 +110,8 @@ def test_live_estimates_the_same_forces_as_score(tmp_path: Path) -> None:
     folder.mkdir()
     write_video(folder / "video.mp4", iter([rest[0], *shots]), np.arange(4) / 25)
     (folder / "meta.yaml").write_text("scale_mm_per_px: 0.3\nyoung_kpa: 1.0\nrest_frame: 0\n")
-    words = ["live", str(folder / "video.mp4"), "-m", str(model), "--scale", "0.3", "--young", "1"]
-    summary = json.loads(CliRunner().invoke(app, [*words, "--every", "--json"]).output)
+    words = ["live", folder / "video.mp4", "-m", model, "--scale", 0.3, "--young", 1]
+    summary = json.loads(run(app, *words, "--every", "--json").stdout)
     assert (summary["frames"], summary["dropped"]) == (3, 0)
 
     settings = RecordingFlowSettings(shrink=1, rate_hz=None)

@@ -14,7 +14,7 @@ import numpy as np
 import phantom
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
+from command import run
 
 from learn import cli
 from learn.checkpoint import ModelCard, read_card
@@ -40,7 +40,6 @@ from synth.errors import UserError
 from synth.job.schema import Job
 from synth.publish.export.registry import FORMATS, export_dataset
 
-run = CliRunner().invoke
 BASE, SCALES = preset("tiny", size=32), Scales(1.0, 0.2, 1.0, 100.0, 0.3)
 
 
@@ -88,12 +87,11 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     own = make(tmp_path / "own", rng.integers(0, 9, 9 + draw).tolist())
     if draw % 2:
         words = ["--shares", "0.5,0.2,0.3", *(["--by", "sequence", "--share-anatomy"] if draw == 3 else [])]
-        done = run(synth, ["split", str(own), *words])
-        assert done.exit_code == 0, done.output
-    assert run(synth, ["report", str(own)]).exit_code == 0
+        run(synth, "split", own, *words)
+    run(synth, "report", own)
     before = index.read_split(own)
     make(own, rng.integers(0, 14, 4).tolist(), first=len(before.sides))
-    assert run(synth, ["report", str(own)]).exit_code == 0
+    run(synth, "report", own)
     stored = index.read_split(own)
     assert before.sides.items() <= stored.sides.items(), "growth changes no side"
     rows = index.read_index(own).to_pylist()
@@ -101,15 +99,9 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     # Publication.
     assert {row["index"]: row["split"] for row in rows} == on
     assert not split.leaks(rows, stored)
-    text = (own / "README.md").read_text()
-    assert f"hash `{stored.hash}`" in text
-    counts = split.count(rows)
-    assert (
-        f"Splits: test {counts['test']}, train {counts['train']}, validation {counts['validation']}" in text
-    )
+    assert stored.hash in (own / "README.md").read_text()
     (named, _) = json.loads((own / "croissant.json").read_text())["distribution"]
     assert named["sha256"] == hashlib.sha256((own / named["contentUrl"]).read_bytes()).hexdigest()
-    assert f"test {counts['test']}" in (own / "report.html").read_text()
     for found in exported(own, tmp_path).values():
         assert found == on
     # Training.
@@ -160,8 +152,7 @@ def test_only_overlapping_openings_are_one_group(tmp_path: Path) -> None:
     own = make(tmp_path / "own", [1] * 12, opening=names)
     with pytest.raises(UserError):
         divided(own)  # one brain
-    done = run(synth, ["split", str(own), "--by", "opening", "--shares", "0.4,0.3,0.3"])
-    assert done.exit_code == 0, done.output
+    run(synth, "split", own, "--by", "opening", "--shares", "0.4,0.3,0.3")
     on = {row["opening"]: set[str]() for row in index.read_index(own).to_pylist()}
     for row in index.read_index(own).to_pylist():
         on[row["opening"]].add(row["split"])
@@ -177,14 +168,13 @@ def test_only_overlapping_openings_are_one_group(tmp_path: Path) -> None:
 def test_train_and_eval_use_the_split(tmp_path: Path) -> None:
     own = make(tmp_path / "own", [*range(8)])
     words = ["--preset", "tiny", "--epochs", "1", "--json", "size=32", "arch.width=8"]
-    done = run(cli.app, ["train", str(own), "-o", str(tmp_path / "model"), *words])
-    assert done.exit_code == 0, done.output
+    run(cli.app, "train", own, "-o", tmp_path / "model", *words)
     card, chosen = read_card(tmp_path / "model"), index.read_split(own)
     assert card.dataset_splits == [chosen.hash]
     assert {chosen.sides[name] for name in card.split["test"]} == {"test"}
-    done = run(cli.app, ["eval", str(tmp_path / "model"), str(own), "--json"])
+    done = run(cli.app, "eval", tmp_path / "model", own, "--json")
     assert len(json.loads(done.stdout)["sequences"]) == len(card.split["test"])
-    assert run(cli.app, ["train", str(own), "-o", str(tmp_path / "b"), "folds=3"]).exit_code == 2
+    run(cli.app, "train", own, "-o", tmp_path / "b", "folds=3", code=2)
 
 
 def many(clips: list[Clip], brains: int, each: int = 2) -> list[Clip]:

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from learn.checkpoint import read_card
+from learn.data.grid import Grid
 from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
@@ -92,6 +93,14 @@ def test_fitting_and_estimation_use_the_same_force(kind: str, request: pytest.Fi
     moved, still = estimate(folder), estimate(folder, 0.0)
     found = net_force(moved.map.density[None], still.map.density[None], moved.map.grid)
     assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
+
+
+def test_the_force_at_rest_is_subtracted_and_a_size_is_not_negative() -> None:
+    grid, density = Grid(16), np.zeros((2, 1, 3, 16, 16), np.float32)
+    density[0, ..., 8, 8], density[1, ..., 8, 8] = 1 / grid.pitch_mm**2, 3 / grid.pitch_mm**2
+    assert np.abs(net_force(*density, grid)[0]) == pytest.approx([2.0, 2.0, 2.0])
+    assert net_force(density[1, :, :1], density[0, :, :1], grid)[0, 0] == pytest.approx(2.0)
+    assert net_force(density[0, :, :1], density[1, :, :1], grid)[0, 0] == 0
 
 
 @pytest.mark.parametrize("wrong", [("force_unit", -1.0), ("features", ("log motion",))])

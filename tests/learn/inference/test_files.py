@@ -7,14 +7,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import onnxruntime
 import pytest
+from command import run
 from fake_model import write_model
-from typer.testing import CliRunner
 
+from bench.recording import writer
 from learn.checkpoint import ModelCard, read_card, write_card
 from learn.cli import app
 from learn.data.clips import Clip
@@ -31,8 +31,6 @@ from synth.recording_flow.passes import VideoPass
 from synth.system.config_file import override
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import read_video
-
-run = CliRunner().invoke
 
 
 @pytest.fixture(
@@ -82,10 +80,9 @@ def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_p
         young_kpa=sequence.attrs["young_kpa"],
     )
     for source in (store, arrays):
-        done = run(app, ["predict", str(model), str(source), "-o", str(tmp_path / "out"), "--json"])
-        assert done.exit_code == 0, done.output
+        run(app, "predict", model, source, "-o", tmp_path / "out")
     before = arrays.read_bytes()
-    assert run(app, ["predict", str(model), str(arrays), "-o", str(tmp_path)]).exit_code == 2
+    run(app, "predict", model, arrays, "-o", tmp_path, code=2)
     assert arrays.read_bytes() == before, "the input is not overwritten"
     with np.load(tmp_path / "out/000002.npz") as a, np.load(tmp_path / "out/mine.npz") as b:
         np.testing.assert_array_equal(a["density"], b["density"])
@@ -98,14 +95,9 @@ def write_video(file: Path, frames: int = 3) -> None:
     rng = np.random.default_rng(0)
     wide = cv2.GaussianBlur(rng.uniform(60, 200, (48, 80)).astype(np.float32), None, 1.5)
     wide = (255 * (wide - wide.min()) / np.ptp(wide)).clip(40, 220).astype(np.uint8)
-    with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "0", "threads": "1"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
-        for t in range(frames):
-            rgb = np.repeat(wide[:, 8 - t : 72 - t, None], 3, axis=2) * np.array([1.0, 0.75, 0.7])
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb.astype(np.uint8)), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    coloured = (wide[..., None] * np.array([1.0, 0.75, 0.7])).astype(np.uint8)
+    shown = (np.ascontiguousarray(coloured[:, 8 - t : 72 - t]) for t in range(frames))
+    writer.write_video(file, shown, np.arange(frames) / 10, crf=0)
 
 
 def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
@@ -113,11 +105,8 @@ def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:
     marked = np.zeros((48, 64), np.uint8)
     marked[8:40, 8:56] = 255
     cv2.imwrite(str(tmp_path / "tissue.png"), marked)
-    args = ["predict", str(model), str(tmp_path / "video.mp4"), "-o", str(tmp_path), "--scale", "0.4"]
-    done = run(
-        app, [*args, "--tissue", str(tmp_path / "tissue.png"), "--flow", "dis", "--young", "1", "--json"]
-    )
-    assert done.exit_code == 0, done.output
+    known = ["--scale", 0.4, "--young", 1, "--tissue", tmp_path / "tissue.png"]
+    run(app, "predict", model, tmp_path / "video.mp4", "-o", tmp_path, "--flow", "dis", *known)
     with np.load(tmp_path / "video.npz") as found:
         assert found["total_force_mn"].shape == (3,)
         assert found["young_known"]
@@ -133,17 +122,16 @@ def test_an_unknown_scale_is_reported_and_e_ignored(
 ) -> None:
     write_video(tmp_path / "video.mp4", 1)
     monkeypatch.chdir(tmp_path)
-    predict = ["predict", str(model), "video.mp4", "--flow", "dis"]
+    predict = ["predict", model, "video.mp4", "--flow", "dis"]
     # The picture of 64 px is assumed to be 32 mm wide.
     for name, scale in (("unknown", ["--scale", "unknown", "--young", "3"]), ("stated", ["--scale", "0.5"])):
-        done = run(app, [*predict, *scale, "--out", name])
-        assert done.exit_code == 0, done.output
+        run(app, *predict, *scale, "--out", name)
     unknown, stated = (np.load(Path(name, "video.npz")) for name in ("unknown", "stated"))
     np.testing.assert_array_equal(unknown["total_force_mn"], stated["total_force_mn"])
     assert not unknown["young_known"]
     assert unknown["notes"][0] == UNKNOWN_NOTE
     assert UNKNOWN_NOTE not in stated["notes"]
-    assert run(app, [*predict, "--scale", "-1"]).exit_code == 2
+    run(app, *predict, "--scale", -1, code=2)
 
 
 def test_stiffness_from_a_press(clips: list[Clip]) -> None:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 
 import av
 import numpy as np
 import phantom
 import pytest
+from command import run
 from fake_model import write_model
-from typer.testing import CliRunner
 
 from learn.cli import app
 from learn.data.grid import GridView, to_image
@@ -36,20 +35,13 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_model(tmp_path_factory.mktemp("model"), "arch.output=vector")
 
 
-def predict(*words: object) -> dict[str, object]:
-    done = CliRunner().invoke(app, ["predict", *map(str, words), "--json"])
-    assert done.exit_code == 0, (done.output, done.exception)
-    found: dict[str, object] = json.loads(done.stdout)
-    return found
-
-
 def frames(path: Path) -> list[np.ndarray]:
     with av.open(str(path)) as container:
         return [one.to_ndarray(format="rgb24") for one in container.decode(video=0)]
 
 
 def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path) -> None:
-    predict(model, data, "--out", tmp_path)
+    run(app, "predict", model, data, "--out", tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == FILES
     sequence = Dataset(data)[0]
     with np.load(tmp_path / "000000.npz") as found:

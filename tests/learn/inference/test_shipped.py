@@ -9,16 +9,13 @@ import fake_model
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from command import run
 
 import learn
 from learn import checkpoint
 from learn.cli import app
 from learn.inference import shipped
-from synth.errors import UserError
 from synth.system.checked_file import folder_bytes
-
-run = CliRunner().invoke
 
 
 @pytest.fixture
@@ -36,7 +33,7 @@ def pack(models: Path, name: str, *changes: str) -> Path:
     return models / name
 
 
-def test_a_packed_model_is_equal_and_damage_is_found(models: Path) -> None:
+def test_a_packed_model_is_equal(models: Path) -> None:
     folder = pack(models, "mono", "arch.output=vector")
     pack(models, "stereo")
     assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "weights.safetensors"}
@@ -44,14 +41,8 @@ def test_a_packed_model_is_equal_and_damage_is_found(models: Path) -> None:
     before, after = (checkpoint.read_model(one)[0].state_dict() for one in both)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name]) for name in before)
-    row = json.loads(run(app, ["models", "--json"]).stdout)[0]
+    row = json.loads(run(app, "models", "--json").stdout)[0]
     assert (row["name"], row["cameras"], row["bytes"]) == ("mono", 1, folder_bytes(folder))
-    weights = folder / "weights.safetensors"
-    whole = weights.read_bytes()
-    for broken in (whole[:-100], whole[:-1] + b"\x7f"):
-        weights.write_bytes(broken)
-        with pytest.raises(UserError, match="weights"):
-            learn.load_model("mono")
 
 
 @pytest.mark.parametrize(
@@ -73,4 +64,3 @@ def test_pretrained_networks_are_small_complete_and_documented(name: str) -> Non
     assert card.settings.arch.depth == (name == "stereo")
     page = (folder / "README.md").read_text()
     assert shipped.hash_data(card) in page
-    assert "Limits:" in page

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from command import run
 from fake_run import in_process
-from typer.testing import CliRunner
 
 from synth.checks import verify
 from synth.cli import app
@@ -60,7 +60,7 @@ def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: di
 
 
 def test_edited_attributes_and_sides_are_refused_and_found(dataset: Path) -> None:
-    assert CliRunner().invoke(app, ["split", str(dataset), "--by", "sequence"]).exit_code == 0
+    run(app, "split", dataset, "--by", "sequence")
     assert "splits" not in bad(dataset)
     found = index.read_index(dataset).to_pylist()
     next(row for row in found if row["split"] == "test")["split"] = "train"
@@ -100,6 +100,10 @@ def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> 
     assert (read.flow.backend, read.fem.law) == ("gone", "gone")
     with pytest.raises(UserError, match=r"flow\.backend"):
         parse_job(json.dumps(job), "job.yaml", tmp_path)
+    described.pop("format_version")
+    (tmp_path / "dataset.json").write_text(json.dumps(described))
+    with pytest.raises(UserError, match="format"):
+        Folder(tmp_path).job()
 
 
 def test_a_reader_accepts_its_format_and_the_previous_but_none_before_the_first() -> None:
@@ -109,10 +113,3 @@ def test_a_reader_accepts_its_format_and_the_previous_but_none_before_the_first(
     for found, current in ((newest - 2, newest), (newest + 1, newest), (FIRST - 1, FIRST), (None, FIRST)):
         with pytest.raises(UserError, match=f"written by format {found}; this version reads {current}"):
             check_format(found, current, "x")
-
-
-def test_a_dataset_without_a_format_version_is_refused(tmp_path: Path) -> None:
-    before = {"identity": "", "job": {"fem": {"tip": "flat"}}, "generators": []}
-    (tmp_path / "dataset.json").write_text(json.dumps(before))
-    with pytest.raises(UserError, match=f"written by format 1; this version reads {FOLDER}"):
-        Folder(tmp_path).job()

@@ -35,15 +35,14 @@ def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str, named: str) ->
 @pytest.mark.parametrize(
     ("cluster", "warning"),
     [
-        ("dask://localhost:8786", ""),
-        ("dask://node7:8786", "node7 is reached unencrypted"),
-        ("tls://node7:8786", ""),
-        ({"cores": 1, "security": True}, "every interface"),
-        ({"interface": "ib0"}, "unencrypted"),
-        ({"scheduler_options": {"host": "10.0.0.1"}}, "unencrypted"),
-        ({"interface": "ib0", "security": True}, ""),
+        ("dask://localhost:8786", False),
+        ("dask://node7:8786", True),
+        ("tls://node7:8786", False),
+        ({"cores": 1, "security": True}, True),  # the scheduler listens on every interface
+        ({"interface": "ib0"}, True),
+        ({"scheduler_options": {"host": "10.0.0.1"}}, True),
+        ({"interface": "ib0", "security": True}, False),
     ],
 )
-def test_an_open_cluster_causes_a_warning(cluster: str | dict[str, object], warning: str) -> None:
-    assert warning in open_to(cluster)
-    assert bool(warning) == bool(open_to(cluster))
+def test_an_open_cluster_causes_a_warning(cluster: str | dict[str, object], warning: bool) -> None:
+    assert bool(open_to(cluster)) is warning

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 from PIL import Image
 from ruamel.yaml import YAML
-from typer.testing import CliRunner
 
 from synth.cli import app
 from synth.dataset import index
@@ -81,8 +81,8 @@ def test_a_picture_shows_flow_and_load_where_they_are(root: Path, tmp_path: Path
     red, _, blue = force[at].astype(int)
     assert red > blue + 50, "yellow at the greatest load"
     assert np.array_equal(drawn[-height:, :width], sequence["rgb"][2])
-    words = ["view", str(root), "--frame", "0", "-f", str(picture.strongest(sequence)), "--save"]
-    assert CliRunner().invoke(app, [*words, str(tmp_path / "two.png")]).exit_code == 0
+    words = ["view", root, "--frame", 0, "-f", picture.strongest(sequence), "--save"]
+    run(app, *words, tmp_path / "two.png")
     assert np.array_equal(np.asarray(Image.open(tmp_path / "two.png")), drawn)
     for name in ("two.txt", "two.rrd"):
-        assert CliRunner().invoke(app, [*words, str(tmp_path / name)]).exit_code == 2
+        run(app, *words, tmp_path / name, code=2)

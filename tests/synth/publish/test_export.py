@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command import run
 from PIL import Image
-from typer.testing import CliRunner
 
 from synth.cli import app
 from synth.dataset import index, split
@@ -41,7 +41,7 @@ def sides(root: Path) -> dict[str, set[int]]:
 
 
 def test_folder(root: Path, tmp_path: Path) -> None:
-    assert CliRunner().invoke(app, ["export", str(root), str(tmp_path / "to")]).exit_code == 0
+    run(app, "export", root, tmp_path / "to")
     sequence = Dataset(root)[1]
     here = tmp_path / "to" / "000001"
     assert np.array_equal(np.asarray(Image.open(here / "rgb/0002.png")), sequence["rgb"][2])

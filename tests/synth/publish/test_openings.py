@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 from egg_brain import soup, written
-from typer.testing import CliRunner
 
 import synth
 from synth.cli import app
@@ -47,9 +47,7 @@ def test_openings_of_an_egg_are_on_it_along_its_normal_and_apart(found: list[Ope
 
 
 def test_the_command_draws_the_places_and_prints_a_valid_job(egg: Path, tmp_path: Path) -> None:
-    words = ["preview", str(egg), "--radius", f"{RADIUS:g}", "--count", "2", "-o", str(tmp_path / "a.png")]
-    done = CliRunner().invoke(app, words)
-    assert done.exit_code == 0, done.output
+    done = run(app, "preview", egg, "--radius", RADIUS, "--count", 2, "-o", tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 10_000
     (tmp_path / "job.yaml").write_text(done.stdout)
     job = synth.load_job(str(tmp_path / "job.yaml"), ["anatomy.vertices=2500", "fem.tets=400"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from typer.testing import CliRunner
+from command import run
 
 from synth.cli import app
 
@@ -18,8 +18,7 @@ from synth.cli import app
 def test_preview_draws_scenarios_and_prints_their_cost(tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.png"
     small = ["render.size=[80, 64]", "sequences=40", "frames=6", "render.spp=4", "anatomy.vertices=900"]
-    done = CliRunner().invoke(app, ["preview", "tiny", *small, "-n", "3", "-o", str(sheet), "--json"])
-    assert done.exit_code == 0, done.output
+    done = run(app, "preview", "tiny", *small, "-n", 3, "-o", sheet, "--json")
     found = json.loads(done.stdout)
     assert cv2.imread(str(sheet)).shape == (128, 160, 3)  # three tiles in a square of four
     assert found["render_cpu_s"] > 0.1
@@ -31,8 +30,7 @@ def test_preview_draws_scenarios_and_prints_their_cost(tmp_path: Path) -> None:
 def test_a_recording_holds_every_field_on_one_timeline(root: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="the extra `view` is not installed")
     path = tmp_path / "one.rrd"
-    made = CliRunner().invoke(app, ["view", str(root), "-s", "1", "--save", str(path)])
-    assert made.exit_code == 0, made.output
+    run(app, "view", root, "-s", 1, "--save", path)
     rerun = [sys.executable, "-m", "rerun", "rrd"]
     subprocess.run([*rerun, "verify", str(path)], check=True, capture_output=True)
     printed = subprocess.run([*rerun, "print", str(path)], check=True, capture_output=True, text=True).stdout

@@ -1,5 +1,0 @@
-from __future__ import annotations
-
-from clip_fixtures import dataset
-
-__all__ = ["dataset"]
