@@ -27,7 +27,7 @@ from synth.recording_flow.decode import RecordingFlowSettings
 from synth.render.camera.camera import Camera
 
 SIZE = (160, 120)
-FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
+FOCAL, BASE, AWAY, FPS = 1370.0, 24.0, 300.0, 6.0
 K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
 COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
 DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
@@ -71,15 +71,10 @@ def write_pair(folder: Path) -> dict[str, object]:
 def make(tmp_path: Path) -> Make:
     """Frames by the size of the dent and the height of the whole surface, at rest where disparity is 0."""
 
-    def made(
-        second: str,
-        dents: Sequence[float] = (0.0, 0.3, 0.6),
-        lift_mm: Sequence[float] = (0, 0, 0),
-        fps: float = 10,
-    ) -> Path:
+    def made(second: str, dents: Sequence[float] = (0, 0.3, 0.6), lifts: Sequence[float] = (0, 0, 0)) -> Path:
         for name in ("frames", second):
             (tmp_path / name).mkdir()
-        for t, (amount, lift) in enumerate(zip(dents, lift_mm, strict=True)):
+        for t, (amount, lift) in enumerate(zip(dents, lifts, strict=True)):
             u, depth = 2.5 * amount * DENT, np.float32(AWAY + lift + rise(amount))
             cv2.imwrite(str(tmp_path / f"frames/{t:03d}.png"), warped(u)[..., ::-1])
             if second == "right":
@@ -88,7 +83,7 @@ def make(tmp_path: Path) -> Make:
             else:
                 now = cv2.remap(depth, *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
                 np.save(tmp_path / f"depth/{t:03d}.npy", np.dstack([0 * now, 0 * now, now]) if t else now)
-        about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": fps}
+        about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": FPS}
         about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
         writer.write_meta(tmp_path, about)
         return tmp_path
@@ -145,12 +140,12 @@ def test_a_missing_right_or_depth_picture_is_a_gap(make: Make, second: str, lost
 @pytest.mark.parametrize("second", ["right", "depth"])
 def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, second: str) -> None:
     """The whole surface moves in depth, which one picture hardly shows, and is pressed meanwhile."""
-    rate_hz, lift_mm, fps, count = 0.4, 0.5, 6.0, 72
-    time = np.arange(count) / fps
+    rate_hz, lift_mm, count = 0.4, 0.5, 72
+    time = np.arange(count) / FPS
     load = 0.5 * np.clip(np.sin(np.pi * (time - 5) / 2.5), 0, None) * ((time > 5) & (time < 7.5))
     breath = lift_mm * (np.cos(2 * np.pi * rate_hz * time) - 1)
     method, settings = Recorder(), replace(SETTINGS, pulse=True)
-    recording = open_recording(make(second, load, breath, fps))
+    recording = open_recording(make(second, load, breath))
     done = track_recording(recording, {"it": method}, AWAY / FOCAL, settings)
     assert len(method.inputs) == 2 * count, "two passes: the first finds the pulse, the second removes it"
     motion = np.stack([moved.motion for moved in method.inputs]).reshape(2, count, *DENT.shape, 3)

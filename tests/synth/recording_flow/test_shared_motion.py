@@ -29,6 +29,9 @@ def stepped(after: int, *motion: float) -> Motion:
     return lambda frame: motion if frame > after else (0.0, 0.0, 0.0, 0.0)
 
 
+BUMP, ZOOM, TURN = stepped(9, 3, -4, 0, 0), stepped(9, 0, 0, 2.4, 0), stepped(6, 0, 0, 0, -2.8)
+
+
 def drift(frame: int) -> tuple[float, ...]:
     return (3 * np.sin(frame / 2), 4 * np.sin(frame / 3), 0.3 * np.sin(frame / 5), 0.5 * np.sin(frame / 4))
 
@@ -69,9 +72,7 @@ def test_a_contact_is_not_taken_for_camera_motion(px: float) -> None:
     assert find_path(filmed(stepped(FRAMES), px)[0], None) is None
 
 
-@pytest.mark.parametrize(
-    "camera", [stepped(9, 3, -4, 0, 0), stepped(9, 0, 0, 2.4, 0), stepped(6, 0, 0, 0, -2.8)]
-)
+@pytest.mark.parametrize("camera", [BUMP, ZOOM, TURN])
 @pytest.mark.parametrize("px", [0.5, 3.0, 8.0])
 def test_camera_motion_is_separated_from_a_contact(camera: Motion, px: float) -> None:
     surface, matrices = filmed(camera, px)
