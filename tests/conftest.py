@@ -1,7 +1,5 @@
 """For every test: one thread a process, and what lies in tests/slow is slow."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

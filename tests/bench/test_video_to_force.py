@@ -1,7 +1,5 @@
 """`learn predict` and `bench score` give the same forces for a video."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -5,8 +5,6 @@ million, recovered flow by parts in ten thousand, and physics, which chooses bet
 hundred. Bytes are compared only between runs on one machine (`tests/synth/sequence`, `tests/slow`).
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fixtures: a dataset of phantoms, and its clips."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import phantom

@@ -1,7 +1,5 @@
 """Commands run in this process."""
 
-from __future__ import annotations
-
 from click.testing import Result
 from typer import Typer
 from typer.testing import CliRunner

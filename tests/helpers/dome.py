@@ -1,7 +1,5 @@
 """The default block of tissue and the dome over its opening, as a fine surface."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from synth.fem.mesh import tetrahedra

@@ -1,7 +1,5 @@
 """An egg for a brain: a surface as users have it, as .obj, .stl or .vtk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals with constant half widths."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

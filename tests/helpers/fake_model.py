@@ -1,7 +1,5 @@
 """A model folder of an untrained network whose random weights predict non-zero forces."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

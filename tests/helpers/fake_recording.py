@@ -1,7 +1,5 @@
 """Recordings with known force: a texture moved by a smooth field proportional to the force."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

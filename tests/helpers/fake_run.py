@@ -1,7 +1,5 @@
 """Running the engine with a stand-in for the pipeline."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

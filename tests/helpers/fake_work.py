@@ -1,7 +1,5 @@
 """Stand-ins for the pipeline: sequences without rendering, and sequences that fail."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Edits of stores as an untrusted dataset may hold them, with valid or outdated seals."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from pathlib import Path

@@ -7,8 +7,6 @@
 within the tolerances stated there; hashes (of stored fields and of weights) only compare runs on one machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

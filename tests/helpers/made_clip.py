@@ -1,7 +1,5 @@
 """A clip of given motion and force."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Newton's method by SciPy: slow and sure, what the fast solver is measured against."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import newton_krylov

@@ -4,8 +4,6 @@ Surface displacement of an elastic half-space under a force spread like a hat of
 Cerruti and Boussinesq solutions; Johnson, Contact Mechanics, 1985, §3.2), viewed from straight above.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

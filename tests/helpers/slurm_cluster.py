@@ -1,7 +1,5 @@
 """A SLURM of one node with two slots on this machine, for as long as a test needs it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

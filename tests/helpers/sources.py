@@ -1,7 +1,5 @@
 """The project's own source, as tests of the repository read it."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from functools import cache

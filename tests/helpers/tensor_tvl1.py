@@ -1,7 +1,5 @@
 """Masked TV-L1 on whole tensors with the equations and symbols of `synth.flow.tvl1`, as its reference."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

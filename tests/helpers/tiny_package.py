@@ -1,7 +1,5 @@
 """A package as pip leaves it, in a folder on the path: a module, and metadata with its entry points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Untrusted and damaged models: card and weights are read, or refused with a one-line error."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

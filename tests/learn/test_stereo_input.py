@@ -1,7 +1,5 @@
 """Stereo motion as a network's input."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace as replace_
 from pathlib import Path

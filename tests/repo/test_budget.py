@@ -4,8 +4,6 @@ Each row states what there is now and what is aimed at. A commit may raise the f
 above it; where it is above already, it only falls.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from importlib import import_module

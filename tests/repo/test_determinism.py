@@ -1,7 +1,5 @@
 """Rules that keep a dataset a function of its job, checked on the source itself."""
 
-from __future__ import annotations
-
 import ast
 
 from sources import PACKAGES, ROOT, imports, parsed, sources

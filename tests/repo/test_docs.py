@@ -1,7 +1,5 @@
 """Pages agree with the code: generated pages are current, commands and keys exist, code blocks run."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """Every example runs and gives the numbers stated here."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Packages import only from those below them; checked on the source itself."""
 
-from __future__ import annotations
-
 import ast
 from functools import cache
 from pathlib import Path

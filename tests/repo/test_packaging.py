@@ -1,7 +1,5 @@
 """The wheel, the container recipes and the pinned requirements hold what the package needs, and agree."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

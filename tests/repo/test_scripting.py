@@ -1,7 +1,5 @@
 """The packages as scripts use them: imports are light, public names exist, the notebook runs."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """One word a thing: the terms of the field, in code, on disk and in prose."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 

@@ -1,7 +1,5 @@
 """Stores with random damage: `synth verify` finds all damage that changes a value."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections import Counter

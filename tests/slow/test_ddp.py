@@ -1,7 +1,5 @@
 """Two processes on one machine, as torchrun starts them: the same weights in both, one model written."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

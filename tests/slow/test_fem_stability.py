@@ -1,7 +1,5 @@
 """Stability of the mechanics and errors at its limits: a law's range, odd steps, slivers, random scenes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

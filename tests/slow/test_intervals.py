@@ -1,7 +1,5 @@
 """From a dataset to forces with intervals, with phantoms, a tiny network and brains that are new to it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Killed and resumed runs, on this machine and on a cluster, give the bytes of an undisturbed run."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The whole pipeline on a small job: its labels hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

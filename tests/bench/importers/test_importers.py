@@ -1,7 +1,5 @@
 """Importers return the frames, times and forces that each format's own library wrote."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

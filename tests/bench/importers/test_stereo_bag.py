@@ -1,7 +1,5 @@
 """A bag as surgical robots record them: two compressed cameras of 960 x 540, two wrenches, calibrations."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Baselines on data of a linear solid."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

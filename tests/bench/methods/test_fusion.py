@@ -1,7 +1,5 @@
 """Fusion of network and physics, against closed forms of Gaussians and draws from stated errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Methods of other packages in scores and score.json; their errors become one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The Bayesian inverse against loads of another mesh, theory of the half-space, and draws from itself."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

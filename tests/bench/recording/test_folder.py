@@ -1,7 +1,5 @@
 """Reading recordings: times, gaps, rotation, pixel aspect and numbers."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A sequence exported as a recording has the same data, without ground truth that a lab lacks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

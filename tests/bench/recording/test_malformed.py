@@ -1,7 +1,5 @@
 """Broken recordings: each gives a one-line error or finding; none crashes."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Masks of a recording: by frame, one for all, and the tracked region."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Times since 1970, rotated sensors, and unknown scales."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A recording's right and depth camera, on a photograph warped by a known motion in three dimensions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scoring from folder to score.json and report.html, with known displacement and force."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

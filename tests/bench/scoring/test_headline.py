@@ -1,7 +1,5 @@
 """The headline of a report: no numbers for lost recordings, relative scores without E, the press first."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import Future
 from pathlib import Path

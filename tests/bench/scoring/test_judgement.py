@@ -1,7 +1,5 @@
 """Findings on recordings: the same in `bench check` and `bench score`, and no scores with errors."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Scores against numbers computed by hand; coverage of bootstrap intervals on known dependence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pooled scores, and scores that can't be pooled."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Offsets between clocks: found within a frame, or refused if the recording doesn't determine them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sensor processing of known signals, and scales from drawn boards."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

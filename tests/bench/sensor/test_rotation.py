@@ -1,7 +1,5 @@
 """The sensor's rotation, from the closed form of a half-space (Cerruti and Boussinesq), off centre."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

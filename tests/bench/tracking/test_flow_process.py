@@ -1,7 +1,5 @@
 """Flow in another process: errors are passed on, and the process ends with its parent."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

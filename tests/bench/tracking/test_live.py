@@ -1,7 +1,5 @@
 """Streams: the same forces as scoring, with flow in this or another process, each as soon as it is ready."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import Future
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Untrusted stores and caches: data that doesn't match its seal is refused."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

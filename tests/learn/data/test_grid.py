@@ -1,7 +1,5 @@
 """Resampling to the grid and its channels, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

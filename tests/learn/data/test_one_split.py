@@ -1,7 +1,5 @@
 """One split per dataset, used for export, training, validation, scores and intervals."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Metrics against torchmetrics, and on predictions of known score."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

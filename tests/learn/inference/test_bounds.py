@@ -1,7 +1,5 @@
 """Prediction intervals of a network's force, and their part of the card."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

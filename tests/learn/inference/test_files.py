@@ -1,7 +1,5 @@
 """Exported models, and forces estimated from stores, arrays and videos."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Position of the grid on a picture that is wider than it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

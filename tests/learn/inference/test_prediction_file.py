@@ -1,7 +1,5 @@
 """Files of `learn predict`: documented fields, equal in all files."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pretrained networks: complete, small, and equal to the models they were packed from."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The losses, against numbers worked out by hand and against torchmetrics."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torchmetrics

@@ -1,7 +1,5 @@
 """Coverage of hierarchical split conformal prediction on drawn scores."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

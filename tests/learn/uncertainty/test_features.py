@@ -1,7 +1,5 @@
 """Features of known motions, and distances in samples of known covariance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Intervals fitted on estimates with drawn errors that correlate strongly within a sequence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """`synth verify`: a good dataset passes, and each check finds the fault that it is made for."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Untrusted datasets: read unchanged since the seal and in a known format, or refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading a remote dataset over HTTP: the same values as from the folder."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer

@@ -1,7 +1,5 @@
 """The provenance of a sequence includes its code, networks and packages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sources import imports

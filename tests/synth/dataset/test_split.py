@@ -1,7 +1,5 @@
 """Splits: no group is on two sides, held-out families are never in training, order has no effect."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The sequence store: values are read as written, nothing unfinished is visible, damage is reported."""
 
-from __future__ import annotations
-
 import shutil
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The Dask engine: errors of its configuration, and warnings about open clusters."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The engine: order, faults and interruption change no byte; status and forecasts agree with what is."""
 
-from __future__ import annotations
-
 import json
 import signal
 import threading

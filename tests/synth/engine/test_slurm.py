@@ -1,7 +1,5 @@
 """A dataset rendered through a real SLURM on this machine: lost jobs and nodes change no byte."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A user's surface: holes and duplicates, placement, meshing, and refused files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Elements and laws, ours and plug-ins, against scikit-fem, closed forms and finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """Instruments given by the job, several at once: labels that add up, forces in place of loads."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

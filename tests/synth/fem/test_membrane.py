@@ -1,7 +1,5 @@
 """The membrane: force and stiffness follow from its energy, wrinkles bear nothing, work is conserved."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

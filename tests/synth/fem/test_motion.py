@@ -1,7 +1,5 @@
 """Inertia and relaxation against closed forms and the equations they step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """The solver against closed forms: half-space, uniaxial stretch, manufactured solutions, Newton's method."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pulse of heart and breath: the surface rises as far as requested, and labels do not change."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from dome import ANATOMY, OPENING_MM, patch

@@ -1,7 +1,5 @@
 """The block's upper boundary on gyri and sulci: how close, and never at the elements' expense."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from dome import ANATOMY

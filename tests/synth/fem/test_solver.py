@@ -1,7 +1,5 @@
 """A gesture's motion, loads and labels on the fine surface; what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

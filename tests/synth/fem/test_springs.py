@@ -1,7 +1,5 @@
 """Springs of attachments and of the skull: what they hold and what stays free, in block and mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from dome import ANATOMY

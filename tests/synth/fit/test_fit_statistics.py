@@ -1,7 +1,5 @@
 """Statistics of drawn pictures with known parameters, and recovery of a known camera."""
 
-from __future__ import annotations
-
 import io
 
 import cv2

@@ -1,7 +1,5 @@
 """Photographs of cortex: detection of the usable region, refused files, compression."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from pathlib import Path

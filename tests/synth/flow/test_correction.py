@@ -1,7 +1,5 @@
 """The correction of flow: its features against closed forms, its gain on pictures that are not rendered."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

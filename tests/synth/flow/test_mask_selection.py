@@ -1,7 +1,5 @@
 """Selection of masks among true and false detections of instruments and highlights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """OpenCV's estimators against translations, detection of masks, and estimators of plug-ins."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Stereo: rectification against OpenCV's projections, and known motion in three dimensions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

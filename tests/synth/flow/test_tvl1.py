@@ -1,7 +1,5 @@
 """The masked TV-L1 solver: its parts against formulas and tensor code, flow of known warps, tracking."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

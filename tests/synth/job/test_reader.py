@@ -1,7 +1,5 @@
 """Job files: read as written, errors reported with their place; named jobs can all be drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

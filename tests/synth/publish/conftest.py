@@ -1,7 +1,5 @@
 """One dataset for all tests in this folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The card: `datasets` and the Croissant validator can read it, and its numbers are those of the dataset."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Exports, read by the libraries that they are made for, and checked against the geometry."""
 
-from __future__ import annotations
-
 import gc
 import io
 import json

@@ -1,7 +1,5 @@
 """Suggested openings of a brain: their places and directions, and the job made of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Views of a job and of a dataset: contact sheet, and the recording for the viewer rerun."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

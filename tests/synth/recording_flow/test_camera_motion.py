@@ -1,7 +1,5 @@
 """Camera motion estimated on the surroundings of the tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Foreground objects on tissue of analytic motion and depth."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

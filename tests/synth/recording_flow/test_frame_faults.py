@@ -1,7 +1,5 @@
 """Faults of videos are detected and named; a clean video has none."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

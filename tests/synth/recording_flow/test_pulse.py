@@ -1,7 +1,5 @@
 """Pulsation of the tissue: found where there is one, not found in contacts or noise alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

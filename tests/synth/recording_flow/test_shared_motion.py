@@ -1,7 +1,5 @@
 """Camera motion where tissue fills the picture, separated from contacts and pulsation of analytic motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

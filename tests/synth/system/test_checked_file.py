@@ -1,7 +1,5 @@
 """Untrusted files are read within limits and run no code; files are written as a whole or not at all."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

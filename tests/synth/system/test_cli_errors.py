@@ -1,7 +1,5 @@
 """Errors of the machine end a command with one line and exit code 2; bugs have a traceback."""
 
-from __future__ import annotations
-
 import errno
 
 import pytest

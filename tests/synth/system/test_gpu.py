@@ -1,7 +1,5 @@
 """Drivers and GPUs that the renderer can use."""
 
-from __future__ import annotations
-
 import pytest
 
 from synth.system.gpu import Gpu, obstacle

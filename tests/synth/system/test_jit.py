@@ -1,7 +1,5 @@
 """The cache folder: SULCUS_CACHE, the user's cache, or a private temporary folder."""
 
-from __future__ import annotations
-
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Tuning: the force error has its unit, the search keeps budget and cost, the file is the person's own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
