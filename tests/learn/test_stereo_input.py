@@ -134,5 +134,3 @@ def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> Non
     assert json.loads(scored.stdout)["input"] == "motion"
     run(app, "eval", model, data, "--all", "--input", "recovered", code=2)
     assert export(load_model(model), tmp_path / "net.onnx") < 1e-4
-    about = json.loads((tmp_path / "net.onnx.json").read_text())
-    assert "stereo" in about["preprocessing"][0]

@@ -1,4 +1,4 @@
-"""A bag as surgical robots record them: two compressed cameras of 960 x 540, two wrenches, calibrations."""
+"""A bag as surgical robots record them: two compressed cameras, two wrenches, calibrations."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ from bench.recording.folder import open_recording
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 
-SIZE, FPS, FOCAL, BASE_MM, AWAY_MM = (960, 540), 10.0, 1000.0, 5.0, 100.0
+SIZE, FPS, FOCAL, BASE_MM, AWAY_MM = (320, 180), 10.0, 1000.0, 5.0, 100.0
 CAMERAS = {
     "left": "/davinci/left/camera/image_raw/compressed",
     "right": "/davinci/right/camera/image_raw/compressed",
@@ -25,7 +25,7 @@ CAMERAS = {
 DEPTH = "/davinci/depth/image"
 ARMS = ("/PSM1/body/measured_cf", "/PSM2/body/measured_cf")
 LATE_S = 0.012  # delay of the right camera's stamps
-K = np.array([[FOCAL, 0, 470.0], [0, FOCAL, 280], [0, 0, 1]])
+K = np.array([[FOCAL, 0, 157.0], [0, FOCAL, 93], [0, 0, 1]])
 TOED_IN = Rotation.from_rotvec([0.002, -0.03, 0.004]).as_matrix(), np.array([-BASE_MM, 0.1, -0.2])
 PARALLEL = np.eye(3), np.array([-BASE_MM, 0, 0])
 Rgb = np.ndarray
@@ -132,7 +132,7 @@ def test_depth_equals_the_bags(tmp_path: Path, kind: type) -> None:
     got = np.load(path) if kind is np.float32 else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert got == pytest.approx(depth_mm, abs=1e-3)
     assert recording.meta.depth is not None
-    assert (recording.meta.depth.focal_px, recording.meta.depth.centre_px) == (FOCAL, (470.0, 280.0))
+    assert (recording.meta.depth.focal_px, recording.meta.depth.centre_px) == (FOCAL, (157.0, 93.0))
 
 
 def test_partners_are_each_others_nearest() -> None:
@@ -152,7 +152,7 @@ def test_partners_are_each_others_nearest() -> None:
 )
 def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, str]) -> None:
     # Of another size than the calibration's.
-    video = [{camera: np.zeros((270, 480, 3), np.uint8) for camera in CAMERAS}]
+    video = [{camera: np.zeros((90, 160, 3), np.uint8) for camera in CAMERAS}]
     source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]))
     for further in ({}, {"right": CAMERAS["right"]}):
         with pytest.raises(UserError):

@@ -34,6 +34,7 @@ silent = lambda: lambda *inputs: None
 short = lambda: lambda *inputs: bench.ForceEstimate(np.zeros(2))
 nothing = lambda: None
 '''
+QUICK = bench.Settings(backend="dis", rate_hz=None, pulse=False)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def test_errors_name_the_plug_in(
     installed(tmp_path, monkeypatch, own=at)
     model = write_model(tmp_path / "model", "arch.output=vector")
     with pytest.raises(UserError, match=rf"method own \(lab_methods:{at}\)"):
-        bench.score(recording, model, settings=bench.Settings(rate_hz=None, pulse=False))
+        bench.score(recording, model, settings=QUICK)
 
 
 def test_a_method_cannot_change_the_others_input(recording: Path) -> None:
@@ -83,8 +84,7 @@ def test_a_method_cannot_change_the_others_input(recording: Path) -> None:
         assert not scene.tissue.flags.writeable
         return force
 
-    settings = bench.Settings(rate_hz=None, pulse=False)
-    both = bench.score(recording, methods={"a": wipe, "b": wipe}, settings=settings, baselines=False).methods
+    both = bench.score(recording, methods={"a": wipe, "b": wipe}, settings=QUICK, baselines=False).methods
     np.testing.assert_array_equal(both["a"].size_mn, both["b"].size_mn)
     assert np.nanmax(both["b"].size_mn) > 0
 
@@ -100,12 +100,12 @@ def test_a_method_may_revise_a_whole_video(recording: Path) -> None:
             count = len(contact_free) - self.short
             return [bench.ForceEstimate(np.array([1.0 + k, 0.0, 0.0])) for k in range(count)]
 
-    settings, later = bench.Settings(rate_hz=None, pulse=False), Later()
-    found = bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
+    later = Later()
+    found = bench.score(recording, methods={"later": later}, settings=QUICK, baselines=False)
     assert found.methods["later"].size_mn.tolist() == [1.0 + k for k in range(len(found.time_s))]
     later.short = True
     with pytest.raises(UserError):
-        bench.score(recording, methods={"later": later}, settings=settings, baselines=False)
+        bench.score(recording, methods={"later": later}, settings=QUICK, baselines=False)
 
 
 def test_no_method_takes_the_name_of_another(

@@ -43,7 +43,7 @@ def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path
 
 def test_the_first_sequence_that_no_model_was_trained_on(tmp_path: Path) -> None:
     for index in range(3):
-        phantom.write(tmp_path / "data", index, anatomy_seed=7, frames=2)
+        phantom.write(tmp_path / "data", index, anatomy_seed=7, frames=3)
     hashes = [sequence.attrs["content_hash"] for sequence in Dataset(tmp_path / "data")]
     model = write_model(tmp_path / "model")
     words = ["from-dataset", tmp_path / "data", "--unseen-by", "mono", "--unseen-by", model, "-o"]

@@ -1,7 +1,5 @@
 """Few paths per pixel: their distribution, and noise at soft edges after filtering."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

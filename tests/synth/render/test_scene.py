@@ -1,7 +1,5 @@
 """The renderer on every variant that runs here."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

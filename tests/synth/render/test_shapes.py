@@ -1,7 +1,5 @@
 """Shapes: the chart of the surface, trees of vessels, instruments."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mechanics of others through the seam: a sealed store that verifies, on a user's brain; results refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labels of the published method: both stages of noise, and their fields in a dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

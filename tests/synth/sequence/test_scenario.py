@@ -1,7 +1,5 @@
 """A scenario depends on (job, index) only; its contacts lie in the opening and in the picture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A scene from a script is the one in a dataset, frame by frame, and needs no folder; a stereo sequence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
