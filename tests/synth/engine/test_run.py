@@ -97,7 +97,6 @@ def test_gpus_are_those_left_visible(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_fault_costs_only_its_own_sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert engine._TRIES == 3
     monkeypatch.setattr(engine, "_TRIES", 2)
     job = JOB.model_copy(update={"sequences": 9})
     watcher = Silent()
@@ -202,9 +201,11 @@ def test_status_during_and_after_a_run(tmp_path: Path) -> None:
 
 
 def test_the_time_left_is_estimated_from_the_latest_sequences(tmp_path: Path) -> None:
+    (tmp_path / ".run").mkdir()
+
     def left(workers: int, todo: int, *ends: float) -> float | None:
         journal = Journal(Folder(tmp_path), workers, Silent().account)
-        journal._left = todo
+        journal.begin(todo, 0, 0)
         for at in ends:
             journal.pace(at)
         return journal.left_s()

@@ -12,17 +12,10 @@ from synth.fit.colours import fit_colours
 from synth.fit.photograph import Compression, Photograph
 from synth.fit.statistics import measure
 from synth.render.camera.camera_sensor import processed
-from synth.render.camera.colour_processing import CAMERAS
+from synth.render.camera.colour_processing import CAMERAS, encoded
 
 MM = 0.0547
 SIZE = (360, 480)
-
-
-def encoded(linear: np.ndarray) -> np.ndarray:
-    """The sRGB picture of linear light."""
-    root = 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
-    value = np.where(linear <= 0.0031308, 12.92 * linear, root)
-    return np.clip(np.rint(255 * value), 0, 255).astype(np.uint8)
 
 
 def lines(count: int, width_px: int) -> np.ndarray:
@@ -35,7 +28,7 @@ def lines(count: int, width_px: int) -> np.ndarray:
 
 
 def test_noise_of_known_size_is_found_and_blur_lowers_sharpness() -> None:
-    picture = encoded(lines(8, 3)).astype(float)
+    picture = np.clip(np.rint(255 * encoded(lines(8, 3))), 0, 255)
     noise = 3 * np.random.default_rng(1).standard_normal(SIZE)[..., None]
     usable = np.ones(SIZE, bool)
     noisy = np.clip(picture + noise, 0, 255).astype(np.uint8)
