@@ -82,7 +82,7 @@ docs: setup
 	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
 
 evidence: setup
-	$(BIN)/python -m evidence.all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \
+	$(BIN)/python -m evidence all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \
 	  $(if $(MECHANICS_PYTHON),--mechanics-python $(MECHANICS_PYTHON)) $(if $(PICTURES_PYTHON),--pictures-python $(PICTURES_PYTHON))
 
 lint: setup

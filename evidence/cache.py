@@ -35,8 +35,8 @@ def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any
     return json.loads(file.read_text("utf-8"))
 
 
-def clip(folder: Path, make: Callable[[], Clip]) -> Clip:
-    """Clip packed in a folder whose name contains its key; made and packed if there is none."""
-    if not folder.is_dir():
-        pack(make(), folder)
-    return unpack(folder)
+def clip(file: Path, make: Callable[[], Clip]) -> Clip:
+    """Clip packed in a file whose name contains its key; made and packed if there is none."""
+    if not file.is_file():
+        pack(make(), file)
+    return unpack(file)

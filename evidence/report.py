@@ -1,6 +1,6 @@
-"""Results of a measurement: data as JSON with their provenance, a page with charts, tables for the terminal.
+"""Results of a measurement: data as JSON with their provenance, and a page with charts.
 
-A script measures, draws a `Page` from its data alone, and passes both to `publish`.
+A study (`evidence.study`) measures, and draws a `Page` from its data alone.
 """
 
 from __future__ import annotations
@@ -18,9 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from synth.dataset.folder import write_whole
 from synth.publish.svg import svg
@@ -154,15 +151,12 @@ def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = 
 
 
 def publish(
-    folder: Path,
-    file: str,
-    found: Mapping[str, Any],
-    page: Callable[[Mapping[str, Any]], Page],
-    shown: Mapping[str, Any] | None = None,
+    folder: Path, file: str, found: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page]
 ) -> None:
-    """Writes data and the page drawn from them, as `save`, and prints them, or `shown` in their place."""
-    save(folder, file, found, page(found))
-    show(found if shown is None else shown)
+    """Writes data and the page drawn from them, as `save`, and prints its text."""
+    drawn = page(found)
+    save(folder, file, found, drawn)
+    print(drawn.text())
 
 
 def command() -> str:
@@ -181,13 +175,13 @@ def command() -> str:
 
 
 def commit() -> str:
-    """The checkout's commit, with "+" if files other than results differ from it; empty outside git."""
+    """The checkout's commit, with "+" if files outside docs differ from it; empty outside git."""
 
     def git(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(["git", "-C", str(CHECKOUT), *words], capture_output=True, text=True)
 
     name = git("rev-parse", "--short=7", "HEAD").stdout.strip()
-    changed = name and git("status", "--porcelain", "--", ".", ":!docs/results").stdout
+    changed = name and git("status", "--porcelain", "--", ".", ":!docs").stdout
     return f"{name}+" if changed else name
 
 
@@ -200,29 +194,34 @@ def shortened(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def show(found: Mapping[str, Any]) -> None:
-    """Prints data: lists of rows as tables, other values line by line."""
-    console = Console(width=None if sys.stdout.isatty() else 140)
-    for name, value in found.items():
-        if isinstance(value, Mapping):
-            trees = all(isinstance(row, Mapping) for row in value.values())
-            value = [{name: key, **row} for key, row in value.items()] if trees else [value]
-        if isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
-            columns = Section("", value).columns
-            table = Table(*map(escape, columns), title=escape(name), title_justify="left")
-            for row in value:
-                table.add_row(*(escape(_cell(row.get(key))) for key in columns))
-            console.print(table)
-        else:
-            console.print(f"{name}: {_cell(value)}", markup=False, highlight=False)
+def bars(values: Mapping[str, float]) -> tuple[Row, ...]:
+    """A row for each value, without intervals."""
+    return tuple(Row(name, float(value)) for name, value in values.items())
 
 
-def bars(
-    values: Mapping[str, float], ends: Mapping[str, tuple[float, float]] | None = None
-) -> tuple[Row, ...]:
-    """A row for each value, with its interval where there is one."""
-    known, none = ends or {}, (math.nan, math.nan)
-    return tuple(Row(name, float(value), known.get(name, none)) for name, value in values.items())
+def grouped(rows: Sequence[Mapping[str, Any]], *keys: str) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Rows by their values of some keys, in the order of the first of each."""
+    found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def curve(
+    name: str,
+    rows: Sequence[Mapping[str, Any]],
+    x: str,
+    y: str,
+    label: str = "",
+    factors: tuple[float, float] = (1, 1),
+) -> Curve:
+    """A series of two keys of rows, each times a factor; rows with a true `default` are ringed.
+
+    `label`: text of the points, with the row's keys in braces; empty: a line joins them.
+    """
+    xs, ys = (tuple(by * row[key] for row in rows) for key, by in zip((x, y), factors, strict=True))
+    labels = tuple(label.format_map(row) for row in rows) if label else ()
+    return Curve(name, xs, ys, labels, tuple(k for k, row in enumerate(rows) if row.get("default")))
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -243,28 +242,28 @@ def curves(panels: Sequence[Panel]) -> str:
     across = min(2, len(panels))
     lines = [panels[k : k + across] for k in range(0, len(panels), across)]
     heights = [_PANEL + _NAME * max(math.ceil(len(_names(p)) / _across(p)) for p in line) for line in lines]
-
-    def draw(figure: Figure) -> None:
-        places = figure.subplots(len(lines), across, squeeze=False, height_ratios=heights).flat
-        for place, panel in itertools.zip_longest(places, panels):
-            if panel is None:
-                place.set_axis_off()
-            else:
-                _panel(place, panel, colours)
-
-    return svg(_WIDTH * across / 2, sum(heights), draw)
+    draws = [lambda axes, panel=panel: _panel(axes, panel, colours) for panel in panels]
+    return _stacked(heights, across, draws)
 
 
 def intervals(charts: Sequence[Chart]) -> str:
     """Charts as one SVG, one below the other."""
-    heights = [70 + _ROW * len(chart.rows) for chart in charts]
+    draws = [lambda axes, chart=chart: _intervals(axes, chart) for chart in charts]
+    return _stacked([70 + _ROW * len(chart.rows) for chart in charts], 1, draws, _WIDTH)
+
+
+def _stacked(heights: list[int], across: int, draws: Sequence[Callable[[Axes], None]], width: int = 0) -> str:
+    """Axes in lines of some heights [points], `across` in each, as one SVG."""
 
     def draw(figure: Figure) -> None:
-        places = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights).flat
-        for place, chart in zip(places, charts, strict=True):
-            _intervals(place, chart)
+        places = figure.subplots(len(heights), across, squeeze=False, height_ratios=heights).flat
+        for place, one in itertools.zip_longest(places, draws):
+            if one is None:
+                place.set_axis_off()
+            else:
+                one(place)
 
-    return svg(_WIDTH, sum(heights), draw)
+    return svg(width or _WIDTH * across / 2, sum(heights), draw)
 
 
 def _panel(axes: Axes, panel: Panel, colours: Mapping[str, str]) -> None:

@@ -7,8 +7,9 @@ import hashlib
 import json
 import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from typing import Any
 from evidence.report import CHECKOUT
 
 _OURS = re.compile(r"(synth|learn|bench|evidence)(\.\w+)+")
-_SCRIPT = re.compile(r"python -m (evidence(?:\.\w+)+)")
 _SCORED = re.compile(r"^\s*bench score", re.M)
 
 
@@ -28,8 +28,8 @@ class Status:
     command: str
     commit: str
     changed: tuple[str, ...] | None
-    """Files imported by its script, and data of the checkout that it read, that differ from those that made
-    it; None where script or commit are unknown."""
+    """Files imported by its study, and data of the checkout that it read, that differ from those that made
+    it; None where study or commit are unknown."""
     cpu_hours: float | None
 
     def row(self) -> dict[str, Any]:
@@ -37,13 +37,22 @@ class Status:
         state = "unknown" if self.changed is None else "current"
         if self.changed:
             state = f"stale: {len(self.changed)} files"
-        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": self.command}
+        command = self.command.partition("\n")[0]
+        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": command}
         return {"result": self.file, "state": state, **made}
 
 
-def gather(results: Path, home: Path = CHECKOUT) -> list[Status]:
-    """Status of every JSON file of a folder in the checkout `home`, sorted by name."""
-    return [_status(file, home) for file in sorted(results.rglob("*.json"))]
+def gather(results: Path, modules: Mapping[str, str], home: Path = CHECKOUT) -> list[Status]:
+    """Status of every JSON file of a folder in the checkout `home`, sorted by name.
+
+    `modules`: the study that makes the files of a pattern, relative to the folder.
+    """
+    found = []
+    for file in sorted(results.rglob("*.json")):
+        name = str(file.relative_to(results))
+        module = next((one for pattern, one in modules.items() if fnmatch(name, pattern)), "")
+        found.append(_status(file, module, home))
+    return found
 
 
 def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
@@ -82,15 +91,14 @@ def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
     return found
 
 
-def _status(file: Path, home: Path) -> Status:
+def _status(file: Path, module: str, home: Path) -> Status:
     found = json.loads(file.read_text("utf-8"))
     found = found if isinstance(found, dict) else {}
     name, command = str(file.relative_to(home)), str(found.get("command", ""))
     commit = str(found.get("commit") or _git(home, "log", "-1", "--format=%h", "--", name)).strip()
     changed = None
-    script = _SCRIPT.match(command)
-    if script and _file(script[1], home) and _git(home, "cat-file", "-t", commit.rstrip("+")):
-        files = closure(script[1], home) | (closure("bench.cli", home) if _SCORED.search(command) else set())
+    if module and _git(home, "cat-file", "-t", commit.rstrip("+")):
+        files = closure(module, home) | (closure("bench.cli", home) if _SCORED.search(command) else set())
         ours = {str(one.relative_to(home)) for one in files}
         read = {path: word for path, word in found.get("data", {}).items() if (home / path).exists()}
         other = {path for path, word in read.items() if content(home / path) != word}

@@ -1,7 +1,4 @@
-"""Held-out AUC of a small network that distinguishes crops of renderings from those of a photograph.
-
-Run: python -m evidence.appearance.classifier cortex.jpg --frames 5 --epochs 8 --seed 31
-"""
+"""Held-out AUC of a small network that distinguishes crops of renderings from those of a photograph."""
 
 from __future__ import annotations
 
@@ -14,23 +11,27 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-import typer
 from scipy.cluster.vq import kmeans2
 from sklearn.metrics import roc_auc_score
 from torch import nn
 
 from evidence import report, status
-from evidence.appearance import crops
-from evidence.render.realism import OUTLINE
+from evidence.flow.scenes import jpeg
+from evidence.render.picture_statistics import Picture, corners
+from evidence.render.realism import OUTLINE, bare_picture, outlined, scaled_photograph
+from evidence.study import Study
+from synth.errors import UserError
 from synth.fit.fitting import fit_camera
-from synth.fit.photograph import read_photograph
+from synth.fit.photograph import Photograph, read_photograph
 from synth.job.schema import Job
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-Picture = npt.NDArray[np.uint8]
 
+SIDE_PX = 128
+_NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
+MM_PER_PX = 0.0547  # of all crops
 _FOLDS = 5
 _HELD_OUT = (3, 4), (0, 1)  # pairs of sectors: the camera is fitted on the others and tested on these
 _BATCH, _RATE, _WIDTH = 32, 2e-3, 16
@@ -38,26 +39,87 @@ _PATCHES = 40  # of the photograph; the control assigns one label to each
 _BLURRED_PX = 3.0
 
 
-def main(
+def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Picture, Floats]:
+    """Crops (N, 128, 128, 3) of the photograph inside an outline, and their corners (N, 2) in it [px].
+
+    Raises:
+        UserError: the file is not an image, or no crop fits.
+    """
+    image = scaled_photograph(photo, width_mm / MM_PER_PX)
+    found = corners(outlined(outline, image.shape[:2]), SIDE_PX, step)
+    if not found:
+        raise UserError(f"{photo}: no crop of {SIDE_PX} px fits inside the outline")
+    return _cut(taken(image, 0), found), np.array(found, float)
+
+
+def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
+    """Crops of tissue in the first frame of each sequence, without instruments; and their sequence (N,)."""
+    field = job.render.size[0] * MM_PER_PX
+    keys = job.model_dump()
+    keys["render"] |= {"tool": False, "field_mm": (field, field)}
+    keys["sensor"]["bitrate_mbps"] = None  # `taken` applies the codec
+    bare = Job.model_validate(keys)
+    pictures, of = [], []
+    for index in range(job.sequences):
+        rgb, inside, _ = bare_picture(bare, index)
+        found = corners(inside, SIDE_PX, step)
+        pictures.append(_cut(taken(rgb, index + 1), found))
+        of += [index] * len(found)
+    return np.concatenate(pictures), np.array(of)
+
+
+def without(given: Photograph, places: Floats) -> Photograph:
+    """The photograph with the pixels of some crops marked as unusable."""
+    usable, scale = given.usable.copy(), MM_PER_PX / given.mm_per_px
+    for x, y in places:
+        rows, columns = (slice(int(scale * at), int(scale * (at + SIDE_PX)) + 1) for at in (y, x))
+        usable[rows, columns] = False
+    return given._replace(usable=usable)
+
+
+def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) -> Job:
+    """The job whose frames are compared: a default one with the sections fitted by `synth fit`.
+
+    The fitted vignetting is that of the whole photograph, `width_mm` wide. These frames correspond to a piece
+    of its centre, where vignetting is less by the square of the width.
+    """
+    job = Job.model_validate({"sequences": frames, "seed": seed, **sections})
+    if not sections:
+        return job
+    share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
+    sensor = job.sensor.model_copy(update={"vignette": job.sensor.vignette * share**2})
+    return job.model_copy(update={"sensor": sensor})
+
+
+def taken(rgb: Picture, seed: int) -> Picture:
+    """The image with the noise and JPEG compression common to all crops."""
+    noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
+    return jpeg(np.clip(rgb + noise, 0, 255).astype(np.uint8), _QUALITY)
+
+
+def _cut(rgb: Picture, found: list[tuple[int, int]]) -> Picture:
+    crops = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
+    return np.asarray(crops, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
+
+
+def measure(
     photo: Path,
-    out: Path = report.RESULTS / "render/appearance",
     outline: str = OUTLINE,
     width_mm: float = 110.0,
     frames: int = 5,
-    epochs: int = 10,
+    epochs: int = 8,
     seed: int = 31,
-) -> None:
+) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls should be near 0.5.
 
     Fitted cameras are tested on sectors that `synth fit` did not use. `outline`, `width_mm`: of the cortex in
     the photograph, as in realism; `frames`: number of rendered sequences, one frame each.
     """
-    torch.set_num_threads(1)
-    (theirs, places), rng = crops.of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
+    (theirs, places), rng = of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
     away = places - places.mean(axis=0)
     turn = np.arctan2(away[:, 1], away[:, 0])
     region = turn.argsort().argsort() * _FOLDS // len(turn)  # sectors about the centre, of equally many crops
-    near = np.asarray((np.abs(places[:, None] - places[None]) < crops.SIDE_PX).all(axis=2))  # overlapping
+    near = np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))  # overlapping
     rows = []
 
     def add(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
@@ -65,21 +127,21 @@ def main(
         rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
     def against(job: Job) -> tuple[Picture, Ints, Ints, Flags]:
-        ours, sequence = crops.of_job(job)
+        ours, sequence = of_job(job)
         label = np.repeat([0, 1], (len(theirs), len(ours)))
         fold, both = np.concatenate([region, sequence % _FOLDS]), np.pad(near, (0, len(ours)))
         return np.concatenate([theirs, ours]), label, fold, both
 
-    pictures, label, fold, both = against(crops.read_job({}, frames, seed, width_mm))
+    pictures, label, fold, both = against(read_job({}, frames, seed, width_mm))
     add("default job", pictures, label, fold, both)
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
     fitted: list[dict[str, Any]] = []
     for pair in _HELD_OUT:
-        usable = crops.without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
+        usable = without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
         fitted.append(fit_camera(usable))
-        pictures, label, fold, both = against(crops.read_job(fitted[-1], frames, seed, width_mm))
+        pictures, label, fold, both = against(read_job(fitted[-1], frames, seed, width_mm))
         grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
         blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
         shown = {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
@@ -88,8 +150,7 @@ def main(
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
     add("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
-    results = {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows}
-    report.publish(out, "classifier.json", results, page)
+    return {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -190,5 +251,4 @@ def _tensor(pictures: Picture) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).float() / 127.5 - 1
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "render/appearance/classifier.json", page, ("{photo}",))

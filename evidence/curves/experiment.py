@@ -2,84 +2,258 @@
 
 Every estimator is fitted on 30, 100, 300, ... sequences of one dataset and tested on held-out sequences of it
 and on whole datasets out of distribution. Each row is stored at once: an interrupted run continues.
-
-Run: python -m evidence.curves.experiment mission --unseen mission-ood --sizes 30,100, with datasets of the
-job `mission` and of mission-ood.yaml in this folder.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import product, starmap
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-from joblib import Parallel, delayed
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.decomposition import TruncatedSVD
 
-from evidence import report, status
-from evidence.curves import estimators
-from evidence.curves.estimators import SAME, Estimator, Experiment
+from evidence import cache, report, status, training
+from evidence.datasets import coarser
+from evidence.end_to_end import models
+from evidence.intervals import mean_of
+from evidence.study import Study
+from learn.data.clips import Clip, load_clips
+from learn.data.grid import Grid
+from learn.evaluation.evaluate import evaluate
+from learn.inference.predict import Predictor
+from learn.settings import TrainingSettings
+from learn.split import Split
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
+Floats = NDArray[np.float64]
+Estimate = Callable[[Clip], Floats]  # clip → force (T, 3) mN, camera axes
+
+RIDGE, NEAREST, SMALL, LARGE = "ridge", "k-NN", "d2fnet-s", "D2FNet"
+NETWORKS = {
+    SMALL: {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0},
+    LARGE: {"width": 32, "stem": 2, "levels": 4, "dropout": 0.05},
+}
+MODELS = (RIDGE, NEAREST, *NETWORKS)
+SOURCES = {
+    "recovered": {1: "recovered", 2: "motion"},
+    "exact": {1: "ideal", 2: "motion-ideal"},
+}
+"""Displacement for fitting and testing, by number of cameras: recovered, or the ground truth, whose remaining
+error is of what the surface doesn't show."""
+GRID = Grid(64)
+_COMPONENTS = 200  # principal components of displacement
+_BASIS = 150  # sequences that they are found on
+_BATCH, _LEAST, _MOST = 16, 4, 80  # frames a batch, epochs
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """One point of a curve."""
+
+    model: str
+    input: str
+    cameras: int
+    size: int  # sequences fitted on
+
+    @property
+    def slug(self) -> str:
+        return f"{self.model}-{self.input}-{self.cameras}-{self.size}"
+
+    @property
+    def source(self) -> str:
+        """Name of its displacement in clips."""
+        return SOURCES[self.input][self.cameras]
+
+
+def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: int, work: Path) -> Estimate:
+    """An estimator fitted on `fit`: a network, in about `steps` batches and stored in `work`, with its epoch
+    selected by `select`; or ridge or nearest neighbours."""
+    if one.model not in NETWORKS:
+        return _by_components(one, fit)
+    settings = network_settings(one, steps, sum(clip.frames for clip in fit))
+    split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(fit) + len(select))), ())
+    predictor = training.fit(one.slug, [*fit, *select], split, settings, work)
+    return partial(models.read_force, predictor, source=one.source)
+
+
+def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
+    """Ridge or nearest neighbours on principal components of displacement, in eight orientations."""
+    small = [coarser(clip) for clip in fit]
+    # Not centred, so that zero motion stays zero.
+    x, _, _ = models.samples(small[:_BASIS], one.source)
+    basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
+    features, forces, groups = [], [], []
+    for start in range(0, len(small), _BASIS):
+        x, force, group = models.samples(small[start : start + _BASIS], one.source)
+        features.append(basis.transform(x))
+        forces.append(force)
+        groups.append(group + start)
+    x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
+    regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else models.fit_nearest(x, force)
+    return lambda clip: (
+        clip.young_kpa
+        * np.asarray(regressor.predict(basis.transform(models.rows(coarser(clip), one.source))))
+    )
+
+
+def network_settings(one: Estimator, steps: int, frames: int) -> TrainingSettings:
+    """Training settings of a network: about `steps` batches over a training set of `frames` frames."""
+    arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
+    return TrainingSettings.model_validate(
+        {
+            "size": GRID.size,
+            "arch": arch | {"depth": one.cameras == 2},
+            "loss": "mse-frame",
+            "input": one.source,
+            "epochs": int(np.clip(round(steps * _BATCH / frames), _LEAST, _MOST)),
+            "batch": _BATCH,
+            "learning_rate": 2e-3,
+            "schedule": "cosine",
+            "seed": 0,
+        }
+    )
+
+
+def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> dict[str, Any]:
+    """Errors relative to the force, means over the sequences `part` with intervals, and the gain.
+
+    Returns:
+        `whole`, `across`, `along` the line of sight, `force_size`, and of sequences without a membrane
+        `bare`, each [mean, low, high] or None; of the forces' sizes the `gain` of predicted on true and the
+        `slope` of true on predicted.
+    """
+    predicted, true = [estimate(clip) for clip in part], [clip.force for clip in part]
+    sizes, own = ([np.linalg.norm(force, axis=1) for force in forces] for forces in (predicted, true))
+    off = models.errors(predicted, true)
+    found = {
+        "force_size": [
+            float(np.sqrt(np.square(a - b).mean() / np.square(b).mean()))
+            for a, b in zip(sizes, own, strict=True)
+        ],
+        "whole": off["errors"],
+        "across": off["across"],
+        "along": off["along"],
+        "bare": [e for e, alone in zip(off["errors"], bare, strict=True) if alone],
+    }
+    row: dict[str, Any] = {
+        name: [round(value, 4) for value in mean_of(values)] if values else None
+        for name, values in found.items()
+    }
+    all_predicted, all_true = np.concatenate(sizes), np.concatenate(own)
+    # The mean of a posterior shrinks towards zero (gain below 1) and is right on average (slope of 1): a gain
+    # is a fault only where the slope differs from 1.
+    both = float(all_predicted @ all_true)
+    row["gain"] = round(both / float(all_true @ all_true), 3)
+    row["slope"] = round(both / max(float(all_predicted @ all_predicted), 1e-30), 3)
+    return row
+
+
+def map_figures(predictor: Predictor, part: Sequence[Clip], source: str) -> dict[str, Any]:
+    """R² of the force map over all cells, and the share of contact-free area with a force."""
+    known = evaluate(predictor, part, source).summary()
+    return {
+        "map_r2": round(known["map_r2_pooled"], 4),
+        "false_positives": round(known["false_positive_relative"], 5),
+    }
+
+
+SAME = "in distribution"  # tested sequences of the dataset that estimators are fitted on
+Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]
+"""By name: clips, and whether each lacks a membrane."""
 _PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
 _NAMES = {1: "monocular", 2: "stereo"}
 
 
-def main(
-    data: Annotated[Path, typer.Argument(help="Dataset; its first sequences test and select epochs.")],
-    unseen: Annotated[list[Path] | None, typer.Option(help="Datasets that are only tested on.")] = None,
-    sizes: Annotated[str, typer.Option(help="Comma-separated numbers of sequences.")] = "300,1000,2800",
-    models: Annotated[str, typer.Option(help="Comma-separated estimators.")] = ",".join(estimators.MODELS),
-    inputs: Annotated[str, typer.Option(help="Comma-separated: recovered, exact.")] = "recovered",
-    cameras: Annotated[str, typer.Option(help="Comma-separated: 1, 2.")] = "1,2",
-    steps: Annotated[int, typer.Option(min=1, help="Approximate number of training batches.")] = 4000,
-    test: Annotated[int, typer.Option(min=4, help="Sequences of `data` to test on.")] = 100,
-    select: Annotated[int, typer.Option(min=2, help="Sequences of `data` that select an epoch.")] = 40,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "learn/curves",
-    work: Annotated[Path, typer.Option(help="Folder for packed sequences, networks and rows.")] = Path(
-        "runs/curves"
-    ),
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-) -> None:
-    """Error of the force against fitted sequences, by model, displacement and cameras."""
-    ood = tuple(unseen or ())
-    experiment = Experiment(data, ood, test, select, steps, work)
-    numbers, counted = [int(n) for n in sizes.split(",")], [int(n) for n in cameras.split(",")]
-    wanted = _wanted(numbers, models.split(","), inputs.split(","), counted)
+def measure(
+    datasets: list[Path],
+    sizes: str = "30,100,300",
+    models: str = "ridge,d2fnet-s",
+    inputs: str = "recovered",
+    cameras: str = "1,2",
+    steps: int = 4000,
+    test: int = 56,
+    select: int = 40,
+    work: Path = Path("runs/curves"),
+) -> dict[str, Any]:
+    """Error of the force against fitted sequences, by model, displacement and cameras.
+
+    `datasets`: the first one's sequences test, select an epoch and are fitted on, in this order, so that
+    tested ones stay the same as it grows; the others are only tested on. `sizes`, `models`, `inputs`
+    (recovered, exact), `cameras`: comma-separated; `steps`: approximate number of training batches; `work`:
+    folder of packed sequences, networks and rows.
+    """
+    data, *ood = datasets
+    numbers, counted = ([int(n) for n in words.split(",")] for words in (sizes, cameras))
     if max(numbers) > (left := len(Dataset(data)) - test - select):
         raise UserError(f"--sizes: at most {left}: {data} has no more after --test and --select")
-    experiment.pack()
-    rows = Parallel(workers, verbose=10)(delayed(experiment.rows)(one) for one in wanted)
-    found = {
-        "data": status.data(data, *ood),
-        "generation_cpu_s": estimators.generation_cpu_s(data),
-        "tested": {SAME: test} | {root.name: len(Dataset(root)) for root in ood},
-        "rows": [row for of_estimator in rows for row in of_estimator],
+    sources = [source for by_cameras in SOURCES.values() for source in by_cameras.values()]
+    clips, *others = (load_clips(root, GRID, sources, cache=work / "clips") for root in datasets)
+    tests: Tests = {
+        name: (part, [clip.membrane != "intact" for clip in part])
+        for name, part in zip([SAME, *(root.name for root in ood)], [clips[:test], *others], strict=True)
     }
-    shown = {one.heading: one.rows for one in page(found).sections}
-    report.publish(out, "curves.json", found, page, shown)
+    spent = generation_cpu_s(data)
+    rows = []
+    for size, model, source, count in product(numbers, models.split(","), inputs.split(","), counted):
+        one = Estimator(model, source, count, size)
+        rows += measure_estimator(one, clips[test:], select, tests, steps, spent, work)
+    return {
+        "data": status.data(*datasets),
+        "generation_cpu_s": spent,
+        "tested": {name: len(part) for name, (part, _) in tests.items()},
+        "rows": rows,
+    }
 
 
-def _wanted(
-    sizes: Sequence[int], models: Sequence[str], inputs: Sequence[str], cameras: Sequence[int]
-) -> list[Estimator]:
-    """Estimators by size, smallest first, so that an interrupted run has the start of every curve."""
-    for known, named, word in ((estimators.MODELS, models, "models"), (estimators.SOURCES, inputs, "inputs")):
-        if unknown := set(named) - set(known):
-            raise UserError(f"--{word}: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
-    return [
-        Estimator(model, source, count, size)
-        for size, model, source, count in product(sorted(sizes), models, inputs, cameras)
-    ]
+def measure_estimator(
+    one: Estimator,
+    clips: Sequence[Clip],
+    select: int,
+    tests: Tests,
+    steps: int,
+    generation_s: float,
+    work: Path,
+) -> list[dict[str, Any]]:
+    """Errors of an estimator, one row for each test, cached.
+
+    `clips`: the first `select` may select an epoch, the others are fitted on; `generation_s`: CPU time of
+    rendering a sequence.
+    """
+    chosen, fit = clips[: min(select, max(4, one.size // 5))], clips[select : select + one.size]
+    parts = (fit, chosen, *(part for part, _ in tests.values()))
+    key = cache.key(asdict(one), steps, [clip.content_hash for part in parts for clip in part])
+
+    def compute() -> list[dict[str, Any]]:
+        began = time.process_time()
+        estimate = fitted(one, fit, chosen, steps, work / "networks")
+        spent = time.process_time() - began
+        hours = (spent + one.size * generation_s) / 3600
+        return [
+            asdict(one)
+            | {"tested": name, "fit_cpu_s": round(spent, 1), "cpu_h": round(hours, 3)}
+            | figures(estimate, part, bare)
+            for name, (part, bare) in tests.items()
+        ]
+
+    found: list[dict[str, Any]] = cache.result(work / "rows", one.slug, key, compute)
+    return found
+
+
+def generation_cpu_s(root: Path) -> float:
+    """Median CPU time of rendering a sequence [s]; the first of a process includes compilation."""
+    return float(np.median([sum(one.stages_cpu_s.values()) for one in Dataset(root)]))
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """A panel for every tested dataset and number of cameras; tables with a column for every size."""
-    groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
-    for row in found["rows"]:
-        groups.setdefault((row["tested"], row["cameras"]), []).append(row)
+    groups = report.grouped(found["rows"], "tested", "cameras")
     groups = dict(sorted(groups.items(), key=lambda one: (one[0][0] != SAME, *one[0])))
     last = [*groups][-1][0]
     rows = [row for (tested, _), own in groups.items() if tested == last for row in own]
@@ -96,7 +270,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
     )
 
 
-def _verdict(group: tuple[str, int], rows: Sequence[Mapping[str, Any]]) -> str:
+def _verdict(group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> str:
     best = min(rows, key=lambda row: float(row["whole"][0]))
     error = report.percent(best["whole"])
     return f"{group[0]}, {_NAMES[group[1]]}: {error} with {best['model']} on {best['size']} sequences"
@@ -104,21 +278,18 @@ def _verdict(group: tuple[str, int], rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _panel(rows: Sequence[Mapping[str, Any]], title: str) -> report.Panel:
     curves = []
-    for model, source in dict.fromkeys((row["model"], row["input"]) for row in rows):
-        line = sorted((r["size"], r["whole"][0]) for r in rows if (r["model"], r["input"]) == (model, source))
-        x, y = zip(*line, strict=True)
+    for (model, source), own in report.grouped(rows, "model", "input").items():
+        x, y = zip(*sorted((row["size"], row["whole"][0]) for row in own), strict=True)
         curves.append(report.Curve(f"{model}, {source}", x, y))
     return report.Panel(title, "fitted sequences", "error of the force", tuple(curves), log_x=True)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]:
-    lines: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for row in rows:
-        names = {"cameras": row["cameras"], "model": row["model"], "fitted on": row["input"]}
-        line = lines.setdefault(tuple(names.values()), names)
-        line[f"{row['size']} sequences"] = report.percent(row[part])
-    return list(lines.values())
+    return [
+        {"cameras": cameras, "model": model, "fitted on": source}
+        | {f"{row['size']} sequences": report.percent(row[part]) for row in own}
+        for (cameras, model, source), own in report.grouped(rows, "cameras", "model", "input").items()
+    ]
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "learn/curves/curves.json", page, ("{mission} {mission-ood} --work {work}/curves",))

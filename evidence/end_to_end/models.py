@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,11 +19,8 @@ from bench.methods import baselines, physics, posterior
 from bench.methods.compliance import TissueKind
 from bench.methods.protocol import Field
 from learn.data.clips import Clip
-from learn.inference.predict import Predictor, load_model
-from learn.settings import TrainingSettings
-from learn.split import Split
+from learn.inference.predict import Predictor
 from learn.training import batches
-from learn.training.train import train
 from synth.flow.confidence import deviation
 
 Floats = NDArray[np.float64]
@@ -104,16 +100,6 @@ def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Flo
     force = np.concatenate([t.force / t.young_kpa for turns in clips for t in turns])
     group = np.repeat(np.arange(len(fit)), [sum(t.frames for t in turns) for turns in clips])
     return x, force, group
-
-
-def train_network(
-    fit: Sequence[Clip], select: Sequence[Clip], settings: TrainingSettings, folder: Path
-) -> Predictor:
-    """A network with vector output, stored in `folder`; the clips `select` choose the epoch."""
-    clips = [*fit, *select]
-    split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(clips))), ())
-    train(clips, split, settings, folder)
-    return load_model(folder)
 
 
 def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bool = False) -> Floats:

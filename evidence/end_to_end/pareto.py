@@ -6,40 +6,193 @@ frame of its data and of one estimate.
 
 One instrument pulls or pushes. The force along the line of sight is visible in flow only through the little
 that tissue spreads under a push, so that the part across the line of sight is also reported by itself.
-
-Run: python -m evidence.end_to_end.pareto --fit 8 --test 6 --out runs/end-to-end
 """
 
 from __future__ import annotations
 
+import functools
+import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import typer
 
-from evidence import report
+from bench.methods.baselines import GRID
+from evidence import cache, datasets, report
 from evidence.end_to_end import models
-from evidence.end_to_end.pipelines import FINE, FRAMES, SIZE, Sequences, chosen, default_rendering, errors
-from learn.evaluation.statistics import interval, paired
+from evidence.intervals import difference, mean_of
+from evidence.study import Study
+from learn.data import clips as data
+from learn.data.clips import Clip
+from synth.dataset.folder import write_whole
+from synth.flow import mask_detection
+from synth.flow.estimator import create
+from synth.job.schema import FemSection, FlowSection, Job, RenderSection
 
+FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
+_MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
+_NO_COST = ("peak_rss_mb", "store")  # timings of a sequence that are not costs of making it
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Settings by which sequences are made."""
+
+    law: str
+    tets: int
+    spp: int
+
+    def job(self, seed: int, count: int) -> Job:
+        return Job.model_validate(
+            {
+                "seed": seed,
+                "sequences": count,
+                "frames": FRAMES,
+                "anatomy": {"vertices": VERTICES},
+                "fem": {"law": self.law, "tets": self.tets, "load": LOAD, "gestures": GESTURES},
+                "render": {"size": SIZE, "spp": self.spp},
+                "flow": {"backend": "ideal"},
+            }
+        )
+
+    @property
+    def name(self) -> str:
+        return f"{self.law}-{self.tets}-{self.spp}"
+
+
+def default_rendering() -> Rendering:
+    """Defaults of a job at this load."""
+    fem = FemSection(load=LOAD)
+    return Rendering(fem.chosen_law[0], fem.tets, RenderSection().spp)
+
+
+FINE = Rendering("neo-hookean", 3000, 8)  # of the sequences that all pipelines are tested on
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """One dot of the chart."""
+
+    rendering: Rendering
+    flow: str
+    model: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.rendering.name}, {self.flow}, {self.model}"
+
+    @property
+    def default(self) -> bool:
+        """Whether rendering and flow are the defaults; a job doesn't specify the model."""
+        return self.rendering == default_rendering() and self.flow == FlowSection().backend
+
+    def as_row(self) -> dict[str, Any]:
+        """Settings that identify it in a row of results."""
+        return asdict(self.rendering) | {"flow": self.flow, "model": self.model, "default": self.default}
+
+
+def chosen() -> list[Pipeline]:
+    """Defaults, changes of one setting at a time, all settings at their cheapest, and those of `FINE`."""
+    usual, flow = default_rendering(), FlowSection().backend
+    cheapest = Rendering("linear", 400, 1)
+    changed = [replace(usual, law="linear"), replace(usual, tets=400), replace(usual, spp=1)]
+    pairs = [(rendering, flow) for rendering in dict.fromkeys([usual, *changed, cheapest, FINE])]
+    pairs += [(usual, other) for other in ("dis", "opencv-tvl1", "ideal")] + [(cheapest, "dis")]
+    made = [Pipeline(rendering, flow, model) for rendering, flow in pairs for model in _MODELS]
+    # Physics alone is not fitted: one dot for each flow estimator of the tested sequences.
+    return [p for p in made if p.model != models.PHYSICS or (p.rendering == usual and p.flow != "ideal")]
+
+
+class Sequences:
+    """Sequences of one rendering on the baselines' grid, with the flow that any estimator recovers from them.
+
+    Costs are the least CPU time a frame of all sequences: other processes only add to it, and the first
+    sequence of a process includes compilation.
+    """
+
+    def __init__(self, rendering: Rendering, job: Job, work: Path) -> None:
+        """Renders the sequences that are missing."""
+        self._folder = datasets.folder_of(job, rendering.name, work)
+        self._sequences = [datasets.render(job, index, self._folder) for index in range(job.sequences)]
+
+    def clips(self, flow: str) -> list[Clip]:
+        """Clips with the `recovered` displacement of an estimator, stored next to the sequences."""
+        return [
+            cache.clip(self._folder / f"clips-{flow}" / f"{k:06d}", functools.partial(self._recover, k, flow))
+            for k in range(len(self._sequences))
+        ]
+
+    def data_s(self) -> float:
+        """CPU time [s] of making a frame, without its flow."""
+        spent: list[float] = []
+        for one in self._sequences:
+            times = one.attrs["timings"].items()
+            spent.append(sum(t["cpu_s"] for stage, t in times if stage not in _NO_COST) / one.frames)
+        return min(spent)
+
+    def flow_s(self, flow: str) -> float:
+        """CPU time [s] of a frame's masks and flow, 0 for ideal flow; requires `clips` first."""
+        if flow == "ideal":
+            return 0.0
+        return min(float(self._flow_cost(k, flow).read_text("utf-8")) for k in range(len(self._sequences)))
+
+    def _flow_cost(self, index: int, flow: str) -> Path:
+        return self._folder / f"flow-{flow}-{index:06d}.cpu_s"
+
+    def _recover(self, index: int, flow: str) -> Clip:
+        sequence = self._sequences[index]
+        clip = data.read_clip(sequence, GRID, ("ideal",))
+        if flow == "ideal":
+            return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
+        began = time.process_time()
+        hidden = mask_detection.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
+        masks_s = time.process_time() - began
+        recovered, flow_s = datasets.recover_flow(sequence, clip, create(flow), hidden, GRID)
+        spent = (masks_s + flow_s) / (clip.frames - 1)
+        write_whole(self._flow_cost(index, flow), str(spent), durable=False)
+        return recovered
+
+
+def errors(one: Pipeline, made: Sequences, tested: Sequences, work: Path) -> dict[str, Any]:
+    """Errors of a pipeline and CPU time of an estimate [s], cached in `work`.
+
+    A pipeline fitted on ideal flow is tested with the default's flow.
+    """
+    fit = [] if one.model == models.PHYSICS else made.clips(one.flow)
+    tests = tested.clips(FlowSection().backend if one.flow == "ideal" else one.flow)
+
+    def compute() -> dict[str, Any]:
+        estimate = models.build(one.model, fit)
+        forces, spent = [], []
+        for clip in tests:
+            began = time.process_time()
+            forces.append(estimate(clip))
+            spent.append((time.process_time() - began) / clip.frames)
+        return models.errors(forces, [clip.force for clip in tests]) | {"estimate_s": min(spent)}
+
+    key = cache.key(one.name, [clip.content_hash for clip in (*fit, *tests)])
+    found: dict[str, Any] = cache.result(work / "estimates", one.name.replace(", ", "-"), key, compute)
+    return found
+
+
+_NAME = "{law} {tets}, {spp} spp, {flow}"  # of a row's pipeline
 PARTS = {"": "errors", "across_": "across"}
 """The whole force, and its part across the line of sight: prefix of a row's keys, and key of the errors."""
+_ENDS = ("rmse", "low", "high")
 _WHAT = {"": "the force", "across_": "the force across the line of sight"}
 
 
-def main(
-    out: Annotated[Path, typer.Option(help="Folder for results.")] = report.RESULTS / "end-to-end",
-    work: Annotated[Path, typer.Option(help="Folder of intermediate results; a later run continues.")] = Path(
-        "runs/end-to-end-work"
-    ),
-    fit: Annotated[int, typer.Option(min=4, help="Sequences that each pipeline makes to fit on.")] = 40,
-    test: Annotated[int, typer.Option(min=3, help="Sequences that all are tested on.")] = 24,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 31,
-) -> None:
-    """Error of the force against CPU time a frame, for whole pipelines."""
+def measure(
+    work: Path = Path("runs/end-to-end"), fit: int = 40, test: int = 24, seed: int = 31
+) -> dict[str, Any]:
+    """Error of the force against CPU time a frame, for whole pipelines.
+
+    `work`: folder of intermediate results, from which a later run continues; `fit`: sequences that each
+    pipeline makes to fit on; `test`: sequences that all are tested on.
+    """
     tested, pipelines = Sequences(FINE, FINE.job(seed + 1, test), work), chosen()
     renderings = dict.fromkeys(one.rendering for one in pipelines)
     made = {one: Sequences(one, one.job(seed, fit), work) for one in renderings}
@@ -53,14 +206,13 @@ def main(
         typer.echo(done, err=True)
     true = [clip.force for clip in tested.clips("ideal")]
     nothing = models.errors([0 * force for force in true], true)
-    found = {
+    return {
         "tested": asdict(FINE) | {"size": SIZE, "frames": FRAMES, "sequences": test},
         "seed": seed,
         "zero": float(np.mean(nothing["errors"])),
         "across_zero": float(np.mean(nothing["across"])),
         "rows": summarised(rows, seed),
     }
-    report.publish(out, "pareto.json", found, page, {"rows": page(found).sections[0].rows})
 
 
 def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
@@ -75,17 +227,11 @@ def summarised(rows: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
         usual = None if row["default"] else defaults[row["model"]]
         more: dict[str, Any] = {"along_rmse": float(np.mean(row["along"]))}
         for name, part in PARTS.items():
-            found = interval(np.asarray(row[part]), np.random.default_rng(seed))
-            more |= {f"{name}rmse": found.mean, f"{name}low": found.low, f"{name}high": found.high}
+            keys = (f"{name}{end}" for end in _ENDS)
+            more |= zip(keys, mean_of(row[part], seed), strict=True)
             more[f"{name}difference"] = None if usual is None else difference(usual[part], row[part], seed)
         done.append(row | more)
     return done
-
-
-def difference(usual: list[float], other: list[float], seed: int) -> list[float]:
-    """Mean, low and high of the error of `other` less that of `usual` on the same sequences (BCa)."""
-    found = paired(np.asarray(usual), np.asarray(other), np.random.default_rng(seed)).difference
-    return [found.mean, found.low, found.high]
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -117,16 +263,12 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
 def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
     """A curve for each model, a dot for each pipeline, and the error of zero force."""
-    rows = found["rows"]
     curves = []
-    for model in dict.fromkeys(row["model"] for row in rows):
-        own = [row for row in rows if row["model"] == model]
-        errs = tuple(100 * float(row[f"{part}rmse"]) for row in own)
-        ends = tuple((100 * float(row[f"{part}low"]), 100 * float(row[f"{part}high"])) for row in own)
-        ringed = tuple(k for k, row in enumerate(own) if row["default"])
-        cost, labels = tuple(float(row["cpu_s"]) for row in own), tuple(map(_name, own))
-        curves.append(report.Curve(model, cost, errs, labels, ringed, ends, named=False))
-    costs, level = [float(row["cpu_s"]) for row in rows], 100 * float(found[f"{part}zero"])
+    for (model,), own in report.grouped(found["rows"], "model").items():
+        drawn = report.curve(model, own, "cpu_s", f"{part}rmse", _NAME, (1, 100))
+        ends = tuple((100 * row[f"{part}low"], 100 * row[f"{part}high"]) for row in own)
+        curves.append(replace(drawn, ends=ends, named=False))
+    costs, level = [row["cpu_s"] for row in found["rows"]], 100 * found[f"{part}zero"]
     curves.append(report.Curve("zero force", (min(costs), max(costs)), (level, level)))
     title, unit = f"Error of {_WHAT[part]} (rings: defaults)", "RMSE [% of the whole force]"
     return report.Panel(title, "CPU s a frame", unit, tuple(curves), log_y=True, front=True)
@@ -135,18 +277,13 @@ def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
 def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
     more = row["across_difference"]
     return {
-        "pipeline": _name(row),
+        "pipeline": _NAME.format_map(row),
         "model": row["model"],
         "CPU s": f"{row['cpu_s']:.3f}",
-        "error [%]": report.mean_cell([row[key] for key in ("rmse", "low", "high")], ".0f", 100),
-        "across [%]": report.mean_cell([row[f"across_{key}"] for key in ("rmse", "low", "high")], ".0f", 100),
+        "error [%]": report.mean_cell([row[key] for key in _ENDS], ".0f", 100),
+        "across [%]": report.mean_cell([row[f"across_{key}"] for key in _ENDS], ".0f", 100),
         "difference across": None if more is None else report.mean_cell(more, "+.1f", 100),
     }
 
 
-def _name(row: Mapping[str, Any]) -> str:
-    return f"{row['law']} {row['tets']}, {row['spp']} spp, {row['flow']}"
-
-
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "end-to-end/pareto.json", page, ("--work {work}/end-to-end",))

@@ -1,7 +1,4 @@
-"""Overhead of the engine over the bare stages, and speed-up by a second worker.
-
-Run: python -m evidence.engine.speed (10 CPU-minutes)
-"""
+"""Overhead of the engine over the bare stages, and speed-up by a second worker. 10 CPU-minutes."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import typer
 
 from evidence import report
+from evidence.study import Study
 from synth.dataset.store import Dataset, Writer
 from synth.engine import machine, run
 from synth.engine.progress import RunBars
@@ -30,16 +27,9 @@ from synth.system.stopwatch import StageCallback
 _CPU_S = "STAND_IN_CPU_S"  # environment variable: how long a stand-in computes in a worker [s]
 
 
-def main(
-    out: Path = report.RESULTS / "engine",
-    job: str = "demo",
-    rendered: int = 8,
-    sequences: int = 24,
-    cpu_s: float = 4.0,
-) -> None:
+def measure(job: str = "demo", rendered: int = 8, sequences: int = 24, cpu_s: float = 4.0) -> dict[str, Any]:
     """Overhead from `rendered` sequences of a job; workers from stand-ins of `cpu_s` processor time each."""
-    found = {"overhead": overhead(job, rendered), "workers": workers(sequences, cpu_s)}
-    report.publish(out, "speed.json", found, page)
+    return {"overhead": overhead(job, rendered), "workers": workers(sequences, cpu_s)}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -170,5 +160,4 @@ def _cpu() -> float:
     return mine.ru_utime + mine.ru_stime + theirs.ru_utime + theirs.ru_stime
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "engine/speed.json", page)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from scipy.special import ellipe, ellipk, j0, j1
 
 from evidence import report
+from evidence.study import Study
 from synth.fem import surface_embedding
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
@@ -29,17 +28,16 @@ _SHEETS = (0.0, 50.0)
 _WIDE_MM = (800.0, 800.0, 480.0)  # a membrane spreads the load: its far field is not the bare half-space's
 
 
-def main(out: Path = report.RESULTS / "fem/half-space", tets: str = "1600,5000") -> None:
+def measure(tets: str = "1600,5000") -> Row:
     """Error of surface displacement under uniform, Hertz and tangential discs, bare and with a membrane.
 
     `tets`: tetrahedra of the meshes.
     """
     settings = product((int(n) for n in tets.split(",")), _POISSONS, _SHEETS)
-    found = {"rows": [row for setting in settings for row in measure(*setting)]}
-    report.publish(out, "half-space.json", found, page)
+    return {"rows": [row for setting in settings for row in errors(*setting)]}
 
 
-def measure(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
+def errors(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     """Relative root mean square errors inside the disc and outside, to twice its radius.
 
     `sheet_mm`: stiffness of the membrane over Young's modulus of the half-space.
@@ -187,5 +185,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Discs on the half-space", found, panels)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "fem/half-space/half-space.json", page)

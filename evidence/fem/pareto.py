@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from evidence import report
 from evidence.fem import case as fem_case
+from evidence.study import Study
 from synth.fem import solver
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
@@ -36,26 +36,20 @@ _SETTINGS = (
 _FRAMES = 60
 
 
-def main(
-    out: Path = report.RESULTS / "fem/pareto",
-    load: float = 0.3,
-    refined: int = 9000,
-    contacts: int = 4,
-) -> None:
+def measure(load: float = 0.3, refined: int = 8000, contacts: int = 2) -> Row:
     """Error against CPU time a frame by law and size, and costs.
 
     `load`: P = F/(E a^2) at which laws are compared; `refined`: tetrahedra of the references; `contacts`:
     number of contacts, at most four.
     """
     on = fem_case.patch()
-    found: Row = {
+    return {
         "meaning": "errors: relative root mean square of displacement in the opening; ms_a_frame: CPU time "
         "of one core over 60 frames with 40,000 vertices",
         "rows": discretisation(on, refined, contacts, load),
         "laws": law_table(on),
         "sequence": [sequence(law, 0.15) for law in ("linear", "neo-hookean")],
     }
-    report.publish(out, "pareto.json", found, page)
 
 
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:
@@ -157,29 +151,20 @@ def page(found: Mapping[str, Any]) -> report.Page:
     """Error of mesh and law against cost, and the largest error of each law by load."""
     rows, laws = found["rows"], found["laws"]
     cost, by_load = [], []
-    for law in dict.fromkeys(row["law"] for row in rows):
-        mine = [row for row in rows if row["law"] == law and row["error"] is not None]
-        x, y = (
-            tuple(factor * row[key] for row in mine) for key, factor in (("ms_a_frame", 1), ("error", 100))
-        )
-        labels = tuple(f"{law}, {row['tets']}" for row in mine)
-        ringed = tuple(k for k, row in enumerate(mine) if row["default"])
-        cost.append(report.Curve(law, x, y, labels, ringed))
+    for (law,), own in report.grouped(rows, "law").items():
+        mine = [row for row in own if row["error"] is not None]
+        cost.append(report.curve(law, mine, "ms_a_frame", "error", "{law}, {tets}", (1, 100)))
         errors = {load: [r["error"] for r in laws if (r["law"], r["load"]) == (law, load)] for load in _LOADS}
         complete = {load: 100 * max(each) for load, each in errors.items() if each and None not in each}
         if complete:
             by_load.append(report.Curve(law, tuple(complete), tuple(complete.values())))
-    unit = "CPU ms a frame"
-    title = "Physics: error against cost"
+    title, worst = "Physics: error against cost", "Laws against neo-Hookean, worst"
     panels = [
-        report.Panel(title, unit, "error [%]", tuple(cost), True, True, front=True),
-        report.Panel(
-            "Laws against neo-Hookean, worst", "P = F/(E a2)", "error [%]", tuple(by_load), True, True
-        ),
+        report.Panel(title, "CPU ms a frame", "error [%]", tuple(cost), True, True, front=True),
+        report.Panel(worst, "P = F/(E a2)", "error [%]", tuple(by_load), True, True),
     ]
     sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]
     return report.Page(title, found, panels, sections)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "fem/pareto/pareto.json", page)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 
 from evidence import report
+from evidence.study import Study
 from synth.errors import UserError
 from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.mesh import tetrahedra
@@ -21,19 +20,14 @@ Row = dict[str, Any]
 _JOB = Job(sequences=1000)
 
 
-def main(out: Path = report.RESULTS / "fem/relief", scenes: int = 40, tets: str = "1600,5000,20000") -> None:
+def measure(scenes: int = 40, tets: str = "1600,5000,20000") -> Row:
     """Peak and load-weighted mean displacement of default scenes at full load, relative to the finest mesh.
 
     `scenes`: number of scenes of the default job; `tets`: tetrahedra, the last is the reference.
     """
     sizes = [int(n) for n in tets.split(",")]
-    rows: list[Row] = []
-    found: Row = {}
-    for count in reversed(sizes):
-        rows += [measure_scene(index, count) for index in range(scenes)]
-        found = {"summary": summarise(rows, sizes), "rows": rows}
-        report.save(out, "relief.json", found, page(found))  # intermediate results too
-    report.show({"summary": found["summary"]})
+    rows = [measure_scene(index, count) for count in reversed(sizes) for index in range(scenes)]
+    return {"summary": summarise(rows, sizes), "rows": rows}
 
 
 def measure_scene(index: int, count: int) -> Row:
@@ -92,5 +86,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(title, found, [panel], [report.Section("Summary", found["summary"])])
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "fem/relief/relief.json", page)

@@ -1,7 +1,5 @@
 """Trains the corrections of flow and of depth on rendered ground truth and on motion in closed form.
 
-Run: python -m evidence.flow.correction_training EXAMPLES [--scenes 480 --depth]
-
 Data are sequences of `mission` from the 2,000th on (no force estimator is trained on these), each as rendered
 and once more as from another camera (gain, colour, contrast, noise, blur, JPEG; if monocular also another
 size, and some corrupted frames that cannot be tracked). Flow is also trained on the warped pairs of
@@ -22,13 +20,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-import typer
 from numpy.typing import NDArray
 from torch import Tensor
 
 from evidence import report
 from evidence.flow import scenes as drawn_scenes
 from evidence.flow.scenes import Recipe, inverse, jpeg, noise_field, pairs, pixels, sample
+from evidence.study import Study
 from synth.errors import UserError
 from synth.flow import correction, image, mask_detection
 from synth.flow.stereo import depth_correction
@@ -52,7 +50,7 @@ _FREEDOM, _PLAIN = 5.0, 4.0  # of Student's distribution; weight of the absolute
 _BATCH, _RATE = 8, 2e-3
 
 
-def main(
+def measure(
     examples: Path,
     scenes: int = 480,
     closed: int = 160,
@@ -62,8 +60,6 @@ def main(
     depth: bool = False,
 ) -> None:
     """Makes examples of `scenes`, `closed` warped and `drawn` pairs, and trains for some CPU-minutes."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     examples.mkdir(parents=True, exist_ok=True)
     sources = _sources(scenes, closed, drawn, depth)
     describe, before = (depth_example, "depth_") if depth else (example, "")
@@ -86,7 +82,7 @@ def main(
         "torch": torch.__version__,
     }
     report.save(weights.parent, f"{weights.stem}.json", card)
-    report.show(card)
+    print(card)
 
 
 def _sources(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
@@ -461,5 +457,4 @@ def _loss(found: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
     return (weight * (likely + _PLAIN * torch.sqrt(error**2 + 1e-4))).sum() / weight.sum()
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, steps=())

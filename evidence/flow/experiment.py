@@ -1,24 +1,20 @@
-"""Flow: endpoint error, divergence, masks, drift and time against their targets.
-
-Run: python -m evidence.flow.experiment [--only time]
-"""
+"""Flow: endpoint error, divergence, masks, drift and time against their targets."""
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-import typer
 
 from evidence import report
-from evidence.flow.measure import Error, epe, inpainted, measure
+from evidence.flow.measure import Error, epe, mean_error
 from evidence.flow.scenes import CLEAN, Flags, Recipe, Rgb, Stage, pairs
+from evidence.study import Study
 from synth.flow import mask_detection
 from synth.flow.estimator import create
 from synth.flow.track import Tracker
@@ -30,16 +26,13 @@ Row = dict[str, Any]
 _OOD = report.CHECKOUT / "evidence/curves/mission-ood.yaml"
 
 
-def main(
-    out: Path = report.RESULTS / "flow/benchmark",
-    only: Annotated[str, typer.Option(help="Parts to run.")] = "warped,drift,contact,time",
-    count: int = 6,
-    frames: Annotated[int, typer.Option(min=60, help="Of the drift sequence.")] = 200,
-    seed: int = 2641,
-) -> None:
-    """Figures against their targets, on `count` pairs a source; seeds 4 and 5 were tuned on."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+def measure(
+    only: str = "warped,drift,contact,time", count: int = 6, frames: int = 200, seed: int = 2641
+) -> dict[str, Any]:
+    """Figures against their targets, on `count` pairs a source; seeds 4 and 5 were tuned on.
+
+    `only`: parts to run; `frames`: of the drift sequence, at least 60.
+    """
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "warped": lambda: _warped(count, seed),
         "drift": lambda: _drift(frames, seed),
@@ -47,8 +40,7 @@ def main(
         "time": lambda: _time(seed),
     }
     rows = [{"part": part} | row for part in only.split(",") for row in parts[part]()]
-    found = {"torch": torch.__version__, "opencv": cv2.__version__, "rows": rows}
-    report.publish(out, "results.json", found, page)
+    return {"torch": torch.__version__, "opencv": cv2.__version__, "rows": rows}
 
 
 def row(what: str, on: str, measured: float, target: float | None = None, unit: str = "px") -> Row:
@@ -88,17 +80,15 @@ def _automatic(picture: Rgb, _: Flags) -> Flags:
 def _warped(count: int, seed: int) -> Iterator[Row]:
     on = "warped procedural cortex"
     dirty, clean = list(pairs(Recipe(), count, seed)), list(pairs(CLEAN, count, seed))
-    ours = measure(create("tvl1"), dirty)
+    ours = mean_error(create("tvl1"), dirty)
     yield from _targets(on, ours)
     for name in ("opencv-tvl1", "dis"):
-        theirs = measure(create(name), dirty)
+        theirs = mean_error(create(name), dirty)
         yield row(f"EPE mean, exact masks: {name}", on, theirs.mean)
         yield row(f"divergence, relative RMS: {name}", on, theirs.divergence, unit="share")
-    filled = measure(create("tvl1"), [inpainted(pair) for pair in dirty])
-    yield row("EPE masked / mean-intensity inpainting", on, ours.mean / filled.mean, 0.6, "ratio")
-    unaided = measure(create("tvl1"), dirty, _automatic)
+    unaided = mean_error(create("tvl1"), dirty, _automatic)
     yield row("EPE automatic / exact masks", on, unaided.mean / ours.mean, 1.25, "ratio")
-    mine, theirs = measure(create("tvl1"), clean), measure(create("opencv-tvl1"), clean)
+    mine, theirs = mean_error(create("tvl1"), clean), mean_error(create("opencv-tvl1"), clean)
     yield row("EPE clean pairs", on, mine.mean, 0.12)
     yield row("EPE clean pairs / tuned OpenCV TV-L1", on, mine.mean / theirs.mean, 1.3, "ratio")
 
@@ -150,11 +140,10 @@ def _contact(count: int) -> Iterator[Row]:
 
 def _time(seed: int) -> Iterator[Row]:
     some = list(pairs(replace(Recipe(), size=256), 5, seed))
-    measure(create("tvl1"), some[:1])  # compiles
+    mean_error(create("tvl1"), some[:1])  # compiles
     on = f"256², one thread, {platform.machine()}"
-    yield row("CPU cold", on, measure(create("tvl1"), some).cpu_s, 0.5, "CPU-s")
-    yield row("CPU warm", on, measure(create("tvl1"), some, warm=0.9).cpu_s, 0.2, "CPU-s")
+    yield row("CPU cold", on, mean_error(create("tvl1"), some).cpu_s, 0.5, "CPU-s")
+    yield row("CPU warm", on, mean_error(create("tvl1"), some, warm=0.9).cpu_s, 0.2, "CPU-s")
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "flow/benchmark/results.json", page)

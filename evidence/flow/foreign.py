@@ -6,18 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-import typer
 from numpy.typing import NDArray
 
 from evidence import report
 from evidence.flow.foreign_scenes import Frame, Recipe, recipes, video
 from evidence.flow.measure import epe
+from evidence.study import Study
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
@@ -28,21 +27,19 @@ _FPS = 10.0
 Table = Mapping[str, NDArray[Any]]
 
 
-def main(
-    out: Path = report.RESULTS / "flow/recordings",
+def measure(
     half: str = "reporting",
     count: int = 48,
     first: int = 48,
     size: int = 160,
     frames: int = 14,
-    jobs: int = 2,
-) -> None:
+    jobs: int = 1,
+) -> dict[str, Any]:
     """Errors on `count` videos of a half after its `first` ones; settings were tuned on the half `tuning`."""
     chosen = recipes(half, count, first)
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         rows = list(pool.map(partial(judge, size=size, frames=frames), chosen))
-    found = {"half": half, "summary": summarise(rows)}
-    report.publish(out, "recordings.json", found, page)
+    return {"half": half, "summary": summarise(rows)}
 
 
 def judge(recipe: Recipe, size: int, frames: int) -> dict[str, Any]:
@@ -140,5 +137,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Flow: videos not made by our renderer", found, charts, sections, words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "flow/recordings/recordings.json", page)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
@@ -66,7 +66,7 @@ def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
 Masks = Callable[[Rgb, Flags], Flags]  # (image, exact mask of usable pixels) → the mask to use
 
 
-def measure(
+def mean_error(
     estimator: Estimator, pairs: Iterable[Pair], masks: Masks | None = None, warm: float | None = None
 ) -> Error:
     """Mean errors over pairs, with other masks than the exact ones if they are given.
@@ -91,15 +91,3 @@ def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
     good = np.asarray(values)
     good = good[np.isfinite(good)]
     return float(good.mean()) if len(good) else float("nan")
-
-
-def inpainted(pair: Pair) -> Pair:
-    """The pair with masked pixels set to the mean intensity, as in the paper, and all pixels usable."""
-
-    def filled(picture: Rgb, usable: Flags) -> Rgb:
-        mean: NDArray[np.float64] = picture[usable].mean(axis=0) if usable.any() else np.full(3, 128.0)
-        return np.where(usable[..., None], picture, np.round(mean)).astype(np.uint8)
-
-    every = np.ones_like(pair.rest_usable)
-    rest, now = filled(pair.rest, pair.rest_usable), filled(pair.now, pair.now_usable)
-    return replace(pair, rest=rest, now=now, rest_usable=every, now_usable=every)

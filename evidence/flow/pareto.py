@@ -4,29 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import torch
-import typer
 
 from evidence import report
-from evidence.flow.measure import measure
+from evidence.flow.measure import mean_error
 from evidence.flow.scenes import Recipe, pairs
+from evidence.study import Study
 from synth.flow.estimator import Estimator
 from synth.flow.opencv import Dis, OpenCvTvl1
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 
-def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int = 2613) -> None:
+def measure(count: int = 4, seed: int = 2613) -> dict[str, Any]:
     """Endpoint and divergence error against milliseconds on `count` pairs; seed 6 was tuned on."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     made = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
     for family, label, estimator, warm in _candidates():
-        error = measure(estimator, made, warm=warm)
+        error = mean_error(estimator, made, warm=warm)
         about = {
             "family": family,
             "setting": label,
@@ -37,13 +34,12 @@ def main(out: Path = report.RESULTS / "flow/pareto", count: int = 4, seed: int =
             "default": "(default)" in label,
         }
         rows.append(about | asdict(error))
-    found = {
+    return {
         "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
         "torch": torch.__version__,
         "opencv": cv2.__version__,
         "rows": rows,
     }
-    report.publish(out, "pareto.json", found, page)
 
 
 def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
@@ -82,21 +78,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         ("mean", "endpoint error", "EPE mean [px]"),
         ("divergence", "divergence error", "relative RMS"),
     ):
-        curves = []
-        for family in dict.fromkeys(row["family"] for row in found["rows"]):
-            own = [row for row in found["rows"] if row["family"] == family]
-            curves.append(
-                report.Curve(
-                    family,
-                    tuple(1e3 * row["cpu_s"] for row in own),
-                    tuple(row[key] for row in own),
-                    tuple(row["setting"] for row in own),
-                    ringed=tuple(k for k, row in enumerate(own) if row["default"]),
-                )
-            )
-        panels.append(
-            report.Panel(f"Flow: {title}", "CPU time [ms]", unit, tuple(curves), True, True, front=True)
+        curves = tuple(
+            report.curve(family, own, "cpu_s", key, "{setting}", (1e3, 1))
+            for (family,), own in report.grouped(found["rows"], "family").items()
         )
+        panels.append(report.Panel(f"Flow: {title}", "CPU time [ms]", unit, curves, True, True, front=True))
     shown = ("family", "setting", "default", "mean", "contact", "divergence", "cpu_s")
     rows = [{key: row[key] for key in shown} for row in found["rows"]]
     best = min(rows, key=lambda row: float(row["mean"]))
@@ -107,5 +93,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Flow: error against time", found, panels, [report.Section("", rows)], words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "flow/pareto/pareto.json", page)

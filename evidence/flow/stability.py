@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
-import typer
 
 from evidence import report
 from evidence.flow.measure import epe
 from evidence.flow.scenes import Floats, Pair, Recipe, pairs
+from evidence.study import Study
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Tracker
 
@@ -30,24 +27,17 @@ _DISTURBANCES: dict[str, tuple[str, tuple[float, ...]]] = {
 }
 
 
-def main(
-    out: Path = report.RESULTS / "flow/stability",
-    count: int = 2,
-    size: int = 224,
-    seed: int = 2615,
-    methods: str = "tvl1,opencv-tvl1,dis",
-) -> None:
+def measure(
+    count: int = 1, size: int = 224, seed: int = 2615, methods: str = "tvl1,opencv-tvl1,dis"
+) -> dict[str, Any]:
     """Errors and flags of `count` pairs a point; seed 8 was tuned on."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     rows = []
     for disturbance, value, made in _pairs(size, count, seed):
         for name in methods.split(","):
             points = [_point(create(name), pair, start) for pair, start in made]
             means = {key: float(np.mean([point[key] for point in points])) for key in points[0]}
             rows.append({"disturbance": disturbance, "value": value, "estimator": name} | means)
-    found = {"flags": [_flags(name, rows) for name in methods.split(",")], "points": rows}
-    report.publish(out, "stability.json", found, page)
+    return {"flags": [_flags(name, rows) for name in methods.split(",")], "points": rows}
 
 
 def _pairs(
@@ -99,17 +89,16 @@ def _flags(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `stability.json`: error against the size of each disturbance."""
     panels = []
-    for disturbance in dict.fromkeys(p["disturbance"] for p in found["points"]):
-        curves = []
-        for name in dict.fromkeys(p["estimator"] for p in found["points"]):
-            own = [p for p in found["points"] if (p["disturbance"], p["estimator"]) == (disturbance, name)]
-            x, y = tuple(p["value"] for p in own), tuple(max(p["epe"], 1e-3) for p in own)
-            curves.append(report.Curve(name, x, y))
-        panels.append(report.Panel(disturbance, disturbance, "EPE mean [px]", tuple(curves), log_y=True))
+    points = [point | {"epe": max(point["epe"], 1e-3)} for point in found["points"]]  # for logarithms
+    for (disturbance,), some in report.grouped(points, "disturbance").items():
+        curves = tuple(
+            report.curve(name, own, "value", "epe")
+            for (name,), own in report.grouped(some, "estimator").items()
+        )
+        panels.append(report.Panel(disturbance, disturbance, "EPE mean [px]", curves, log_y=True))
     words = ["A frame is lost if its mean endpoint error exceeds 1 px, without masked pixels."]
     sections = [report.Section("Flags of lost frames", found["flags"])]
     return report.Page("Flow: limits", found, panels, sections, words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "flow/stability/stability.json", page)

@@ -1,22 +1,17 @@
-"""Motion in three dimensions from stereo: error, bias, z-scores and cost.
-
-Run: python -m evidence.flow.stereo data-640 data-320
-"""
+"""Motion in three dimensions from stereo: error, bias, z-scores and cost."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import cv2
 import numpy as np
-import torch
-import typer
 from numpy.typing import NDArray
 
 from evidence import report, status
+from evidence.study import Study
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.flow import mask_detection
@@ -35,14 +30,8 @@ Sample = tuple[Floats, Floats, Floats, Flags]
 """Visible tissue of one frame: true and recovered motion, deviation, (n, 3) mm; whether in contact (n,)."""
 
 
-def main(
-    data: Annotated[list[Path], typer.Argument(help="Stereo datasets, of seeds that were not tuned on.")],
-    count: Annotated[int, typer.Option(help="Sequences of each dataset.")] = 100,
-    out: Path = report.RESULTS / "flow/stereo",
-) -> None:
-    """Depth motion from stereo by resolution."""
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
+    """Depth motion from stereo by resolution, on `count` sequences of datasets that were not tuned on."""
     rows = []
     for root in data:
         dataset = Dataset(root)
@@ -54,8 +43,7 @@ def main(
             | figures([sample for one in measured for sample in one[0]])
             | {"cost_ratio": ratio, "epipolar_px": float(np.median([one[3] for one in measured]))}
         )
-    found = {"data": status.data(*data), "rows": rows}
-    report.publish(out, "stereo.json", found, page)
+    return {"data": status.data(*data), "rows": rows}
 
 
 def figures(samples: list[Sample]) -> dict[str, float]:
@@ -141,5 +129,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Stereo: motion in three dimensions", found, charts, sections, words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "flow/stereo/stereo.json", page, ("{stereo-640} {stereo-320}",))

@@ -2,10 +2,8 @@
 
 Mechanics by felupe (triquadratic bricks, compressible neo-Hookean, Hertz's pressure; a membrane as a net of
 trusses; a pulse applied to the ground), images by Blender's Cycles. This module contributes texture, the
-tool's shape and motion, the sensor and the folder's layout. docs/results/learn/foreign is then made by
-`bench score` and `bench pool`; without `right.mp4` a recording is monocular.
-
-Run: python -m evidence.foreign.recordings OUT --mechanics-python A/bin/python --pictures-python B/bin/python
+tool's shape and motion, the sensor and the folder's layout. They are scored by `bench score` and `bench pool`
+in stereo, and monocular without their right camera.
 """
 
 from __future__ import annotations
@@ -15,19 +13,22 @@ import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from bench.recording import writer
 from bench.recording.meta import read_meta
+from evidence import report
+from evidence.pooled import FOLDERS, score_and_pool
 from evidence.scoring.exvivo import ramp
+from evidence.study import Study
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import read_picture
@@ -42,31 +43,37 @@ _VIDEOS = {"": "video.mp4", "right-": "right.mp4"}  # prefix of a camera's image
 _HEART_HZ, _BREATH_HZ = 1.2, 0.25
 
 
-def main(
-    out: Annotated[Path, typer.Argument(help="Folder that gets the recordings.")],
-    mechanics_python: Annotated[Path, typer.Option(help="A Python that has felupe and pypardiso.")],
-    pictures_python: Annotated[Path, typer.Option(help="A Python that has bpy.")],
+def measure(
+    recordings: Path,
+    mechanics_python: Path,
+    pictures_python: Path,
     kinds: str = ",".join(KINDS),
-    count: Annotated[int, typer.Option(help="Of each kind.")] = 2,
-    seconds: Annotated[float, typer.Option(min=8.0)] = 8.0,
+    count: int = 3,
+    seconds: float = 8.0,
     fps: float = 3.0,
-    spp: Annotated[int, typer.Option(help="Light paths a pixel.")] = 24,
+    spp: int = 24,
     seed: int = 500,
-    left: Annotated[Path | None, typer.Option(help="Folder that gets monocular copies.")] = None,
+    results: Path = report.RESULTS / "learn/foreign",
 ) -> None:
-    """Makes recordings by felupe and Blender: plain, with a membrane, with a pulse."""
-    for kind in kinds.split(","):
-        for index in range(count):
-            folder = out / f"{kind}-{index}"
-            if not folder.exists():
-                with checked_file.folder_of(folder) as part:
-                    rng = np.random.default_rng([seed, KINDS.index(kind), index])
-                    pythons = mechanics_python, pictures_python
-                    record(part, folder.name, kind, rng, (seconds, fps, spp), pythons)
-            if left is not None and not (left / folder.name).exists():
-                with checked_file.folder_of(left / folder.name) as part:
-                    copy_left_camera(folder, part)
-            print(folder)
+    """Makes recordings in the folder `recordings`, and scores them into `results`.
+
+    `mechanics_python`, `pictures_python`: a Python with felupe and pypardiso, and one with bpy; `count`: of
+    each kind; `spp`: light paths a pixel.
+    """
+    folders = {cameras: list[Path]() for cameras in FOLDERS}
+    for kind, index in product(kinds.split(","), range(count)):
+        both, left = (recordings / FOLDERS[cameras] / f"{kind}-{index}" for cameras in (2, 1))
+        if not both.exists():
+            with checked_file.folder_of(both) as part:
+                rng = np.random.default_rng([seed, KINDS.index(kind), index])
+                record(part, both.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
+        if not left.exists():
+            with checked_file.folder_of(left) as part:
+                copy_left_camera(both, part)
+        folders[2].append(both)
+        folders[1].append(left)
+    for cameras, of in folders.items():
+        score_and_pool(of, cameras, results / FOLDERS[cameras])
 
 
 def copy_left_camera(recording: Path, part: Path) -> None:
@@ -92,18 +99,8 @@ def record(
     """
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
-    young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
-    contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
-    specimen = {
-        "block_mm": (90.0, 50.0),
-        "elements": (12, 7),
-        "levels": 3,
-        "young_kpa": young,
-        "poisson": float(rng.uniform(0.42, 0.48)),
-        "membrane_mn_per_mm": float(rng.uniform(5, 40)) if kind == "membrane" else 0.0,
-        "pulse_mm": float(rng.uniform(0.15, 0.4)) if kind == "pulse" else 0.0,
-        "contacts": contacts,
-    }
+    specimen = draw_specimen(kind, rng)
+    contacts = specimen["contacts"]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         surface = Surface.of(np.load(run(pythons[0], folder, "mechanics", specimen)), rng)
@@ -134,12 +131,28 @@ def record(
     about = {
         "stereo": {"calibration": "pair.yaml"},
         "scale_mm_per_px": _DISTANCE_MM / focal,
-        "young_kpa": young,
+        "young_kpa": specimen["young_kpa"],
         "specimen": name,
         "sensor": {"axes": "camera", "acts_on": "tissue", "free_s": [[0.1, _STILL_S - 0.2]]},
         "sync": {"method": "clock"},
     }
     writer.write_meta(part, about)
+
+
+def draw_specimen(kind: str, rng: np.random.Generator) -> dict[str, Any]:
+    """A specimen of a kind: its size, properties and contacts, as the worker's mechanics read them."""
+    young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
+    contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
+    return {
+        "block_mm": (90.0, 50.0),
+        "elements": (12, 7),
+        "levels": 3,
+        "young_kpa": young,
+        "poisson": float(rng.uniform(0.42, 0.48)),
+        "membrane_mn_per_mm": float(rng.uniform(5, 40)) if kind == "membrane" else 0.0,
+        "pulse_mm": float(rng.uniform(0.15, 0.4)) if kind == "pulse" else 0.0,
+        "contacts": contacts,
+    }
 
 
 def run(
@@ -334,5 +347,8 @@ def _sensed(picture: Path, rng: np.random.Generator) -> NDArray[np.uint8]:
     return np.asarray(np.clip(rgb + noise, 0, 255), np.uint8)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(
+    measure,
+    "learn/foreign/*/pool.json",
+    steps=("{work}/foreign {mechanics_python} {pictures_python}",),
+)

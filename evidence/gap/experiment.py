@@ -3,36 +3,40 @@
 Four trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the recovered
 flow's error (N), and a mixture. Each is tested on ideal and on recovered flow, in distribution and out of
 distribution (').
-
-Run: python -m evidence.gap.experiment DATASET --unseen OTHER --work runs/gap
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
-from evidence import report, status
-from evidence.folds import folds, nested
+from evidence import cache, report, status, training
+from evidence.datasets import recover_flow
 from evidence.gap import gap
-from evidence.gap.runs import KEYS, Training, carry_out, with_flow
+from evidence.intervals import difference
+from evidence.study import Study
 from learn.data.clips import Clip, load_clips
-from learn.evaluation.statistics import interval, paired
-from learn.settings import preset, replace
+from learn.data.grid import Grid
+from learn.evaluation.evaluate import evaluate
+from learn.evaluation.statistics import interval
+from learn.settings import TrainingSettings, preset
+from learn.settings import replace as changed
 from learn.split import Split, groups
-from learn.training.threads import set_threads
 from synth.dataset.store import Dataset
+from synth.dataset.store import Sequence as Stored
 from synth.errors import UserError
 
 Curve = NDArray[np.float64]
-KINDS = ("R", "N", "mixed")
+Errors = Mapping[str, Mapping[str, list[float | None]]]  # by test and metric, of each sequence
+Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
+KINDS = ("I", "R", "N", "mixed")
+KEYS = ("force_mae", "map_rmse")  # errors by sequence: total force [mN], density [mN/mm²]; the first decides
+_INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered", "mixed": "mixed"}
 _TESTS = {
     "I": "ideal flow",
     "R": "recovered flow",
@@ -42,66 +46,54 @@ _TESTS = {
 _UNIT = "mean error of the total force [mN]"
 
 
-def main(
-    dataset: Annotated[Path, typer.Argument(help="Dataset with recovered flow of the back end tvl1.")],
-    unseen: Annotated[Path, typer.Option(help="Dataset out of distribution, only tested on.")],
-    work: Annotated[Path, typer.Option(help="Folder for packed sequences, networks and errors.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "gap",
-    fit: Annotated[int | None, typer.Option(min=20, help="Use only so many sequences of `dataset`.")] = None,
-    flow: Annotated[list[str] | None, typer.Option(help="Back ends of the recovered flow.")] = None,
-    named: Annotated[str, typer.Option("--preset", help="Preset of `learn train`.")] = "tiny",
-    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; the preset's if not given.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Networks a training.")] = 2,
-) -> None:
-    """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise."""
-    set_threads(1)
-    settings = preset(named)
-    settings = replace(
-        settings,
-        arch=replace(settings.arch, output="magnitude"),  # the same metrics for all
-        epochs=epochs or settings.epochs,
+def measure(
+    dataset: Path,
+    unseen: Path,
+    work: Path = Path("runs/gap"),
+    fit: int = 300,
+    flow: str = "tvl1",
+    epochs: int = 24,
+    seeds: int = 1,
+) -> dict[str, Any]:
+    """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise.
+
+    `dataset`: with recovered flow of the back end tvl1, of which `fit` sequences are used; `unseen`: out of
+    distribution, only tested on; `work`: folder of intermediate results; `flow`: comma-separated back ends of
+    the recovered flow; `seeds`: networks a training.
+    """
+    tiny = preset("tiny", epochs=epochs)
+    settings = changed(tiny, arch=changed(tiny.arch, output="magnitude"))  # the same metrics for all
+    known, others = (
+        load_clips(root, settings.grid, ("ideal", "recovered"), cache=work) for root in (dataset, unseen)
     )
-    known = load_clips(dataset, settings.grid, ("ideal", "recovered"), cache=work)[:fit]
-    others = load_clips(unseen, settings.grid, ("ideal", "recovered"), cache=work)
+    known = known[:fit]
     split, own_test = parts(known, others)
     stored, clips = [*list(Dataset(dataset))[:fit], *Dataset(unseen)], [*known, *others]
-    runs: dict[Training, dict[str, Any]] = {}
-    for backend in flow or ["tvl1", "opencv-tvl1"]:
+    flows = {}
+    for backend in flow.split(","):
         used = clips
         if backend != "tvl1":
             pairs = zip(stored, clips, strict=True)
             used = [with_flow(s, c, backend, settings.grid, work) for s, c in pairs]
         ours, theirs = [used[i] for i in own_test], [used[i] for i in split.test]
         tests = {
-            "I": (ours, "ideal"),
-            "R": (ours, "recovered"),
-            "I'": (theirs, "ideal"),
-            "R'": (theirs, "recovered"),
+            name: (theirs if "'" in name else ours, "ideal" if name[0] == "I" else "recovered")
+            for name in _TESTS
         }
-        for kind in ("I", *KINDS):
-            for seed in range(seeds):
-                one = Training(kind, backend, seed)
-                typer.echo(f"{kind}, {backend}, seed {seed}", err=True)
-                runs[one] = carry_out(one, used, split, settings, tests, work)
+        seeded = [changed(settings, seed=seed) for seed in range(seeds)]
+        trained = {
+            kind: [errors(kind, backend, used, split, one, tests, work) for one in seeded] for kind in KINDS
+        }
+        flows[backend] = {"noise": asdict(fitted_noise(used, split.fit))} | summary(trained)
     sizes = (split.fit, split.select, own_test, split.test)
-    found: dict[str, Any] = {
+    return {
         "data": status.data(dataset, unseen),
         "settings": settings.model_dump(),
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen"), map(len, sizes), strict=True)),
         "seeds": seeds,
-        "flows": compared(runs),
+        "flows": flows,
     }
-    shown = {flow: _verdict(one) for flow, one in found["flows"].items()}
-    report.publish(out, "results.json", found, page, shown)
-
-
-def compared(runs: Mapping[Training, Mapping[str, Any]]) -> dict[str, Any]:
-    """Errors and shares of the gap of all trainings, by flow estimator."""
-    by: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-    for training, run in runs.items():
-        by.setdefault(training.flow, {}).setdefault(training.kind, []).append(run)
-    return {flow: _plain(summary(trained)) for flow, trained in by.items()}
 
 
 def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[int, ...]]:
@@ -110,60 +102,109 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     Raises:
         UserError: an anatomy is in both datasets, or too few sequences are left.
     """
-    aside = folds(clips, 5, 1)[0]
+    aside = training.folds(clips, 5, 1)[0]
     rest = [i for i in range(len(clips)) if i not in set(aside)]
-    inner = nested([clips[i] for i in rest], 5, 0, 0)
+    inner = training.nested([clips[i] for i in rest], 5, 0, 0)
     fit, select = (tuple(rest[i] for i in part) for part in ((*inner.fit, *inner.test), inner.select))
     number = groups([*clips, *unseen])
     if set(number[: len(clips)]) & set(number[len(clips) :]):
-        raise UserError("--unseen: shares an anatomy with the other dataset")
+        raise UserError("unseen: shares an anatomy with the other dataset")
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
 
 
-def summary(trained: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path) -> Clip:
+    """The clip with the flow recovered by another back end, as in the paper's pipeline, cached in `work`.
+
+    Only the instrument is masked, not highlights, as in masks drawn by hand.
+    """
+
+    def make() -> Clip:
+        return recover_flow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)[0]
+
+    key = cache.key(clip.content_hash, backend, grid.size, grid.extent_mm)
+    return cache.clip(work / "flow" / key, make)
+
+
+def fitted_noise(clips: Sequence[Clip], fit: Sequence[int]) -> gap.Noise:
+    """Noise of recovered flow, fitted on the clips `fit`."""
+    chosen = [clips[i] for i in fit]
+    ideal, recovered = (
+        [np.asarray(clip.displacement[name]) for clip in chosen] for name in ("ideal", "recovered")
+    )
+    return gap.fit_noise(ideal, recovered, [clip.mask for clip in chosen])
+
+
+def with_noise(clips: Sequence[Clip], noise: gap.Noise, seed: int) -> list[Clip]:
+    """Clips with recovered flow replaced by ideal flow plus noise."""
+    made = []
+    for k, clip in enumerate(clips):
+        rng = np.random.default_rng([seed, k])
+        noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
+        made.append(replace(clip, displacement={**clip.displacement, "recovered": noisy}))
+    return made
+
+
+def errors(
+    kind: str,
+    flow: str,
+    clips: Sequence[Clip],
+    split: Split,
+    settings: TrainingSettings,
+    tests: Tests,
+    work: Path,
+) -> Errors:
+    """Errors in every test of a network trained as one of `KINDS` on fit and select of `split`, cached."""
+    settings = changed(settings, input=_INPUTS[kind])
+    # Training on ideal flow doesn't depend on the tested flow estimator.
+    name = f"{kind}{'' if kind == 'I' else f'-{flow}'}-seed{settings.seed}"
+
+    def compute() -> Errors:
+        noise = fitted_noise(clips, split.fit) if kind == "N" else None
+        own = clips if noise is None else with_noise(clips, noise, settings.seed)
+        predictor = training.fit(name, own, split, settings, work / "models")
+        found = {test: evaluate(predictor, part, source).per_clip() for test, (part, source) in tests.items()}
+        return {test: {key: [row[key] for row in rows] for key in KEYS} for test, rows in found.items()}
+
+    used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
+    tested = {test: [clip.content_hash for clip in part] for test, (part, _) in tests.items()}
+    key = cache.key(name, settings.model_dump(), used, flow, tested)
+    done: Errors = cache.result(work / "runs", f"{kind}-{flow}-seed{settings.seed}", key, compute)
+    return done
+
+
+def summary(trained: Mapping[str, Sequence[Errors]]) -> dict[str, Any]:
     """Errors with intervals, and the share of the gap closed by each training, for every metric."""
-    out: dict[str, Any] = {
-        "noise": trained["N"][0]["noise"],
-        "errors": {},
-        "closed": {},
-        "noise_less_real": {},
-    }
+    out: dict[str, Any] = {"errors": {}, "closed": {}, "noise_less_real": {}}
     for key in KEYS:
-        of = {kind: {test: _errors(runs, test, key) for test in _TESTS} for kind, runs in trained.items()}
+        of: dict[str, dict[str, Curve]] = {  # means over seeds
+            kind: {
+                test: np.mean([np.array(run[test][key], float) for run in runs], axis=0) for test in _TESTS
+            }
+            for kind, runs in trained.items()
+        }
         out["errors"][key] = {
-            kind: {test: asdict(interval(values, np.random.default_rng(0))) for test, values in tests.items()}
+            kind: {test: asdict(interval(own, np.random.default_rng(0))) for test, own in tests.items()}
             for kind, tests in of.items()
         }
-        closed = {
-            kind: gap.closed(of["I"]["R'"], of[kind]["R'"], of["I"]["I'"], np.random.default_rng(0))
-            for kind in KINDS
+        out["closed"][key] = {
+            kind: asdict(gap.closed(of["I"]["R'"], of[kind]["R'"], of["I"]["I'"], np.random.default_rng(0)))
+            for kind in KINDS[1:]
         }
-        out["closed"][key] = {kind: asdict(value) for kind, value in closed.items()}
-        more = paired(of["R"]["R'"], of["N"]["R'"], np.random.default_rng(0)).difference
-        out["noise_less_real"][key] = (more.low, more.high)
+        out["noise_less_real"][key] = difference(of["R"]["R'"], of["N"]["R'"])[1:]
     return out
-
-
-def _errors(runs: Sequence[Mapping[str, Any]], test: str, key: str) -> Curve:
-    """Errors by sequence (S,), means over seeds."""
-    rows = [[math.nan if v is None else v for v in run["errors"][test][key]] for run in runs]
-    return np.asarray(np.mean(rows, axis=0), np.float64)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Errors of the trainings on the flow of recordings, and the tables."""
     bars, sections = [], []
     for group, (flow, one) in enumerate(found["flows"].items()):
-        for kind, test in (("I", "I'"), *((kind, "R'") for kind in ("I", *KINDS))):
+        for kind, test in (("I", "I'"), *((kind, "R'") for kind in KINDS)):
             value = one["errors"][KEYS[0]][kind][test]
             name = f"{flow}: {kind} on {_TESTS[test].split(',')[0]}"
             bars.append(report.Row(name, value["mean"], (value["low"], value["high"]), group))
         rows = [
             {"trained on": kind}
-            | {
-                _TESTS[test]: report.mean_cell([v[key] for key in ("mean", "low", "high")])
-                for test, v in tests.items()
-            }
+            | {_TESTS[test]: report.mean_cell([*value.values()][:3]) for test, value in tests.items()}
             | {"share of the gap closed": _closed(one["closed"][KEYS[0]].get(kind))}
             for kind, tests in one["errors"][KEYS[0]].items()
         ]
@@ -195,21 +236,10 @@ def _verdict(found: Mapping[str, Any]) -> str:
 
 
 def _closed(found: Mapping[str, Any] | None) -> str | None:
+    """A cell; None for the training that the gap is defined by."""
     if found is None:
         return None
-    if found["undefined"]:
-        return "undefined"
-    return report.percent([found["share"], *found["interval"]])
+    return "undefined" if found["undefined"] else report.percent([found["share"], *found["interval"]])
 
 
-def _plain(value: Any) -> Any:
-    """The value with None for NaN, which strict JSON parsers reject."""
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "gap/results.json", page, ("{mission} {mission-ood} --work {work}/gap",))

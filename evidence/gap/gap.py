@@ -20,8 +20,8 @@ _RESAMPLES = 2000
 class Gap:
     """Share of the gap closed by a training."""
 
-    share: float  # G = [e(I to R') - e(R to R')] / [e(I to R') - e(I to I)]; NaN when undefined
-    interval: Interval  # 95%, by resampling sequences in pairs
+    share: float | None  # G = [e(I to R') - e(R to R')] / [e(I to R') - e(I to I)]; None when undefined
+    interval: Interval | None  # 95%, by resampling sequences in pairs
     undefined: str  # why there is no share; empty if there is one
 
 
@@ -41,10 +41,9 @@ def closed(
     below = (ideal_on_unseen - ideal_on_ideal)[picks].mean(axis=1)
     above = (ideal_on_unseen - trained_on_unseen)[picks].mean(axis=1)
     low, high = (float(q) for q in np.quantile(below, [0.025, 0.975]))
-    nan = float("nan")
     if low <= 0 <= high or gap <= 0:
         reason = f"the gap's interval {low:.3g} to {high:.3g} touches zero: there may be none to close"
-        return Gap(nan, (nan, nan), reason)
+        return Gap(None, None, reason)
     share = float((ideal_on_unseen - trained_on_unseen).mean()) / gap
     ends = np.quantile(above / below, [0.025, 0.975])
     return Gap(share, (float(ends[0]), float(ends[1])), "")

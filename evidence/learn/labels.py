@@ -6,14 +6,13 @@ numbers), a core-second a sequence. Recovered flow is not available.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import cache as stored
+from evidence.datasets import coarser
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView, settled
 from synth.job.schema import Job
@@ -35,7 +34,7 @@ def clips(job: Job, grid: Grid, cache: Path) -> list[Clip]:
     fine = Grid(FINE, grid.extent_mm)
 
     def make(index: int) -> Clip:
-        return coarser(whole(job, index, fine, cache), fine, fine.size // grid.size)
+        return coarser(whole(job, index, fine, cache), fine.size // grid.size)
 
     folders = [cache / f"{key(job, index, fine)}-{grid.size}" for index in range(job.sequences)]
     return [stored.clip(folder, partial(make, index)) for index, folder in enumerate(folders)]
@@ -45,29 +44,6 @@ def whole(job: Job, index: int, grid: Grid, cache: Path) -> Clip:
     """One sequence with ideal flow on a grid, cached."""
     name = key(job, index, grid)
     return stored.clip(cache / name, lambda: clip(job, index, grid, name))
-
-
-def coarser(clip: Clip, grid: Grid, times: int) -> Clip:
-    """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
-
-    def blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
-        n = grid.size // times
-        pooled: NDArray[np.float32] = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
-        return pooled
-
-    cover = blocks(np.asarray(clip.mask))
-    mask = (cover > 0.5).astype(np.float32)
-    share = np.where(mask > 0, cover, np.float32(1))
-    density = blocks(np.asarray(clip.density))
-    return replace(
-        clip,
-        mask=mask,
-        displacement={
-            k: (blocks(np.asarray(v)) / share * mask).astype(np.float32) for k, v in clip.displacement.items()
-        },
-        confidence=blocks(np.asarray(clip.confidence)),
-        density=np.stack([settled(d, mask) for d in density]),
-    )
 
 
 def key(job: Job, index: int, grid: Grid) -> str:

@@ -1,11 +1,10 @@
 """Time and error of networks: each preset's and others on the same grid.
 
-Run: python -m evidence.learn.pareto --cache CACHE (an hour on a core); without a cache only times.
+An hour on a core; without --cache only times.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,17 +12,17 @@ from typing import Any
 
 import numpy as np
 import torch
-import typer
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
+from evidence.intervals import difference, mean_of
 from evidence.learn import labels
-from evidence.learn.runs import JOB, Run, by_sequence, carry_out, ends, pictured, study
+from evidence.learn.runs import JOB, Run, base_settings, by_sequence, carry_out, pictured
+from evidence.study import Study
 from learn.data.grid import Grid, Scales, channels
-from learn.evaluation.statistics import interval, paired
 from learn.network.d2fnet import Architecture, D2FNet, freeze, fused
 from learn.settings import PRESETS, replace
-from learn.training.threads import set_threads
 from synth.job import reader
 
 OTHERS: Mapping[str, tuple[tuple[int, int, int], ...]] = {
@@ -40,30 +39,24 @@ ROUNDS = 4  # of timing all networks in turn
 LIGHT = 5e9  # FLOP a frame up to which a network is timed `repeats` times
 
 
-def main(
-    cache: Path | None = None,
-    out: Path = report.RESULTS / "learn/pareto",
-    repeats: int = 30,
-    seeds: int = 2,
-    device: str = "cpu",
-) -> None:
+def measure(
+    cache: Path | None = None, repeats: int = 60, seeds: int = 1, device: str = "cpu"
+) -> dict[str, Any]:
     """Errors of networks trained in equal steps, and the time of one frame on one core or a GPU."""
-    set_threads(1)
     shapes = [(PRESETS[name].size, *shape) for name, group in OTHERS.items() for shape in group]
     known = {} if cache is None else errors(cache, seeds)
-    rows = measure([*shapes, *HEAVY], repeats, device)
-    found = {
+    rows = time_networks([*shapes, *HEAVY], repeats, device)
+    return {
         "device": device if device == "cpu" else torch.cuda.get_device_name(),
         "torch": torch.__version__,
         "data": status.data(JOB),
         "trained": {name: PRESETS[name].loss for name in OTHERS if known},
         "rows": [row | known.get(key(row), {}) for row in rows],
     }
-    report.publish(out, f"pareto-{device}.json", found, page)
 
 
 def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
-    """Errors of `OTHERS`, trained with their preset's loss and dropout and otherwise as `study`, fold 0.
+    """Errors of `OTHERS`, trained with the loss and dropout of their preset, else as `base_settings`, fold 0.
 
     Returns:
         By grid, width, stem and levels: `map_rmse` [mN/mm²] and `force_mae` [mN], means over sequences with
@@ -80,18 +73,17 @@ def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str,
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
         for shape, own in runs.items():
             rmse, force = by_sequence(own, "map_rmse"), by_sequence(own, "force_mae")
-            more = paired(base, rmse, np.random.default_rng(0)).difference
             found[(preset.size, *shape)] = {
-                "map_rmse": ends(interval(rmse, np.random.default_rng(0))),
-                "force_mae": ends(interval(force, np.random.default_rng(0))),
-                "against": [value / float(base.mean()) for value in ends(more)],
+                "map_rmse": mean_of(rmse),
+                "force_mae": mean_of(force),
+                "against": [value / float(base.mean()) for value in difference(base, rmse)],
                 "seeds": seeds,
             }
     return found
 
 
 def _run(name: str, shape: tuple[int, int, int], seed: int) -> Run:
-    preset, base = PRESETS[name], study()
+    preset, base = PRESETS[name], base_settings()
     width, stem, levels = shape
     arch = replace(base.arch, width=width, stem=stem, levels=levels, dropout=preset.arch.dropout)
     settings = replace(base, size=preset.size, loss=preset.loss, arch=arch, seed=seed)
@@ -113,7 +105,9 @@ def _shape(arch: Architecture) -> tuple[int, int, int]:
     return arch.width, arch.stem, arch.levels
 
 
-def measure(shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str) -> list[dict[str, Any]]:
+def time_networks(
+    shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str
+) -> list[dict[str, Any]]:
     """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
 
     CPU time on the CPU (without other processes), wall time on a GPU. Heavy networks are timed at least five
@@ -177,22 +171,9 @@ def parameters(model: nn.Module) -> int:
 
 def flops(arch: Architecture, size: int) -> float:
     """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
-    total = 0
-
-    def count(module: nn.Module, _: tuple[Tensor, ...], out: Tensor) -> None:
-        nonlocal total
-        if isinstance(module, nn.ConvTranspose2d):
-            taps = module.in_channels * math.prod(module.kernel_size) / math.prod(module.stride)
-            total += int(2 * taps * out.numel())
-        elif isinstance(module, nn.Conv2d):
-            total += 2 * module.in_channels * math.prod(module.kernel_size) * out.numel()
-
-    with torch.device("meta"):
-        model = D2FNet(arch).eval()
-        for module in model.modules():
-            module.register_forward_hook(count)
-        model(torch.zeros(1, len(arch.channels), size, size))
-    return float(total)
+    with torch.device("meta"), FlopCounterMode(display=False) as counter:
+        D2FNet(arch).eval()(torch.zeros(1, len(arch.channels), size, size))
+    return float(counter.get_total_flops())
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -222,8 +203,7 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
     """Paired differences from a preset, which are smaller than the spread over sequences."""
     own = [one for one in rows if one["size"] == PRESETS[name].size and "against" in one]
     curves = []
-    for stem in sorted({one["stem"] for one in own}):
-        part = [one for one in own if one["stem"] == stem]
+    for (stem,), part in sorted(report.grouped(own, "stem").items()):
         curves.append(
             report.Curve(
                 f"stem of {stem}",
@@ -241,5 +221,4 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
     )
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "learn/pareto/pareto.json", page, ("--cache {work}/labels",))

@@ -1,7 +1,7 @@
 """Comparison of losses: networks trained on labels without images, over seeds and folds, paired by sequence.
 
-Run: python -m evidence.learn.runs CACHE (9 trainings of 80 to 100 core-seconds on 300 sequences);
-with --sequences 1500 --folds 3 --seeds 1 each anatomy is tested once (350 core-seconds a training).
+9 trainings of 80 to 100 core-seconds on 300 sequences; with --sequences 1500 --folds 3 --seeds 1 each anatomy
+is tested once (350 core-seconds a training).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,17 @@ import typer
 from numpy.typing import NDArray
 
 from evidence import cache as stored
-from evidence import report, status
-from evidence.folds import nested
+from evidence import report, status, training
+from evidence.intervals import difference, mean_of
 from evidence.learn import labels
+from evidence.study import Study
 from learn.data.clips import Clip
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
-from learn.evaluation.statistics import Interval, interval, paired
-from learn.inference.predict import Predictor, load_model
+from learn.inference.predict import Predictor
 from learn.loss import Loss
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import Split
-from learn.training.threads import set_threads
-from learn.training.train import train
 from synth.job import reader
 from synth.job.schema import Job
 
@@ -47,7 +46,7 @@ SCORES = (
 """Metrics of a tested sequence; see `learn.evaluation.metrics`."""
 
 
-def study() -> TrainingSettings:
+def base_settings() -> TrainingSettings:
     """Training settings common to all comparisons, about a core-minute."""
     base = preset("tiny", epochs=8, loss="mse")
     return replace(base, arch=replace(base.arch, output="magnitude"))
@@ -62,27 +61,18 @@ class Run:
     fold: int = 0  # of three
 
 
-def main(
-    cache: Path,
-    out: Path = report.RESULTS / "learn/losses",
-    sequences: int = 300,
-    folds: int = 1,
-    seeds: int = 3,
-    epochs: int = 8,
-) -> None:
+def measure(
+    cache: Path, sequences: int = 300, folds: int = 1, seeds: int = 3, epochs: int = 8
+) -> dict[str, Any]:
     """Trains with every loss; `cache` gets packed sequences and networks, and completed runs are reused."""
-    set_threads(1)
     job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences})
-    clips = labels.clips(job, study().grid, cache)
+    clips = labels.clips(job, base_settings().grid, cache)
     runs: dict[str, list[dict[str, Any]]] = {}
-    for loss in LOSSES:
-        for fold in range(folds):
-            for seed in range(seeds):
-                settings = replace(study(), loss=loss, seed=seed, epochs=epochs)
-                one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings, fold), clips, cache)
-                runs.setdefault(loss, []).append(one)
-    found = {"data": status.data(JOB), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
-    report.publish(out, "losses.json", found, page)
+    for loss, fold, seed in product(LOSSES, range(folds), range(seeds)):
+        settings = replace(base_settings(), loss=loss, seed=seed, epochs=epochs)
+        one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings, fold), clips, cache)
+        runs.setdefault(loss, []).append(one)
+    return {"data": status.data(JOB), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -112,15 +102,10 @@ def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str
     found: dict[str, Any] = {"loss": name, "runs": len(runs), "map_r2_pooled": pooled, "against_mse": {}}
     for key in SCORES:
         own, other = by_sequence(runs, key), by_sequence(base, key)
-        found[key] = ends(interval(own, np.random.default_rng(0)))
+        found[key] = mean_of(own)
         if runs is not base:
-            found["against_mse"][key] = ends(paired(other, own, np.random.default_rng(0)).difference)
+            found["against_mse"][key] = difference(other, own)
     return found
-
-
-def ends(value: Interval) -> list[float]:
-    """Mean and interval as a list for JSON."""
-    return [value.mean, value.low, value.high]
 
 
 def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
@@ -148,15 +133,14 @@ def carry_out(run: Run, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
         rows = [{"name": c.name} | one for c, one in zip(found.clips, found.per_clip(), strict=True)]
         return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": spent}
 
-    done: dict[str, Any] = stored.result(cache / "runs", run.name, _key(run, clips), compute)
+    key = stored.key(run.settings.model_dump(), run.fold, [clip.content_hash for clip in clips])
+    done: dict[str, Any] = stored.result(cache / "runs", run.name, key, compute)
     return done
 
 
 def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
     """The run's network, trained unless it is in `cache`."""
-    model = cache / "models" / f"{run.name}-{_key(run, clips)}"
-    train(clips, _split(run, clips), run.settings, model)
-    return load_model(model)
+    return training.fit(run.name, clips, _split(run, clips), run.settings, cache / "models")
 
 
 def pictured(job: Job, size: int) -> Job:
@@ -168,12 +152,7 @@ def pictured(job: Job, size: int) -> Job:
 
 
 def _split(run: Run, clips: Sequence[Clip]) -> Split:
-    return nested(clips, 3, run.fold, 0)
+    return training.nested(clips, 3, run.fold, 0)
 
 
-def _key(run: Run, clips: Sequence[Clip]) -> str:
-    return stored.key(run.settings.model_dump(), run.fold, [clip.content_hash for clip in clips])
-
-
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "learn/losses/losses.json", page, ("{work}/labels",))

@@ -1,6 +1,5 @@
 """Errors of the pretrained networks in and out of distribution, and the coverage of their intervals.
 
-Run: python -m evidence.learn.shipped mission --model mono=MODEL --model stereo=MODEL --unseen mission-ood
 With `--pack` they are written into the package, each with a card of these figures.
 """
 
@@ -9,20 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from evidence import report, status
-from evidence.curves.estimators import figures, map_figures
+from evidence.curves.experiment import figures, map_figures
 from evidence.end_to_end import models
+from evidence.study import Study
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
-from learn.training.threads import set_threads
 from synth.errors import UserError
 
 _LEVEL = 0.9
@@ -38,26 +36,24 @@ _MONOCULAR = (
 )
 
 
-def main(
-    data: Path,
-    model: Annotated[list[str], typer.Option(help="NAME=FOLDER; may be repeated.")],
-    unseen: Annotated[list[Path], typer.Option(help="Datasets out of distribution.")] = [],  # noqa: B006
-    cache: Annotated[Path | None, typer.Option(help="Folder for packed arrays.")] = None,
-    pack: Annotated[bool, typer.Option("--pack", help="Write mono and stereo into the package.")] = False,
-    out: Path = report.RESULTS / "learn/shipped",
-) -> None:
-    """Errors and coverage of networks on the dataset `data`, which they were fitted on, and on others."""
-    set_threads(1)
+def measure(
+    data: list[Path], models: Path = shipped.MODELS, cache: Path | None = None, pack: bool = False
+) -> dict[str, Any]:
+    """Errors and coverage of networks on the first dataset, which they were fitted on, and on others.
+
+    `models`: folder of mono and stereo; `cache`: folder for packed arrays; `pack`: write the networks into
+    the package.
+    """
     rows = []
-    for name, folder in (word.split("=", 1) for word in model):
-        predictor = load_model(Path(folder))
-        own = [_row(predictor, root, cache) for root in (data, *unseen)]
+    for name in shipped.NAMES:
+        folder = models / name
+        predictor = load_model(folder)
+        own = [_row(predictor, root, cache) for root in data]
         rows += [{"model": name} | row for row in own]
-        if pack and name in shipped.NAMES:
+        if pack:
             limits = _LIMITS if predictor.card.settings.arch.depth else (*_LIMITS, *_MONOCULAR)
-            shipped.pack_model(Path(folder), shipped.MODELS / name, report.commit(), _listed(own), limits)
-    found = {"data": status.data(data, *unseen), "rows": rows}
-    report.publish(out, "shipped.json", found, page)
+            shipped.pack_model(folder, shipped.MODELS / name, report.commit(), _listed(own), limits)
+    return {"data": status.data(*data), "rows": rows}
 
 
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:
@@ -149,5 +145,4 @@ _ERRORS_ARE = (
 _COVERED_IS = "Share of frames whose true force lies inside, mean over sequences; nominal 90%."
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "learn/shipped/shipped.json", page, ("{mission} {mission-ood} --cache {work}/clips",))

@@ -1,12 +1,10 @@
-"""Divergence of trainings, and errors of a trained network with wrong motion, stiffness and scale.
-
-Run: python -m evidence.learn.stability CACHE
-"""
+"""Divergence of trainings, and errors of a trained network with wrong motion, stiffness and scale."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as changed
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,16 @@ import typer
 from scipy import ndimage
 
 from evidence import report, status
-from evidence.folds import nested
 from evidence.learn import labels
-from evidence.learn.runs import JOB, Run, carry_out, fit, study
+from evidence.learn.runs import JOB, Run, base_settings, carry_out, fit
+from evidence.study import Study
+from evidence.training import nested
 from learn.data.clips import Clip
 from learn.data.grid import Grid
 from learn.evaluation.evaluate import EvaluationReport, evaluate
 from learn.loss import Loss
 from learn.settings import replace
 from learn.split import Split
-from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.job import reader
 
@@ -34,17 +32,15 @@ NOISE = ((0.005, 0.0), (0.02, 0.0), (0.005, 1.0), (0.02, 1.0), (0.05, 1.0))
 """Size [mm] and blob scale [mm] of noise on the displacement."""
 
 
-def main(cache: Path, out: Path = report.RESULTS / "learn/stability", seeds: int = 5) -> None:
+def measure(cache: Path, seeds: int = 5) -> dict[str, Any]:
     """Divergence by learning rate and loss, and errors with disturbed inputs."""
-    set_threads(1)
-    clips = labels.clips(reader.load_job(str(JOB)), study().grid, cache)
+    clips = labels.clips(reader.load_job(str(JOB)), base_settings().grid, cache)
     split = nested(clips, 3, 0, 0)
-    found = {
+    return {
         "data": status.data(JOB),
         "rates": rates(clips, cache, seeds),
         "disturbed": [row for name in LOSSES[::2] for row in disturbed(clips, split, name, cache)],
     }
-    report.publish(out, "stability.json", found, page)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -66,27 +62,27 @@ def page(found: Mapping[str, Any]) -> report.Page:
 def rates(clips: Sequence[Clip], cache: Path, seeds: int) -> list[dict[str, Any]]:
     """Rows by learning rate and loss; a run diverges if it stops with an error, or ends with R² below 0."""
     rows = []
-    base = replace(study(), epochs=2, arch=replace(study().arch, width=8, stem=4, levels=2))
-    for rate in RATES:
-        for loss in LOSSES:
-            scores = []
-            for seed in range(seeds):
-                settings = replace(base, learning_rate=rate, loss=loss, seed=seed)
-                try:
-                    run = Run(f"rate{rate:g}-{loss}-seed{seed}", settings)
-                    scores.append(carry_out(run, clips, cache)["map_r2_pooled"])
-                except UserError as stopped:
-                    typer.echo(str(stopped), err=True)
-            diverged = seeds - sum(score > 0 for score in scores)
-            row = {"learning rate": rate, "loss": loss, "seeds": seeds, "diverged": diverged}
-            spread = float(np.std(scores, ddof=1)) if len(scores) > 1 else None
-            rows.append(row | {"R², mean": float(np.mean(scores)) if scores else None, "spread (sd)": spread})
+    usual = base_settings()
+    base = replace(usual, epochs=2, arch=replace(usual.arch, width=8, stem=4, levels=2))
+    for rate, loss in product(RATES, LOSSES):
+        scores = []
+        for seed in range(seeds):
+            settings = replace(base, learning_rate=rate, loss=loss, seed=seed)
+            try:
+                run = Run(f"rate{rate:g}-{loss}-seed{seed}", settings)
+                scores.append(carry_out(run, clips, cache)["map_r2_pooled"])
+            except UserError as stopped:
+                typer.echo(str(stopped), err=True)
+        diverged = seeds - sum(score > 0 for score in scores)
+        row = {"learning rate": rate, "loss": loss, "seeds": seeds, "diverged": diverged}
+        spread = float(np.std(scores, ddof=1)) if len(scores) > 1 else None
+        rows.append(row | {"R², mean": float(np.mean(scores)) if scores else None, "spread (sd)": spread})
     return rows
 
 
 def disturbed(clips: Sequence[Clip], split: Split, name: Loss, cache: Path) -> list[dict[str, Any]]:
     """Rows of the tested sequences with a wrong E, noise on the motion, a wrong scale, no motion."""
-    predictor = fit(Run(f"{name}-fold0-seed0", replace(study(), loss=name)), clips, cache)
+    predictor = fit(Run(f"{name}-fold0-seed0", replace(base_settings(), loss=name)), clips, cache)
     test, rng = [clips[i] for i in split.test], np.random.default_rng(3)
     plain = evaluate(predictor, test, "ideal")
     rows = {"undisturbed": numbers(plain)}
@@ -152,5 +148,4 @@ def still(clip: Clip) -> Clip:
     return changed(empty, displacement={"ideal": nothing})
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "learn/stability/stability.json", page, ("{work}/labels",))

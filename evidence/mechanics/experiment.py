@@ -2,85 +2,176 @@
 
 Ridge is fitted on plain tissue and tested in every other condition, on scenes with other anatomies; then the
 same after fitting on the mixture of all. Each condition is compared with the plain one on the same scenes.
-
-Run: python -m evidence.mechanics.experiment --fit 14 --test 4 --out runs/mechanics
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
-import typer
-from joblib import Parallel, delayed
-
-from evidence import report
+from bench.methods.baselines import GRID
+from evidence import datasets, report
+from evidence.datasets import coarser
 from evidence.end_to_end import models
 from evidence.end_to_end.models import RIDGE, Estimate
-from evidence.mechanics.conditions import CONDITIONS, MIXTURE, PLAIN, Scenes, coarse, rendered
+from evidence.intervals import difference, mean_of
+from evidence.study import Study
+from learn.data import clips as data
 from learn.data.clips import Clip
-from learn.evaluation.statistics import Interval, interval, paired
+from synth.dataset import location
+from synth.dataset.folder import write_whole
+from synth.errors import UserError
+from synth.job.schema import Job
+
+FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000  # 1 s, one or two periods of the heart
+
+PLAIN = "plain"
+_UNTOUCHED = 1e-6  # load of a tool without effect
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Mechanical properties of tissue."""
+
+    fem: Mapping[str, Any] = field(default_factory=dict)  # job keys in addition to the common ones
+    removed: bool = (
+        False  # whether the untouched tissue's motion is subtracted, as by a perfect pulse removal
+    )
+    mixed: bool = True  # whether it is in the mixture
+
+
+_SOFT = {"probability": 1.0, "young_kpa": 100.0, "thickness_mm": 0.05}
+_STIFF = {"probability": 1.0, "young_kpa": 1000.0, "thickness_mm": 0.2}
+_PULSE = {"pulse": {"heart_mm": [0.1, 0.5], "breath_mm": [0.1, 1.0]}}
+_ALIVE = _PULSE | {"membrane": {"probability": 1.0}}
+
+CONDITIONS: dict[str, Condition] = {
+    PLAIN: Condition(),
+    "membrane, 5 mN/mm": Condition({"membrane": _SOFT}),
+    "membrane, 200 mN/mm": Condition({"membrane": _STIFF}),
+    "pulse": Condition(_PULSE),
+    "pulse, removed": Condition(_PULSE, removed=True, mixed=False),
+    "Poisson 0.49": Condition({"poisson": 0.49}),
+    "slip at the skull": Condition({"skull": "slip"}),
+    "in vivo": Condition(_ALIVE, mixed=False),
+    "in vivo, removed": Condition(_ALIVE, removed=True, mixed=False),
+}
+"""All tested conditions. The membranes are the ends of the job's range of thickness times modulus; `in vivo`
+is membrane and pulse together, as in the job of that name, and not in the mixture."""
+
+MIXTURE = [name for name, one in CONDITIONS.items() if one.mixed]
+
+
+def job(fem: Mapping[str, Any], seed: int, count: int, alone: bool = False) -> Job:
+    """The job of sequences with some mechanics; if `alone` the tool has no effect."""
+    return Job.model_validate(
+        {
+            "seed": seed,
+            "sequences": count,
+            "frames": FRAMES,
+            "fps": FPS,
+            "anatomy": {"vertices": VERTICES},
+            # The law of the default job, for every load.
+            "fem": {"gestures": ["pull", "push"], "law": "neo-hookean", **fem}
+            | ({"load": _UNTOUCHED} if alone else {}),
+            "render": {"size": SIZE, "spp": 1 if alone else 4},
+            "flow": {"backend": "ideal" if alone else "tvl1"},
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Sequences of one seed in every condition, rendered and packed when they are first used."""
+
+    seed: int
+    count: int
+    work: Path
+
+    def clip(self, name: str, index: int) -> Clip | str:
+        """A sequence of a condition, with ideal and recovered displacement, or why it was refused."""
+        one = CONDITIONS[name]
+        clip = self._packed(one.fem, index)
+        if not one.removed or isinstance(clip, str):
+            return clip
+        own = self._packed(one.fem, index, alone=True)
+        return own if isinstance(own, str) else subtracted(clip, own)
+
+    def _packed(self, fem: Mapping[str, Any], index: int, alone: bool = False) -> Clip | str:
+        wanted = job(fem, self.seed, self.count, alone)
+        folder = datasets.folder_of(wanted, "alone" if alone else "sequences", self.work)
+        packed, refused = folder / f"{index:06d}", folder / f"{index:06d}.refused"
+        if refused.is_file():
+            return refused.read_text("utf-8")
+        if not packed.is_file():
+            try:
+                sequence = datasets.render(wanted, index, folder)
+            except UserError as refusal:
+                write_whole(refused, str(refusal), durable=False)
+                return str(refusal)
+            data.pack(data.read_clip(sequence, GRID, ("ideal",) if alone else ("ideal", "recovered")), packed)
+            shutil.rmtree(location.store(folder, index))
+        return data.unpack(packed)
+
+
+def subtracted(clip: Clip, own: Clip) -> Clip:
+    """A clip less the tissue's own motion, the ideal displacement of `own`, in every frame.
+
+    This is the exact removal of pulse and respiration, except that displacements don't add linearly in large
+    strains.
+    """
+    pulse = own.displacement["ideal"]
+    return replace(
+        clip,
+        content_hash=f"{clip.content_hash}-{own.content_hash}",
+        displacement={name: moved - pulse for name, moved in clip.displacement.items()},
+    )
+
 
 ON_PLAIN, ON_MIXTURE = "plain", "mixture"
 PARTS = {"across": "the force across the line of sight", "whole": "the force"}
 Errors = list[float | None]  # of every sequence [%]; None: refused
 
 
-def main(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "mechanics",
-    work: Annotated[Path, typer.Option(help="Folder of sequences; a later run continues.")] = Path(
-        "runs/mechanics-work"
-    ),
-    fit: Annotated[int, typer.Option(min=14, help="Sequences to fit on, plain and mixture each.")] = 35,
-    test: Annotated[int, typer.Option(min=3, help="Sequences to test on, in every condition.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 41,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-) -> None:
-    """Error of a force estimator fitted on plain tissue, with other mechanics."""
+def measure(
+    work: Path = Path("runs/mechanics"), fit: int = 35, test: int = 12, seed: int = 41
+) -> dict[str, Any]:
+    """Error of a force estimator fitted on plain tissue, with other mechanics.
+
+    `work`: folder of sequences, from which a later run continues; `fit`: sequences to fit on, plain and
+    mixture each, at least 14; `test`: sequences to test on in every condition, at least 3.
+    """
     fitted, tested = Scenes(seed, fit, work), Scenes(seed + 1, test, work)
-    wanted = [(tested, one, k) for name in CONDITIONS for one in rendered(name) for k in range(test)]
-    wanted += [(fitted, name, k) for k in range(fit) for name in (PLAIN, mixed(k))]
-    wanted = list(dict.fromkeys(wanted))
-    made = Parallel(workers, verbose=5)(delayed(scenes.make)(name, k) for scenes, name, k in wanted)
-    found = {
+    mixed = [MIXTURE[k % len(MIXTURE)] for k in range(fit)]  # each in turn
+    used = {(tested, name, k): tested.clip(name, k) for name, k in product(CONDITIONS, range(test))}
+    used |= {(fitted, name, k): fitted.clip(name, k) for k in range(fit) for name in (PLAIN, mixed[k])}
+    refused = {where: clip for where, clip in used.items() if isinstance(clip, str)}
+    known = {where: clip for where, clip in used.items() if not isinstance(clip, str)}
+    rows = []
+    for on, names in ((ON_PLAIN, [PLAIN] * fit), (ON_MIXTURE, mixed)):
+        clips = [known.get((fitted, name, k)) for k, name in enumerate(names)]
+        estimate = build([clip for clip in clips if clip is not None])
+        for name in CONDITIONS:
+            errors = _errors(estimate, [known.get((tested, name, k)) for k in range(test)])
+            rows.append({"model": RIDGE, "fit": on, "condition": name} | errors)
+    return {
         "seed": seed,
         "fitted": {"sequences": fit, "mixture": MIXTURE},
         "refused": sorted(
-            f"{name}, seed {scenes.seed}, sequence {k}: {why}"
-            for (scenes, name, k), why in zip(wanted, made, strict=True)
-            if why
+            f"{name}, seed {of.seed}, sequence {k}: {why}" for (of, name, k), why in refused.items()
         ),
-        "rows": measure(fitted, tested),
+        "rows": rows,
     }
-    shown = {one.heading: one.rows for one in page(found).sections if one.rows}
-    report.publish(out, "results.json", found, page, shown)
-
-
-def mixed(index: int) -> str:
-    """The condition of a sequence of the mixture: each in turn."""
-    return MIXTURE[index % len(MIXTURE)]
-
-
-def measure(fitted: Scenes, tested: Scenes) -> list[dict[str, Any]]:
-    """A row for each fit and condition: errors by sequence, relative to the force [%]."""
-    tests = {name: [tested.clip(name, k) for k in range(tested.count)] for name in CONDITIONS}
-    rows = []
-    for fit in (ON_PLAIN, ON_MIXTURE):
-        clips = [fitted.clip(mixed(k) if fit == ON_MIXTURE else PLAIN, k) for k in range(fitted.count)]
-        estimate = build([clip for clip in clips if clip is not None])
-        rows += [
-            {"model": RIDGE, "fit": fit, "condition": name} | _errors(estimate, some)
-            for name, some in tests.items()
-        ]
-    return rows
 
 
 def build(fit: Sequence[Clip]) -> Estimate:
     """Ridge on cells of twice the size, which suffice for a linear rule."""
-    ridge = models.build(RIDGE, [coarse(clip) for clip in fit])
-    return lambda clip: ridge(coarse(clip))
+    ridge = models.build(RIDGE, [coarser(clip) for clip in fit])
+    return lambda clip: ridge(coarser(clip))
 
 
 def _errors(estimate: Estimate, clips: Sequence[Clip | None]) -> dict[str, Errors]:
@@ -104,16 +195,16 @@ def page(found: Mapping[str, Any]) -> report.Page:
             table.append(
                 {
                     "condition": name,
-                    "fitted on plain [%]": _cell(interval(_array(own), np.random.default_rng(0))),
-                    "difference from plain": None if name == PLAIN else _cell(_more(plain, own), "+"),
-                    "fitted on mixture, difference": _cell(_more(own, mixture), "+"),
+                    "fitted on plain [%]": report.mean_cell(mean_of(own), ".0f"),
+                    "difference from plain": None if name == PLAIN else _more(plain, own),
+                    "fitted on mixture, difference": _more(own, mixture),
                 }
             )
             for group, values in enumerate((own, mixture) if part == "across" else ()):
-                more, on = _more(plain, values), ("plain", "the mixture")[group]
-                bars.append(report.Row(f"{name}, fitted on {on}", more.mean, (more.low, more.high), group))
-                if more.low > 0 and group == 0:
-                    hurt.append(f"{name} ({more.mean:+.0f} points)")
+                (mean, low, high), on = difference(plain, values), ("plain", "the mixture")[group]
+                bars.append(report.Row(f"{name}, fitted on {on}", mean, (low, high), group))
+                if low > 0 and group == 0:
+                    hurt.append(f"{name} ({mean:+.0f} points)")
         sections.append(report.Section(f"Error of {what}", table))
     refused = [f"- {line}" for line in found["refused"]]
     return report.Page(
@@ -136,18 +227,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
     )
 
 
-def _array(values: Errors) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Errors as an array, NaN for a refused sequence."""
-    return np.array([np.nan if value is None else value for value in values])
+def _more(usual: Errors, other: Errors) -> str:
+    return report.mean_cell(difference(usual, other), "+.0f")
 
 
-def _more(usual: Errors, other: Errors) -> Interval:
-    return paired(_array(usual), _array(other), np.random.default_rng(0)).difference
-
-
-def _cell(one: Interval, sign: str = "") -> str:
-    return report.mean_cell([one.mean, one.low, one.high], f"{sign}.0f")
-
-
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "mechanics/results.json", page, ("--work {work}/mechanics",))

@@ -10,9 +10,9 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import numpy.typing as npt
-import typer
 
 from evidence import report
+from evidence.study import Study
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
 from synth.render import instrument
@@ -52,7 +52,7 @@ _SCENERY: dict[str, Kind] = {
 _CAPTION_PX = 15
 
 
-def main(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, quality: int = 46) -> None:
+def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, quality: int = 46) -> None:
     """Draws families x instruments and lights x cameras as the images of docs/gallery.md.
 
     `width`: of a tile [px]; `quality`: of WebP.
@@ -119,5 +119,4 @@ def _merged(*parts: Settings) -> Settings:
     return whole
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure)

@@ -6,16 +6,15 @@ import time
 from collections.abc import Mapping
 from inspect import signature
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import typer
 
 from evidence import report
 from evidence.render.case import Case, case
+from evidence.study import Study
 from synth.job.schema import Job, RenderSection
 from synth.render.scene import Renderer
 
@@ -31,14 +30,13 @@ _DEFAULT = (
 _INTEGRATORS = ("direct", "path3")
 
 
-def main(
-    out: Path = report.RESULTS / "render/pareto",
+def measure(
     spp: str = "1,2,4,8,16",
-    width: str = "640,320",
+    width: str = "640,256",
     vertices: str = "6000,12000,40000",
     frames: int = 12,
     seed: int = 11,
-) -> None:
+) -> dict[str, Any]:
     """Flow error and noise of rendered frames against the CPU time that they took.
 
     `spp`: light paths a pixel; `width`: of the image, 4:3; `vertices`: of the surface, in addition to the
@@ -53,18 +51,17 @@ def main(
         for paths, kind in settings:
             row = {"spp": paths, "integrator": kind, "width": wide}
             row["default"] = (paths, kind, wide) == _DEFAULT
-            rows.append(row | {"vertices": len(ours.vertices)} | measure(ours, paths, kind))
+            rows.append(row | {"vertices": len(ours.vertices)} | measure_setting(ours, paths, kind))
         for count in (int(part) for part in vertices.split(",")):
             other = case(Job.model_validate(sections | {"anatomy": {"vertices": count}}), 0)
             row = dict(zip(("spp", "integrator", "width"), (*_DEFAULT[:2], wide), strict=True))
             row |= {"default": False, "vertices": len(other.vertices)}
-            rows.append(row | measure(other, *_DEFAULT[:2]))
+            rows.append(row | measure_setting(other, *_DEFAULT[:2]))
     cost = frame_cost(case(Job(seed=seed), 0), frames)
-    found = {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
-    report.publish(out, "pareto.json", found, page)
+    return {"seed": seed, "lift_mm": _LIFT, "rows": rows, "frame": cost}
 
 
-def measure(ours: Case, spp: int, kind: str) -> dict[str, float]:
+def measure_setting(ours: Case, spp: int, kind: str) -> dict[str, float]:
     """CPU seconds an image, its noise, and the error of DIS flow for a pull of 1.5 mm.
 
     Noise is measured on two images of the tissue (`noises`), flow error over visible tissue away from the
@@ -117,10 +114,6 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
     return {"cpu_s_least": low, "cpu_s_median": middle, "cpu_s_most": high}
 
 
-def _curve_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return row["width"], row["integrator"], row["vertices"]
-
-
 def page(found: Mapping[str, Any]) -> report.Page:
     """Flow error and noise against time."""
     panels = []
@@ -129,25 +122,18 @@ def page(found: Mapping[str, Any]) -> report.Page:
         ("noise", "noise / mean"),
         ("noise_clipped", "noise / mean, clipped"),
     ):
-        curves = []
-        for kind in dict.fromkeys(_curve_of(r) for r in found["rows"]):
-            own = [r for r in found["rows"] if _curve_of(r) == kind]
-            curves.append(
-                report.Curve(
-                    f"{kind[1]}, {kind[0]} px, {kind[2]} vertices",
-                    tuple(float(r["cpu_s"]) for r in own),
-                    tuple(float(r[key]) for r in own),
-                    tuple(f"{r['spp']} spp" for r in own),
-                    ringed=tuple(k for k, r in enumerate(own) if r["default"]),
-                )
-            )
+        curves = tuple(
+            report.curve(f"{kind}, {width} px, {vertices} vertices", own, "cpu_s", key, "{spp} spp")
+            for (width, kind, vertices), own in report.grouped(
+                found["rows"], "width", "integrator", "vertices"
+            ).items()
+        )
         panels.append(
-            report.Panel(f"Render: {unit}", "CPU s a picture", unit, tuple(curves), True, True, front=True)
+            report.Panel(f"Render: {unit}", "CPU s a picture", unit, curves, True, True, front=True)
         )
     tables = [report.Section("All settings", found["rows"])]
     tables += [report.Section("A whole frame", [found["frame"]])] if "frame" in found else []
     return report.Page("Rendering: flow error and noise against time", found, panels, tables)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "render/pareto/pareto.json", page)

@@ -1,7 +1,4 @@
-"""Image statistics of renderings against a photograph, which is not stored.
-
-Run: python -m evidence.render.realism cortex.jpg
-"""
+"""Image statistics of renderings against a photograph, which is not stored."""
 
 from __future__ import annotations
 
@@ -11,12 +8,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import typer
+from numpy.typing import NDArray
 
 from evidence import report, status
 from evidence.render import picture_statistics
 from evidence.render.case import case
 from evidence.render.picture_statistics import Picture
+from evidence.study import Study
 from synth.errors import UserError
 from synth.job.schema import Job
 
@@ -28,15 +26,14 @@ OUTLINE = (
 """Of the cortex in the photograph of the stored results."""
 
 
-def main(
+def measure(
     photo: Path,
-    out: Path = report.RESULTS / "render/realism",
     outline: str = OUTLINE,
     width_mm: float = 110.0,
     frames: int = 12,
     family: str = "healthy",
     seed: int = 11,
-) -> None:
+) -> dict[str, Any]:
     """Colour, spectrum, gradients and highlights of rendered frames against crops of a photograph.
 
     `outline`: polygon of the cortex in it, as shares "x,y x,y ..."; `width_mm`: width of the photograph in
@@ -57,7 +54,7 @@ def main(
         }
         for name in theirs
     ]
-    found = {
+    return {
         "data": status.data(photo),
         "family": family,
         "seed": seed,
@@ -66,7 +63,6 @@ def main(
         "mm_per_px": pixel,
         "statistics": rows,
     }
-    report.publish(out, "realism.json", found, page)
 
 
 def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float]:
@@ -74,15 +70,21 @@ def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float
     job = Job.model_validate({"seed": seed, "appearance": {"families": [family]}, "render": {"tool": False}})
     crops, pixels = [], []
     for index in range(frames):
-        bare = case(job, index)
-        picture = bare.renderer.render(bare.state(), seed + index).rgb
-        inside = cv2.erode(bare.renderer.rest.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        picture, inside, mm_per_px = bare_picture(job, index)
         crops += picture_statistics.tiles(picture, inside, _SIDE, _STEP)
-        pixels.append(bare.renderer.rest.scale_mm_per_px)
+        pixels.append(mm_per_px)
     return crops, float(np.median(pixels))
 
 
-def outlined(outline: str, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def bare_picture(job: Job, index: int) -> tuple[Picture, NDArray[np.bool_], float]:
+    """First frame of a sequence, its tissue less a rim of 4 px, and its scale [mm per px]."""
+    one = case(job, index)
+    rest = one.renderer.rest
+    inside = cv2.erode(rest.tissue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    return one.renderer.render(one.state(), index).rgb, inside, rest.scale_mm_per_px
+
+
+def outlined(outline: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Pixels (H, W) inside a polygon in shares of the image, "x,y x,y ..."."""
     corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
     inside = np.zeros(shape, np.uint8)
@@ -115,5 +117,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Renderings against a photograph", found, [chart], sections, words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "render/realism/realism.json", page, ("{photo}",))

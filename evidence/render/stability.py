@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import typer
 
 from evidence import report
 from evidence.render.case import Case, case
+from evidence.study import Study
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.render.scene import SceneState
@@ -19,7 +18,7 @@ from synth.render.scene import SceneState
 Changes = dict[str, Any]
 
 
-def main(out: Path = report.RESULTS / "render/stability", seed: int = 11) -> None:
+def measure(seed: int = 11) -> dict[str, Any]:
     """Steep folds, grazing views, extreme sizes: a correct frame or a clear error."""
     rows: list[dict[str, Any]] = []
     for name, (sections, change) in CASES.items():
@@ -30,10 +29,7 @@ def main(out: Path = report.RESULTS / "render/stability", seed: int = 11) -> Non
         except UserError as error:
             row = {"outcome": "clear error", "error": str(error)}
         rows.append({"case": name, "passed": row.get("worst_px", 0.0) < 1e-2, **row})
-    found = {"seed": seed, "cases": rows}
-    report.publish(out, "stability.json", found, page)
-    if not all(row["passed"] for row in rows):
-        raise typer.Exit(1)
+    return {"seed": seed, "cases": rows}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -100,5 +96,4 @@ CASES: dict[str, tuple[Changes, Callable[[Case], Changes] | None]] = {
 }
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "render/stability/stability.json", page)

@@ -1,7 +1,4 @@
-"""Time and memory of `bench score` on a synthetic recording of a minute.
-
-Run: python -m evidence.scoring.cost MODEL
-"""
+"""Time and memory of `bench score` on a synthetic recording of a minute."""
 
 from __future__ import annotations
 
@@ -12,15 +9,15 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from bench.recording import writer
 from evidence import report, status
+from evidence.study import Study
 from synth.errors import UserError
 
 Rgb = NDArray[np.uint8]
@@ -29,12 +26,8 @@ _SENSOR_HZ = 200.0
 _FPS, _SIZE = 30.0, (680, 480)
 
 
-def main(
-    model: Annotated[Path, typer.Argument(help="Model folder of `learn train`.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "scoring",
-    seconds: Annotated[float, typer.Option(min=2, help="Length of the recording.")] = 60.0,
-) -> None:
-    """Time and memory of `bench score` on a recording of a moved texture."""
+def measure(model: Path, seconds: float = 60.0) -> dict[str, Any]:
+    """Time and memory of `bench score` with a model folder, on a recording of a moved texture."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch, "recording")
         record(folder, seconds)
@@ -45,7 +38,7 @@ def main(
         if done.returncode:
             raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
         scored = json.loads(Path(scratch, "score.json").read_text())
-    found = {
+    return {
         "data": status.data(model),
         "seconds": seconds,
         "fps": _FPS,
@@ -54,7 +47,6 @@ def main(
         "wall_s": wall,
         "timings": scored["timings"],
     }
-    report.publish(out, "results.json", found, page)
 
 
 def record(folder: Path, seconds: float) -> None:
@@ -117,5 +109,4 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     )
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "scoring/results.json", page, ("learn/models/mono",))

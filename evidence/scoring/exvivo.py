@@ -2,9 +2,7 @@
 
 They have creep under load, another appearance family, lens, field and tilt, a compressed video, hand tremor,
 presses at several places, and a sensor with its own axes, clock, zero, drift and noise. The layout is that of
-a real recording.
-
-Run: python -m evidence.scoring.exvivo --out recordings --count 2 --seconds 10
+a real recording; they are scored by `bench score` and `bench pool`.
 """
 
 from __future__ import annotations
@@ -12,15 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.recording import writer
+from evidence import report
+from evidence.pooled import FOLDERS, score_and_pool
+from evidence.study import Study
 from synth.errors import UserError
 from synth.fem import solver, tool_gesture
 from synth.fem.deformation import Deformation
@@ -47,25 +46,30 @@ _PRESS_S = 13.0
 _LATE, _LATE_S = 0.2, 0.8  # creep: delayed share of the response, and its time constant [s]
 
 
-def main(
-    out: Annotated[Path, typer.Option(help="Folder that gets the recordings.")],
-    count: Annotated[int, typer.Option(min=1, help="How many recordings.")] = 6,
-    seconds: Annotated[float, typer.Option(help="Length of each.")] = 30.0,
-    fps: Annotated[float, typer.Option(min=1.0, help="Mean frames a second.")] = 10.0,
-    width: Annotated[int, typer.Option(min=64, help="Width of the image; the height is 3/4 of it.")] = 320,
-    photo: Annotated[Path | None, typer.Option(help="A photograph as texture of the surface.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 100,
-    cameras: Annotated[int, typer.Option(min=1, max=2, help="1: monocular, 2: stereo.")] = 1,
+def measure(
+    recordings: Path,
+    count: int = 6,
+    seconds: float = 30.0,
+    fps: float = 10.0,
+    width: int = 320,
+    photo: Path | None = None,
+    seed: int = 100,
+    cameras: int = 1,
+    results: Path = report.RESULTS / "exvivo",
 ) -> None:
-    """Renders ex vivo stand-ins, which differ from all training data in every respect."""
+    """Renders ex vivo stand-ins into the folder `recordings` and scores them into `results`.
+
+    `seconds`: length of each; `fps`: mean frames a second; `width`: of the image, 4:3; `photo`: a photograph
+    as texture of the surface; `cameras`: 1, monocular, or 2, stereo.
+    """
     texture = photo.resolve() if photo else None
     plan = Plan(seed, seconds, fps, (width, width * 3 // 4), texture, cameras)
-    for index in range(count):
-        folder = out / f"{index:03d}"
+    folders = [recordings / f"{index:03d}" for index in range(count)]
+    for index, folder in enumerate(folders):
         if not folder.exists():
             with counting(f"recording {index}", int(seconds * fps)) as progress:
                 make(plan, index, folder, progress)
-        print(folder)
+    score_and_pool(folders, cameras, results / FOLDERS[cameras])
 
 
 @dataclass(frozen=True)
@@ -272,5 +276,11 @@ def ramp(s: Floats) -> Floats:
     return np.asarray(s * s * (3 - 2 * s), np.float64)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(
+    measure,
+    "exvivo/*/pool.json",
+    steps=tuple(
+        f"{{work}}/exvivo-{folder} --photo {{photo}} --cameras {cameras}"
+        for cameras, folder in FOLDERS.items()
+    ),
+)

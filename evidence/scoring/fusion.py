@@ -3,8 +3,6 @@
 Force is estimated from every sequence's stored motion as from a recording's, monocular and in stereo, with
 the membrane unknown and stated. The constants of `bench.methods.fusion`, and the factor on physics' interval
 under a membrane, were set on sequences with even numbers; odd ones are reported.
-
-Run: python -m evidence.scoring.fusion mission-ood --work work
 """
 
 from __future__ import annotations
@@ -12,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
@@ -24,6 +21,8 @@ from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from evidence import cache, report, status
+from evidence.pooled import PRETRAINED
+from evidence.study import Study
 from learn.evaluation.statistics import interval
 from learn.inference.shipped import find_model
 from synth.dataset.store import Dataset
@@ -32,7 +31,6 @@ from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
 Floats = NDArray[np.float64]
-_NETWORKS = {1: "mono", 2: "stereo"}
 _STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
 
 
@@ -47,21 +45,19 @@ class Case:
 CASES = tuple(Case(cameras, stated) for cameras in (1, 2) for stated in (False, True))
 
 
-def main(
-    data: Path,
-    work: Annotated[Path, typer.Option(help="Folder of estimates; a later run reuses them.")] = Path("work"),
-    every: Annotated[int, typer.Option(help="1: odd numbers, 0: even ones.")] = 1,
-    out: Path = report.RESULTS / "scoring/fusion",
-) -> None:
-    """Errors of network, physics and their fusion, and coverage of their 90% intervals."""
+def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, Any]:
+    """Errors of network, physics and their fusion, and coverage of their 90% intervals.
+
+    `work`: folder of estimates, which a later run reuses; `every`: 1 for odd numbers, 0 for even ones.
+    """
     rows = []
     for case in CASES:
-        model = Model(find_model(_NETWORKS[case.cameras]))
+        model = Model(find_model(PRETRAINED[case.cameras]))
         found = [_cached(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
-    report.publish(out, "fusion.json", {"data": status.data(data), "rows": rows}, page)
+    return {"data": status.data(data), "rows": rows}
 
 
 def _cached(sequence: Stored, case: Case, model: Model, work: Path) -> dict[str, Any]:
@@ -149,5 +145,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Fusion of network and physics", found, [], [report.Section("", rows)], words)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "scoring/fusion/fusion.json", page, ("{mission-ood} --work {work}/fusion",))

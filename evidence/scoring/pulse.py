@@ -1,18 +1,14 @@
-"""Error of each method on pulsating tissue, with and without removal of the pulse.
-
-Run: python -m evidence.scoring.pulse --seconds 20
-"""
+"""Error of each method on pulsating tissue, with and without removal of the pulse."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
 from bench.methods.comparison import untrained
@@ -25,6 +21,7 @@ from bench.scoring.result import Result
 from evidence import report
 from evidence.flow.scenes import inverse
 from evidence.scoring.cost import texture
+from evidence.study import Study
 from synth.recording_flow.decode import RecordingFlowSettings
 
 Floats = NDArray[np.float64]
@@ -37,14 +34,11 @@ _TARGET = 1.3  # error after removal relative to that on still tissue
 _HEART, _BREATH = (0.4, 1.2), (0.25, 0.25)  # mm, Hz
 
 
-def main(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = report.RESULTS / "pulse",
-    seconds: Annotated[float, typer.Option(min=14.0, help="Length of each recording.")] = 30.0,
-    count: Annotated[int, typer.Option(min=1, help="Recordings, each with another contact.")] = 3,
-    size: Annotated[int, typer.Option(min=96, help="Side of the images [px].")] = 224,
-    seed: Annotated[int, typer.Option(help="Seed of textures, contacts and their times.")] = 1,
-) -> None:
-    """Error of every method on FEM contacts: on still tissue, with a pulse, and with the pulse removed."""
+def measure(seconds: float = 20.0, count: int = 2, size: int = 160, seed: int = 1) -> dict[str, Any]:
+    """Error of every method on FEM contacts: on still tissue, with a pulse, and with the pulse removed.
+
+    `seconds`: length of each of `count` recordings, at least 14; `size`: side of the images [px].
+    """
     rows = []
     for k in range(count):
         contact = draw_contact(np.random.default_rng([seed, k]), seconds, size)
@@ -60,8 +54,7 @@ def main(
             rows.append(row)
         rows[-1]["found"] = runs["removed"].tracked.pulse
         rows[-1]["found_on_still"] = runs["still"].tracked.pulse
-    found = {"seconds": seconds, "count": count, "size": size, "seed": seed, "rows": rows}
-    report.publish(out, "results.json", found, page, {"rows": page(found).sections[0].rows})
+    return {"seconds": seconds, "count": count, "size": size, "seed": seed, "rows": rows}
 
 
 def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[str, Any]:
@@ -150,8 +143,7 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
 def page(tree: Mapping[str, Any]) -> report.Page:
     """Error of each method after removal relative to that on still tissue, and a table."""
     rows, bars, worst = [], [], 0.0
-    for name in dict.fromkeys(row["method"] for row in tree["rows"]):
-        own = [row for row in tree["rows"] if row["method"] == name]
+    for (name,), own in report.grouped(tree["rows"], "method").items():
         mae = {w: np.array([row[f"{w}_mn"] for row in own]) for w in ("still", "pulse", "removed")}
         left, off = (mae[what] / mae["still"] for what in ("pulse", "removed"))
         cells = {f"{what} [mN]": f"{values.mean():.2f}" for what, values in mae.items()}
@@ -182,5 +174,4 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     )
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "pulse/results.json", page)

@@ -2,8 +2,6 @@
 
 Silently wrong: the error, of the peak or over time, more than doubled and above a tenth of the peak, no new
 message, and the force is outside the 90% interval. Also the messages on undegraded recordings.
-
-Run: python -m evidence.scoring.stability degraded
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
@@ -32,6 +29,7 @@ from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
 from evidence import cache as stored
 from evidence import report
+from evidence.study import Study
 from learn import load_model
 from learn.inference.shipped import choose_model
 from synth.dataset.store import Dataset
@@ -68,11 +66,8 @@ class Video:
 Change = Callable[[Video], Video]
 
 
-def main(
-    work: Path, out: Path = report.RESULTS / "scoring/stability", seed: int = 35, only: str = ""
-) -> None:
+def measure(work: Path, seed: int = 35, only: str = "") -> dict[str, Any]:
     """Scores rendered recordings before and after each change; `only`: a pattern of the changes' names."""
-    cv2.setNumThreads(1)
     rows = list[dict[str, Any]]()
     for name, index in _SCENES:
         clean = _read(_rendered(work, name, seed, 2)[index])
@@ -87,7 +82,7 @@ def main(
     found: dict[str, Any] = {"seed": seed, "changes": _summary(rows), "undegraded": [], "points": rows}
     if not only:
         found["undegraded"] = list(_alarms(work, seed + 1000))
-    report.publish(out, "stability.json", found, page, {key: found[key] for key in ("changes", "undegraded")})
+    return found
 
 
 def _point(work: Path, video: Video, change: Change, peak_mn: float, *key: Any) -> Any:
@@ -218,8 +213,7 @@ def _judged(after: dict[str, Any], before: dict[str, Any], cause: str) -> dict[s
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """A line for each change."""
     lines = []
-    for name in dict.fromkeys(row["change"] for row in rows):
-        own = [row for row in rows if row["change"] == name]
+    for (name,), own in report.grouped(rows, "change").items():
         named = [row["named"] for row in own if row["named"] is not None]
         messages, cause = (one for row in own for one in row["messages"]), CHANGES[name][1] or "$^"
         errors = {k: [row[k] for row in own if row[k] is not None] for k in ("before", "error", "physics")}
@@ -506,5 +500,4 @@ STEREO: dict[str, tuple[Change, str]] = {
 CHANGES = MONOCULAR | STEREO
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "scoring/stability/stability.json", page, ("{work}/degraded",))

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from evidence import report
+from evidence.study import Study
 from learn.evaluation.statistics import interval
 from synth.job import reader
 from synth.tune import search
 from synth.tune.grid import differences
 
+_JOBS = report.RESULTS / "tune"
 _WORDS = (
     "The force is estimated from the displacement of a frame by a fixed linear rule (`synth/tune`). *Error*: "
     "of the force estimated from recovered displacement against the true force at full fidelity, root mean "
@@ -24,19 +24,21 @@ _WORDS = (
 )
 
 
-def main(
-    out: Annotated[Path, typer.Option(help="Folder with a job SCENE.yaml a scene.")] = report.RESULTS
-    / "tune",
+def measure(
     scenes: str = "easy,middle,hard",
     budgets: str = "force 5%,force 3%",
-    probes: Annotated[int, typer.Option(help="Sequences on which every setting is measured.")] = 2,
-    checks: Annotated[int, typer.Option(help="Further ones for complete jobs.")] = 2,
-    fresh: Annotated[int, typer.Option(min=3, help="Sequences not used for tuning.")] = 6,
-) -> None:
-    """Tunes scenes of different difficulty and checks budget and cost on fresh sequences."""
+    probes: int = 2,
+    checks: int = 2,
+    fresh: int = 6,
+) -> dict[str, Any]:
+    """Tunes scenes of different difficulty and checks budget and cost on fresh sequences.
+
+    `scenes`: names of jobs next to the results; `probes`: sequences on which every setting is measured;
+    `checks`: further ones for complete jobs; `fresh`: sequences not used for tuning, at least three.
+    """
     rows = []
     for scene in scenes.split(","):
-        job = reader.load_job(str(out / f"{scene}.yaml"))
+        job = reader.load_job(str(_JOBS / f"{scene}.yaml"))
         # Each budget reuses the measurements of the one before.
         measurements = search.Measurements(job)
         for budget in map(search.parse_budget, budgets.split(",")):
@@ -51,7 +53,7 @@ def main(
             described = {kind: _described(one) for kind, one in whole.items()}
             checked = {kind: _described(one) for kind, one in again.items()}
             rows.append({"scene": scene, "budget": budget, "changes": changes, **described, "fresh": checked})
-    report.publish(out, "tune.json", {"rows": rows}, page, {"rows": table(rows)})
+    return {"rows": rows}
 
 
 def _described(one: search.Evaluation) -> dict[str, Any]:
@@ -66,15 +68,14 @@ def _described(one: search.Evaluation) -> dict[str, Any]:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `tune.json`: error of the force against cost of complete jobs."""
     panels = []
-    for scene in dict.fromkeys(row["scene"] for row in found["rows"]):
+    for (scene,), rows in report.grouped(found["rows"], "scene").items():
         curves = []
-        for row in found["rows"]:
-            if row["scene"] == scene:
-                whole = row["full"], row["own"], row["best"]
-                costs = tuple(one["cpu_s_a_frame"] for one in whole)
-                errors = tuple(100 * _mean(one["totals"]) for one in whole)
-                labels, name = ("full", "untuned", "tuned"), f"budget {100 * row['budget']:g}%"
-                curves.append(report.Curve(name, costs, errors, labels, ringed=(2,)))
+        for row in rows:
+            whole = row["full"], row["own"], row["best"]
+            costs = tuple(one["cpu_s_a_frame"] for one in whole)
+            errors = tuple(100 * _mean(one["totals"]) for one in whole)
+            labels, name = ("full", "untuned", "tuned"), f"budget {100 * row['budget']:g}%"
+            curves.append(report.Curve(name, costs, errors, labels, ringed=(2,)))
         panels.append(report.Panel(scene, "CPU s a frame", "error of the force [%]", tuple(curves)))
     sections = [report.Section("", table(found["rows"]))]
     words = [_verdict(found["rows"]), *found.get("notes", ()), *_WORDS]
@@ -128,5 +129,4 @@ def _over(values: list[float | None]) -> str:
     return report.mean_cell([found.mean, found.low, found.high], ".1f")
 
 
-if __name__ == "__main__":
-    typer.run(main)
+STUDY = Study(measure, "tune/tune.json", page)

@@ -27,7 +27,7 @@ LAW_ERROR = {  # largest displacement error by law: (P, relative error)
     "corotational": ((0.02, 0.0048), (0.05, 0.0118), (0.1, 0.0234), (0.15, 0.0371), (0.2, 0.0570)),
 }
 """Relative to neo-Hookean, the worst of pushing, pulling and dragging aside, nu 0.4; measured by
-`python -m evidence.fem.pareto` (docs/results/fem/pareto)."""
+`python -m evidence fem.pareto` (docs/results/fem/pareto)."""
 
 CHEAPEST_FIRST = ("linear", "neo-hookean", "corotational")
 """Laws by CPU time a frame, from the same measurement."""

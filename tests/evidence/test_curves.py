@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from made_clip import made_clip
 
-from evidence.curves import estimators
-from evidence.curves.estimators import GRID, Estimator, Experiment
+from evidence.curves import experiment
+from evidence.curves.experiment import GRID, SAME, Estimator
 from learn.data.clips import Clip
 
 
@@ -30,35 +31,35 @@ def clips() -> list[Clip]:
     return made
 
 
-@pytest.fixture
-def experiment(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
-    monkeypatch.setattr(estimators, "_load", lambda root, work: clips)
-    monkeypatch.setattr(estimators, "_bare", lambda root: [k % 2 == 0 for k in range(12)])
-    monkeypatch.setattr(estimators, "generation_cpu_s", lambda root: 3600.0)
-    return Experiment(tmp_path / "data", (), 4, 2, 10, tmp_path / "work")
+def row(one: Estimator, clips: list[Clip], work: Path) -> dict[str, Any]:
+    """Errors on the first four clips after fitting on the last six."""
+    tests = {SAME: (clips[:4], [k % 2 == 0 for k in range(4)])}
+    (found,) = experiment.measure_estimator(one, clips[4:], 2, tests, 10, 3600.0, work)
+    return found
 
 
-def test_ridge_estimates_force_in_stereo_and_its_lateral_part_monocular(experiment: Experiment) -> None:
-    two = experiment.rows(Estimator("ridge", "recovered", 2, 6))[0]
-    one = experiment.rows(Estimator("ridge", "recovered", 1, 6))[0]
+def test_ridge_estimates_force_in_stereo_and_its_lateral_part_monocular(
+    clips: list[Clip], tmp_path: Path
+) -> None:
+    two = row(Estimator("ridge", "recovered", 2, 6), clips, tmp_path)
+    one = row(Estimator("ridge", "recovered", 1, 6), clips, tmp_path)
     assert two["whole"][0] < 0.02
     assert two["gain"] == pytest.approx(1, abs=0.02)
     assert one["across"][0] < 0.02
     assert one["along"][0] > 0.3
     assert two["cpu_h"] == pytest.approx(6, abs=0.1)
-    assert experiment.rows(Estimator("ridge", "exact", 2, 6))[0]["whole"][0] < 0.02
+    assert row(Estimator("ridge", "exact", 2, 6), clips, tmp_path)["whole"][0] < 0.02
 
 
 def test_tested_sequences_are_held_out(
-    experiment: Experiment, clips: list[Clip], monkeypatch: pytest.MonkeyPatch
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     used: dict[str, list[str]] = {}
 
-    def fitted(self: Experiment, one: Estimator, fit: list[Clip], select: list[Clip], key: str) -> object:
+    def fitted(one: Estimator, fit: list[Clip], select: list[Clip], steps: int, work: Path) -> object:
         used.update(fit=[c.content_hash for c in fit], select=[c.content_hash for c in select])
         return lambda clip: used.setdefault("test", []).append(clip.content_hash) or clip.force
 
-    monkeypatch.setattr(Experiment, "_fitted", fitted)
-    row = experiment.rows(Estimator("ridge", "recovered", 2, 6))[0]
-    assert row["whole"][0] == 0
+    monkeypatch.setattr(experiment, "fitted", fitted)
+    assert row(Estimator("ridge", "recovered", 2, 6), clips, tmp_path)["whole"][0] == 0
     assert used == {"fit": [*map(str, range(6, 12))], "select": ["4", "5"], "test": ["0", "1", "2", "3"]}

@@ -20,7 +20,7 @@ def test_error_decreases_with_refinement() -> None:
 
 @pytest.mark.slow
 def test_discs_on_the_half_space_agree_with_closed_forms() -> None:
-    rows = {(row["disc"], row["part"]): row["error"] for row in half_space.measure(2500, 0.4)}
+    rows = {(row["disc"], row["part"]): row["error"] for row in half_space.errors(2500, 0.4)}
     assert max(error for (_, part), error in rows.items() if part.startswith(("u_z", "u_x"))) < 0.025
     assert max(error for (_, part), error in rows.items() if part.startswith("u_r")) < 0.08
 
@@ -32,7 +32,7 @@ def test_a_membrane_on_the_half_space_agrees_with_hankel_integrals() -> None:
         found = half_space.covered(radii, 4.5, 0.45, 0.0, disc)
         for part, value in half_space.bare(radii, 4.5, 0.45, disc).items():
             np.testing.assert_allclose(found[part], value, rtol=2e-5)
-    rows = half_space.measure(3000, 0.4, 50.0)
+    rows = half_space.errors(3000, 0.4, 50.0)
     assert max(row["error"] for row in rows if not row["part"].startswith("u_r")) < 0.03
     assert max(row["error"] for row in rows) < 0.08
 

@@ -49,9 +49,11 @@ def test_a_recording_contains_the_prescribed_force(tmp_path: Path, monkeypatch: 
         return folder / f"{work}.npz"
 
     monkeypatch.setattr(recordings, "run", ran)
-    recordings.main(tmp_path, Path("a"), Path("b"), "pulse", 1, 10.0, 2.0, 1, 500)
-    opened = open_recording(tmp_path / "pulse-0")
-    rows = np.loadtxt(tmp_path / "pulse-0/force.csv", delimiter=",", skiprows=1)
+    part, pythons = tmp_path / "part", (Path("a"), Path("b"))
+    part.mkdir()
+    recordings.record(part, "pulse-0", "pulse", np.random.default_rng(500), (10.0, 2.0, 1), pythons)
+    opened = open_recording(part)
+    rows = np.loadtxt(part / "force.csv", delimiter=",", skiprows=1)
     contacts = given["mechanics"]["contacts"]
     strongest = max(np.linalg.norm(one["force_mn"]) for one in contacts)
     measured = 1000 * np.linalg.norm(rows[:, 1:], axis=1)

@@ -20,7 +20,7 @@ def test_share_closed_of_known_errors() -> None:
     assert got.interval == pytest.approx((0.5, 0.5), abs=1e-6)  # proportional pairs: no uncertainty
     errors = rng.normal(5, 2, 20)
     none = gap.closed(errors, errors - 1, errors + 0.3 * rng.normal(size=20), rng)
-    assert np.isnan(none.share)
+    assert none.share is None
     assert none.undefined
 
 

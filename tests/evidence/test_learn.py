@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evidence import training
+from evidence.datasets import coarser
 from evidence.learn import runs, stability
-from evidence.learn.labels import coarser
 from evidence.learn.runs import Run
 from learn.data.clips import Clip, target
 from learn.data.grid import Grid
@@ -21,16 +22,16 @@ GRID = Grid(32)
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    arch = replace(runs.study().arch, levels=2, width=8)
-    return Run("mse-fold0-seed0", replace(runs.study(), size=32, epochs=1, arch=arch))
+    arch = replace(runs.base_settings().arch, levels=2, width=8)
+    return Run("mse-fold0-seed0", replace(runs.base_settings(), size=32, epochs=1, arch=arch))
 
 
 def test_a_run_is_cached_by_settings_and_data(
     run: Run, clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
-    train = runs.train
-    monkeypatch.setattr(runs, "train", lambda *given: trained.append(str(given[3])) or train(*given))
+    train = training.train
+    monkeypatch.setattr(training, "train", lambda *given: trained.append(str(given[3])) or train(*given))
     first = runs.carry_out(run, clips, tmp_path)
     assert runs.carry_out(run, clips, tmp_path) == first
     assert len(trained) == 1
@@ -68,7 +69,7 @@ def test_a_wrong_scale_multiplies_lengths_about_the_centre(clips: list[Clip]) ->
 
 
 def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
-    wide = coarser(clips[2], GRID, 2)
+    wide = coarser(clips[2], 2)
     fine = clips[2].density.sum((2, 3)) * GRID.pitch_mm**2
     np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)
     largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], wide)]

@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-import typer
 
 from evidence import all as everything
-from evidence import report, status
+from evidence import report, status, study
 from evidence.report import Chart, Curve, Page, Panel, bars
 from evidence.steps import run_steps
 
 PANEL = Panel("cost", "ms", "error [%]", (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("a", "b")),))
-CHART = Chart("error", "mN", bars({"ours": 1.0, "theirs": 2.0}, {"ours": (0.5, 1.5)}))
+CHART = Chart("error", "mN", bars({"ours": 1.0, "theirs": 2.0}))
 ROWS = [{"law": "<linear>", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a | b"}]
 
 
@@ -78,25 +76,62 @@ def git(folder: Path, *words: str) -> str:
     [("synth/other.py", ()), *((name, (name,)) for name in ("synth/job.py", "data/job.yaml"))],
 )
 def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple[str, ...]) -> None:
-    assert [one.changed for one in status.gather(home / "results", home)] == [()]
+    modules = {"*.json": "evidence.flow.pareto"}
+    assert [one.changed for one in status.gather(home / "results", modules, home)] == [()]
     (home / changed).write_text((home / changed).read_text() + "\n")
-    (one,) = status.gather(home / "results", home)
+    (one,) = status.gather(home / "results", modules, home)
     assert (one.changed, one.cpu_hours) == (found, 1.5)
 
 
-PYTHON = Path("python")
+OLDER = dict.fromkeys(
+    (
+        *("curves.experiment", "flow.experiment", "flow.foreign", "flow.stability", "learn.runs"),
+        *("learn.shipped", "learn.stability", "mechanics.experiment"),
+        *("scoring.fusion", "scoring.pulse", "scoring.stability"),
+    ),
+    "stored data are older than the code until they are made again: their keys have other names",
+)
+"""Studies whose page can't be drawn from the stored data. When it can, its test fails: remove the entry."""
+DRAWN = [
+    pytest.param(name, marks=pytest.mark.xfail(reason=OLDER[name], strict=True, raises=KeyError))
+    if name in OLDER
+    else name
+    for name in study.names()
+    if name not in ("foreign.recordings", "scoring.exvivo")  # their pages are of `bench pool`
+]
 
 
-def test_every_script_accepts_the_arguments_of_its_step(tmp_path: Path) -> None:
-    steps = [*everything.standalone(tmp_path), *everything.photograph(PYTHON)]
-    steps += [*everything.exvivo(tmp_path, PYTHON), *everything.shared(tmp_path)]
-    steps += everything.foreign(tmp_path, PYTHON, PYTHON)
-    scripts = [words[1:] for _, words in steps if words[1].startswith("evidence.")]
-    assert len({name for name, _ in steps}) == len(steps) > len(scripts) > 25  # logs are named by step
-    for module, *words in scripts:
-        app = typer.Typer()
-        app.command()(import_module(module).main)
-        typer.main.get_command(app).make_context(module, words)  # a UsageError where one is unknown
+@pytest.mark.parametrize("name", DRAWN)
+def test_the_page_of_a_study_is_drawn_from_its_stored_data(name: str, tmp_path: Path) -> None:
+    one = study.load(name)
+    if one.page is None:
+        assert not one.result
+        return
+    found = json.loads((report.RESULTS / one.result).read_text("utf-8"))
+    one.page(found).write(tmp_path)
+    assert (tmp_path / "README.md").read_text("utf-8").startswith("# ")
+
+
+def test_every_stored_result_has_its_study() -> None:
+    results = [study.load(name).result for name in study.names()]
+    found = [{*report.RESULTS.glob(result)} for result in results if result]
+    assert all(found)
+    assert set.union(*found) == {*report.RESULTS.rglob("*.json")}
+    assert sum(map(len, found)) == len(set.union(*found))
+
+
+def test_every_study_accepts_the_arguments_of_its_steps(tmp_path: Path) -> None:
+    options = dict.fromkeys(("photo", "mechanics_python", "pictures_python"), Path("file"))
+    steps, left_out = everything.plan(tmp_path, options)
+    assert not left_out
+    assert len({name for name, _ in steps}) == len(steps) > 25  # logs are named by step
+    assert {name for name, _ in steps} >= set(everything.DATASETS)
+    for _, (_, package, name, *words) in steps:
+        if package == "evidence":
+            study.command(name).make_context(name, words)  # a UsageError where one is unknown
+    fewer, left_out = everything.plan(tmp_path, {}, "render")
+    assert {name for name, _ in fewer} == {"render.gallery", "render.pareto", "render.stability"}
+    assert len(left_out) == 1
 
 
 def test_only_failed_steps_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

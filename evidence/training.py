@@ -1,13 +1,18 @@
-"""Cross-validation folds that share no anatomy."""
+"""Networks of studies: cross-validation folds that share no anatomy, and stored trainings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from evidence import cache
 from learn.data.clips import Clip
+from learn.inference.predict import Predictor, load_model
+from learn.settings import TrainingSettings
 from learn.split import Split, groups
+from learn.training.train import train
 from synth.dataset.split import draw_groups
 
 
@@ -27,3 +32,16 @@ def nested(clips: Sequence[Clip], count: int, fold: int, seed: int) -> Split:
     chosen = folds(inner, min(5, len(set(groups(inner)))), seed)[0]
     select = tuple(rest[k] for k in chosen)
     return Split(tuple(i for i in rest if i not in select), select, test)
+
+
+def fit(
+    name: str, clips: Sequence[Clip], split: Split, settings: TrainingSettings, folder: Path
+) -> Predictor:
+    """Network trained on fit and select of a split, stored in `folder`; an interrupted training continues.
+
+    `name`: part of the key, next to code, settings and the clips' hashes.
+    """
+    used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
+    model = folder / f"{name}-{cache.key(settings.model_dump(), used)}"
+    train(clips, split, settings, model)
+    return load_model(model)

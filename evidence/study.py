@@ -1,0 +1,79 @@
+"""Studies: one experiment a module, from its question to its page in docs/results.
+
+To add one: a module of `evidence` whose docstring states the question, a function `measure` that returns the
+data (its parameters are the command's options), a function `page` that draws them, and
+`STUDY = Study(measure, "FOLDER/NAME.json", page)`. `python -m evidence MODULE` runs it,
+`all` and `status` find it, and a test draws the page from the stored data.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import cv2
+import typer
+
+from evidence import report
+from learn.training.threads import set_threads
+
+_HOME = Path(__file__).parent
+_DEFINED = re.compile(r"^STUDY = ", re.M)
+
+
+@dataclass(frozen=True)
+class Study:
+    """One experiment: what it measures, where its data are stored, and the page drawn from them."""
+
+    measure: Callable[..., Mapping[str, Any] | None]
+    """Takes the command's arguments and options; returns the data, None if it writes files of its own."""
+    result: str = ""
+    """JSON file under docs/results, a pattern if other programs write several; empty: no results."""
+    page: Callable[[Mapping[str, Any]], report.Page] | None = None
+    """Draws the data; None: other programs draw them."""
+    steps: tuple[str, ...] = ("",)
+    """Arguments of each run by `all`: by default one run without any. {NAME} stands for a dataset, an option
+    of `all` (without it the step is left out), or `work`, the folder of intermediate results."""
+
+
+def names() -> list[str]:
+    """Names of all studies: their modules, without `evidence`."""
+    files = [file for file in _HOME.rglob("*.py") if _DEFINED.search(file.read_text("utf-8"))]
+    return sorted(".".join(file.relative_to(_HOME).with_suffix("").parts) for file in files)
+
+
+def load(name: str) -> Study:
+    """The study of a module."""
+    found: Study = import_module(f"evidence.{name}").STUDY
+    return found
+
+
+def command(name: str) -> Any:
+    """Click's command of a study: its arguments and options, and `--out` if it has a page."""
+    study = load(name)
+    signature = inspect.signature(study.measure, eval_str=True)
+    parameters, result = [*signature.parameters.values()], report.RESULTS / study.result
+    if study.page is not None:
+        out = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, default=result.parent, annotation=Path)
+        parameters.append(out)
+
+    @wraps(study.measure)
+    def run(**options: Any) -> None:
+        set_threads(1)
+        cv2.setNumThreads(1)
+        if study.page is None:
+            study.measure(**options)
+            return
+        folder = options.pop("out")
+        report.publish(folder, result.name, study.measure(**options) or {}, study.page)
+
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    app = typer.Typer(add_completion=False)
+    app.command(name)(run)
+    return typer.main.get_command(app)
