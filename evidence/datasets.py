@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evidence import cache
 from learn.data.clips import Clip
-from learn.data.grid import Grid, Resampler, centre, settled
+from learn.data.grid import Grid, GridView, settled
 from synth.dataset import location
 from synth.dataset.store import Sequence, open_sequence
 from synth.flow.estimator import Estimator
@@ -46,14 +46,14 @@ def recover_flow(
     """
     tissue = sequence["tissue"][:].astype(bool)
     scale = float(sequence.attrs["scale_mm_per_px"])
-    resample = Resampler((tissue.shape[0], tissue.shape[1]), scale, centre(tissue), grid)
+    view = GridView(tissue, scale, grid)
     moved, confidence = np.zeros_like(clip.displacement["ideal"]), np.ones_like(clip.confidence)
     rgb, began = sequence["rgb"][: clip.frames], time.process_time()
     followed = track(estimator, rgb, blocked[: clip.frames], tissue)
     spent = time.process_time() - began
     for t in range(1, clip.frames):
-        moved[t] = resample.mean(followed.flow[t].transpose(2, 0, 1) * scale, tissue) * clip.mask
-        confidence[t] = resample.mean(followed.confidence[t], tissue) * clip.mask
+        moved[t] = view.mean(followed.flow[t].transpose(2, 0, 1) * scale) * clip.mask
+        confidence[t] = view.mean(followed.confidence[t]) * clip.mask
     found = {**clip.displacement, "recovered": moved}
     return replace(clip, displacement=found, confidence=confidence), spent
 

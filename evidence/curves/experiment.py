@@ -35,12 +35,8 @@ from synth.errors import UserError
 Floats = NDArray[np.float64]
 Estimate = Callable[[Clip], Floats]  # clip → force (T, 3) mN, camera axes
 
-RIDGE, NEAREST, SMALL, LARGE = "ridge", "k-NN", "d2fnet-s", "D2FNet"
-NETWORKS = {
-    SMALL: {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0},
-    LARGE: {"width": 32, "stem": 2, "levels": 4, "dropout": 0.05},
-}
-MODELS = (RIDGE, NEAREST, *NETWORKS)
+RIDGE = "ridge"
+NETWORKS = {"d2fnet-s": {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0}}
 SOURCES = {
     "recovered": {1: "recovered", 2: "motion"},
     "exact": {1: "ideal", 2: "motion-ideal"},
@@ -74,8 +70,8 @@ class Estimator:
 
 def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: int, work: Path) -> Estimate:
     """An estimator fitted on `fit`: a network, in about `steps` batches and stored in `work`, with its epoch
-    selected by `select`; or ridge or nearest neighbours."""
-    if one.model not in NETWORKS:
+    selected by `select`; or ridge."""
+    if one.model == RIDGE:
         return _by_components(one, fit)
     settings = network_settings(one, steps, sum(clip.frames for clip in fit))
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(fit) + len(select))), ())
@@ -84,7 +80,7 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
 
 
 def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
-    """Ridge or nearest neighbours on principal components of displacement, in eight orientations."""
+    """Ridge on principal components of displacement, in eight orientations."""
     small = [coarser(clip) for clip in fit]
     # Not centred, so that zero motion stays zero.
     x, _, _ = models.samples(small[:_BASIS], one.source)
@@ -96,7 +92,7 @@ def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
         forces.append(force)
         groups.append(group + start)
     x, force, group = np.concatenate(features), np.concatenate(forces), np.concatenate(groups)
-    regressor: Any = models.fit_ridge(x, force, group) if one.model == RIDGE else models.fit_nearest(x, force)
+    regressor = models.fit_ridge(x, force, group)
     return lambda clip: (
         clip.young_kpa
         * np.asarray(regressor.predict(basis.transform(models.rows(coarser(clip), one.source))))

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from evidence import report
@@ -33,12 +28,9 @@ def measure(
     first: int = 48,
     size: int = 160,
     frames: int = 14,
-    jobs: int = 1,
 ) -> dict[str, Any]:
     """Errors on `count` videos of a half after its `first` ones; settings were tuned on the half `tuning`."""
-    chosen = recipes(half, count, first)
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        rows = list(pool.map(partial(judge, size=size, frames=frames), chosen))
+    rows = [judge(one, size, frames) for one in recipes(half, count, first)]
     return {"half": half, "summary": summarise(rows)}
 
 
@@ -51,8 +43,6 @@ def judge(recipe: Recipe, size: int, frames: int) -> dict[str, Any]:
         1 px and above that of zero flow, or less than a fifth of the tissue visible), `flagged`, and both
         (`hits`).
     """
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     shown = list(video(recipe, size, frames))
     ways = {name: _follow(shown, name) for name in _MASKS}
     later, (error, trusted, covered) = shown[1:], ways["auto"]

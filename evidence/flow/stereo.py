@@ -1,8 +1,7 @@
-"""Motion in three dimensions from stereo: error, bias, z-scores and cost."""
+"""Motion in three dimensions from stereo, as datasets store it: error, bias, z-scores and cost."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,7 @@ from numpy.typing import NDArray
 
 from evidence import report, status
 from evidence.study import Study
-from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
-from synth.flow import mask_detection
-from synth.flow.stereo.rig import Intrinsics, StereoRig
-from synth.flow.stereo.track import StereoTracker, still_frames
-from synth.flow.track import track
 
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
@@ -34,14 +28,12 @@ def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
     """Depth motion from stereo by resolution, on `count` sequences of datasets that were not tuned on."""
     rows = []
     for root in data:
-        dataset = Dataset(root)
-        measured = [_measured(dataset[k]) for k in range(min(count, len(dataset)))]
-        height, width = dataset[0].size
-        ratio = sum(one[1] for one in measured) / sum(one[2] for one in measured)
+        sequences = list(Dataset(root))[:count]
+        height, width = sequences[0].size
         rows.append(
-            {"data": root.name, "size": f"{width} x {height}", "sequences": len(measured)}
-            | figures([sample for one in measured for sample in one[0]])
-            | {"cost_ratio": ratio, "epipolar_px": float(np.median([one[3] for one in measured]))}
+            {"data": root.name, "size": f"{width} x {height}", "sequences": len(sequences)}
+            | figures([sample for one in sequences for sample in _samples(one)])
+            | {"cost_ratio": _cost_ratio(sequences)}
         )
     return {"data": status.data(*data), "rows": rows}
 
@@ -67,39 +59,25 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-def _measured(sequence: Sequence) -> tuple[list[Sample], float, float, float]:
-    """Samples of all frames; CPU time [s] of stereo and of the left camera's flow alone; epipolar error [px]
-    of the rest frames."""
-    left, right = sequence["rgb"][:], sequence["rgb_right"][:]
-    tissue, tools = sequence["tissue"][:], sequence["tool"][:]
-    # The store has no tool mask of the right camera: it is detected in the image.
-    blocked = mask_detection.hidden(left, tools)
-    other = mask_detection.hidden(right, np.stack([mask_detection.tool(picture) for picture in right]))
-    begun = time.process_time()
-    tracked = track("tvl1", left, blocked, tissue)
-    flow_s = time.process_time() - begun
-    still = still_frames(tracked.flow, tissue)
-    tracker = StereoTracker(_rig(sequence), left[:still], right[:still], blocked[0], other[0], tissue)
-    moved = [
-        tracker.step(left[t], right[t], blocked[t], other[t], tracked.flow[t], tracked.confidence[t])
-        for t in range(1, sequence.frames)
-    ]
-    both_s = time.process_time() - begun
+def _samples(sequence: Sequence) -> list[Sample]:
+    """Samples of all frames but the rest frame."""
     samples = []
-    for t, one in enumerate(moved, 1):
-        here = tissue & ~tools[0] & sequence["visible"][t]
+    for t in range(1, sequence.frames):
+        here = sequence["tissue"][:] & ~sequence["tool"][0] & sequence["visible"][t]
         load = np.linalg.norm(sequence["traction"][t], axis=-1)
-        fields = sequence["motion"][t], one.motion, one.deviation, load > _CONTACT * max(load.max(), 1e-9)
-        true, found, deviation, pressed = (field[here][::_EVERY] for field in fields)
+        motion = (sequence[name][t] for name in ("motion", "motion_recovered", "motion_deviation"))
+        fields = *motion, load > _CONTACT * max(load.max(), 1e-9)
+        true, found, deviation, pressed = (np.asarray(field)[here][::_EVERY] for field in fields)
         samples.append((true, found, deviation, pressed))
-    return samples, both_s, flow_s, tracker.rest.epipolar_px
+    return samples
 
 
-def _rig(sequence: Sequence) -> StereoRig:
-    """Calibration of the cameras of a stereo sequence."""
-    left, right = optics.camera_of(sequence), stereo.right_of(sequence)
-    cameras = Intrinsics(left.K, left.distortion), Intrinsics(right.K, right.distortion)
-    return StereoRig(*cameras, np.eye(3), right.translation - left.translation, left.size)
+def _cost_ratio(sequences: list[Sequence]) -> float:
+    """CPU time of flow and stereo relative to that of flow."""
+    spent = {
+        stage: sum(s.attrs["timings"][stage]["cpu_s"] for s in sequences) for stage in ("flow", "stereo")
+    }
+    return float(sum(spent.values()) / spent["flow"])
 
 
 _TARGETS = (

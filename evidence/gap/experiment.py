@@ -16,19 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evidence import cache, report, status, training
-from evidence.datasets import recover_flow
 from evidence.gap import gap
 from evidence.intervals import difference
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
-from learn.data.grid import Grid
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.statistics import interval
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
-from synth.dataset.store import Dataset
-from synth.dataset.store import Sequence as Stored
 from synth.errors import UserError
 
 Curve = NDArray[np.float64]
@@ -51,15 +47,13 @@ def measure(
     unseen: Path,
     work: Path = Path("runs/gap"),
     fit: int = 300,
-    flow: str = "tvl1",
     epochs: int = 24,
     seeds: int = 1,
 ) -> dict[str, Any]:
     """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise.
 
-    `dataset`: with recovered flow of the back end tvl1, of which `fit` sequences are used; `unseen`: out of
-    distribution, only tested on; `work`: folder of intermediate results; `flow`: comma-separated back ends of
-    the recovered flow; `seeds`: networks a training.
+    `dataset`: of which `fit` sequences are used; `unseen`: out of distribution, only tested on; `work`:
+    folder of intermediate results; `seeds`: networks a training.
     """
     tiny = preset("tiny", epochs=epochs)
     settings = changed(tiny, arch=changed(tiny.arch, output="magnitude"))  # the same metrics for all
@@ -68,23 +62,13 @@ def measure(
     )
     known = known[:fit]
     split, own_test = parts(known, others)
-    stored, clips = [*list(Dataset(dataset))[:fit], *Dataset(unseen)], [*known, *others]
-    flows = {}
-    for backend in flow.split(","):
-        used = clips
-        if backend != "tvl1":
-            pairs = zip(stored, clips, strict=True)
-            used = [with_flow(s, c, backend, settings.grid, work) for s, c in pairs]
-        ours, theirs = [used[i] for i in own_test], [used[i] for i in split.test]
-        tests = {
-            name: (theirs if "'" in name else ours, "ideal" if name[0] == "I" else "recovered")
-            for name in _TESTS
-        }
-        seeded = [changed(settings, seed=seed) for seed in range(seeds)]
-        trained = {
-            kind: [errors(kind, backend, used, split, one, tests, work) for one in seeded] for kind in KINDS
-        }
-        flows[backend] = {"noise": asdict(fitted_noise(used, split.fit))} | summary(trained)
+    clips = [*known, *others]
+    ours, theirs = [clips[i] for i in own_test], [clips[i] for i in split.test]
+    tests = {
+        name: (theirs if "'" in name else ours, "ideal" if name[0] == "I" else "recovered") for name in _TESTS
+    }
+    seeded = [changed(settings, seed=seed) for seed in range(seeds)]
+    trained = {kind: [errors(kind, clips, split, one, tests, work) for one in seeded] for kind in KINDS}
     sizes = (split.fit, split.select, own_test, split.test)
     return {
         "data": status.data(dataset, unseen),
@@ -92,7 +76,7 @@ def measure(
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen"), map(len, sizes), strict=True)),
         "seeds": seeds,
-        "flows": flows,
+        "flows": {"tvl1": {"noise": asdict(fitted_noise(clips, split.fit))} | summary(trained)},
     }
 
 
@@ -110,19 +94,6 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     if set(number[: len(clips)]) & set(number[len(clips) :]):
         raise UserError("unseen: shares an anatomy with the other dataset")
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
-
-
-def with_flow(sequence: Stored, clip: Clip, backend: str, grid: Grid, work: Path) -> Clip:
-    """The clip with the flow recovered by another back end, as in the paper's pipeline, cached in `work`.
-
-    Only the instrument is masked, not highlights, as in masks drawn by hand.
-    """
-
-    def make() -> Clip:
-        return recover_flow(sequence, clip, backend, sequence["tool"][...].astype(bool), grid)[0]
-
-    key = cache.key(clip.content_hash, backend, grid.size, grid.extent_mm)
-    return cache.clip(work / "flow" / key, make)
 
 
 def fitted_noise(clips: Sequence[Clip], fit: Sequence[int]) -> gap.Noise:
@@ -146,7 +117,6 @@ def with_noise(clips: Sequence[Clip], noise: gap.Noise, seed: int) -> list[Clip]
 
 def errors(
     kind: str,
-    flow: str,
     clips: Sequence[Clip],
     split: Split,
     settings: TrainingSettings,
@@ -155,8 +125,7 @@ def errors(
 ) -> Errors:
     """Errors in every test of a network trained as one of `KINDS` on fit and select of `split`, cached."""
     settings = changed(settings, input=_INPUTS[kind])
-    # Training on ideal flow doesn't depend on the tested flow estimator.
-    name = f"{kind}{'' if kind == 'I' else f'-{flow}'}-seed{settings.seed}"
+    name = f"{kind}-seed{settings.seed}"
 
     def compute() -> Errors:
         noise = fitted_noise(clips, split.fit) if kind == "N" else None
@@ -167,8 +136,8 @@ def errors(
 
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
     tested = {test: [clip.content_hash for clip in part] for test, (part, _) in tests.items()}
-    key = cache.key(name, settings.model_dump(), used, flow, tested)
-    done: Errors = cache.result(work / "runs", f"{kind}-{flow}-seed{settings.seed}", key, compute)
+    key = cache.key(name, settings.model_dump(), used, tested)
+    done: Errors = cache.result(work / "runs", name, key, compute)
     return done
 
 

@@ -32,11 +32,10 @@ from evidence import report
 from evidence.study import Study
 from learn import load_model
 from learn.inference.shipped import choose_model
-from synth.dataset.store import Dataset
+from synth.dataset.store import Dataset, Sequence
 from synth.engine.run import render_job
 from synth.errors import UserError
 from synth.job import reader
-from synth.system.checked_file import read_picture
 
 _JOBS = {"opening": "mission", "edge to edge": str(Path(__file__).parents[1] / "curves/mission-bench.yaml")}
 _SCENES = (("opening", 1), ("edge to edge", 0))
@@ -70,7 +69,7 @@ def measure(work: Path, seed: int = 35, only: str = "") -> dict[str, Any]:
     """Scores rendered recordings before and after each change; `only`: a pattern of the changes' names."""
     rows = list[dict[str, Any]]()
     for name, index in _SCENES:
-        clean = _read(_rendered(work, name, seed, 2)[index])
+        clean = _rendered(work, name, seed, 2)[index]
         peak = 1000 * float(np.linalg.norm(clean.sensor[:, 1:], axis=1).max())
         for what in filter(re.compile(only).search, CHANGES):
             cameras = 1 if what in MONOCULAR else 2
@@ -92,29 +91,20 @@ def _point(work: Path, video: Video, change: Change, peak_mn: float, *key: Any) 
     )
 
 
-def _rendered(work: Path, name: str, seed: int, count: int) -> list[Path]:
-    """Folders of stereo recordings of 24 frames in 3 s."""
-    data, folders = work / f"{name} {seed}", [work / f"{name} {seed} {k}" for k in range(count)]
-    if not folders[-1].is_dir():
-        changed = {"seed": seed, "sequences": count, "frames": 24, "fps": 8.0}
-        render_job(reader.load_job(_JOBS[name]).model_copy(update=changed), data, workers=1)
-        for sequence, folder in zip(Dataset(data), folders, strict=True):
-            export_recording(sequence, folder)
-    return folders
+def _rendered(work: Path, name: str, seed: int, count: int) -> list[Video]:
+    """Stereo recordings of 24 frames in 3 s."""
+    data = work / f"{name} {seed}"
+    changed = {"seed": seed, "sequences": count, "frames": 24, "fps": 8.0}
+    render_job(reader.load_job(_JOBS[name]).model_copy(update=changed), data, workers=1)
+    return [_read(sequence, data.with_name(f"{data.name} {k}")) for k, sequence in enumerate(Dataset(data))]
 
 
-def _read(folder: Path) -> Video:
-    """A recording of `export_recording` with its sensor resampled at a higher rate, with noise."""
-    rgb, right = (
-        np.stack(
-            [read_picture(p, cv2.IMREAD_COLOR)[..., ::-1] for p in sorted((folder / name).glob("*.png"))]
-        )
-        for name in ("frames", "right")
-    )
+def _read(sequence: Sequence, folder: Path) -> Video:
+    """A sequence as a recording, in `folder`, its sensor resampled at a higher rate, with noise."""
+    if not folder.is_dir():
+        export_recording(sequence, folder)
     meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
-    tool = np.zeros(rgb.shape[:3], bool)
-    for path in (folder / "masks").glob("*.png"):
-        tool[int(path.stem)] = np.asarray(read_picture(path, 0)) > 127
+    rgb, right, tool, tissue = (sequence[name][:] for name in ("rgb", "rgb_right", "tool", "tissue"))
     time_s = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1)[:, 1]
     force = np.loadtxt(folder / "force.csv", delimiter=",", skiprows=1)
     clock = np.arange(0, time_s[-1] + 0.5, 1 / _SENSOR_HZ)
@@ -122,11 +112,8 @@ def _read(folder: Path) -> Video:
     size = np.linalg.norm(force[:, 1:], axis=1)
     values += _SENSOR_NOISE * size.max() * np.random.default_rng(0).normal(size=values.shape)
     meta["sensor"]["free_s"] = [[0.0, max(float(force[np.flatnonzero(size > 0)[0] - 1, 0]), 0.1)]]
-    tissue, sensor = (
-        np.asarray(read_picture(folder / "tissue.png", 0)) > 127,
-        np.column_stack([clock, values]),
-    )
-    return Video(rgb, right, tool, tissue, time_s, sensor, meta, (folder / "stereo.yaml").read_text("utf-8"))
+    sensor, pair = np.column_stack([clock, values]), (folder / "stereo.yaml").read_text("utf-8")
+    return Video(rgb, right, tool > 0, tissue > 0, time_s, sensor, meta, pair)
 
 
 def _written(video: Video, work: Path) -> Path:
@@ -234,12 +221,12 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _alarms(work: Path, seed: int) -> Iterator[dict[str, Any]]:
     """Messages on undegraded recordings, which were not tuned on."""
     for name in _JOBS:
-        folders, causes = _rendered(work, name, seed, _CLEAN), Counter[str]()
-        for folder in folders:
-            where = _written(_read(folder), work)
-            causes.update({one.split(":")[0] for one in _scored(where, 1.0)["messages"]} or {"none"})
+        videos, causes = _rendered(work, name, seed, _CLEAN), Counter[str]()
+        for video in videos:
+            messages = _scored(_written(video, work), 1.0)["messages"]
+            causes.update({one.split(":")[0] for one in messages} or {"none"})
         line = ", ".join(f"{k}: {n}" for k, n in causes.items())
-        yield {"scenes": name, "count": len(folders), "messages on": line}
+        yield {"scenes": name, "count": len(videos), "messages on": line}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

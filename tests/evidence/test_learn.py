@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evidence import training
 from evidence.datasets import coarser
 from evidence.learn import runs, stability
 from evidence.learn.runs import Run
@@ -16,6 +15,7 @@ from learn.data.clips import Clip, target
 from learn.data.grid import Grid
 from learn.evaluation.evaluate import EvaluationReport, evaluate, score
 from learn.settings import replace
+from learn.training.train import train
 
 GRID = Grid(32)
 
@@ -30,8 +30,9 @@ def test_a_run_is_cached_by_settings_and_data(
     run: Run, clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
-    train = training.train
-    monkeypatch.setattr(training, "train", lambda *given: trained.append(str(given[3])) or train(*given))
+    monkeypatch.setattr(
+        "evidence.training.train", lambda *given: trained.append(str(given[3])) or train(*given)
+    )
     first = runs.carry_out(run, clips, tmp_path)
     assert runs.carry_out(run, clips, tmp_path) == first
     assert len(trained) == 1
