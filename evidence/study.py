@@ -1,9 +1,7 @@
 """Studies: one experiment a module, from its question to its page in docs/results.
 
-To add one: a module of `evidence` whose docstring states the question, a function `measure` that returns the
-data (its parameters are the command's options), a function `page` that draws them, and
-`STUDY = Study(measure, "FOLDER/NAME.json", page)`. `python -m evidence MODULE` runs it,
-`all` and `status` find it, and a test draws the page from the stored data.
+A module of `evidence` with a constant `STUDY` is one. `python -m evidence MODULE` runs it, `all` and `status`
+find it.
 """
 
 from __future__ import annotations

@@ -17,8 +17,7 @@ from torch import nn
 
 from evidence import report, status
 from evidence.flow.scenes import jpeg
-from evidence.render.picture_statistics import Picture, corners
-from evidence.render.realism import OUTLINE, bare_picture, outlined, scaled_photograph
+from evidence.render.realism import OUTLINE, Picture, bare_picture, corners, outlined, scaled_photograph
 from evidence.study import Study
 from synth.errors import UserError
 from synth.fit.fitting import fit_camera

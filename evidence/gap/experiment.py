@@ -69,6 +69,7 @@ def measure(
     }
     seeded = [changed(settings, seed=seed) for seed in range(seeds)]
     trained = {kind: [errors(kind, clips, split, one, tests, work) for one in seeded] for kind in KINDS}
+    noise = gap.fit_noise([clips[i] for i in split.fit])
     sizes = (split.fit, split.select, own_test, split.test)
     return {
         "data": status.data(dataset, unseen),
@@ -76,7 +77,7 @@ def measure(
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen"), map(len, sizes), strict=True)),
         "seeds": seeds,
-        "flows": {"tvl1": {"noise": asdict(fitted_noise(clips, split.fit))} | summary(trained)},
+        "flows": {"tvl1": {"noise": asdict(noise)} | summary(trained)},
     }
 
 
@@ -94,15 +95,6 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     if set(number[: len(clips)]) & set(number[len(clips) :]):
         raise UserError("unseen: shares an anatomy with the other dataset")
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
-
-
-def fitted_noise(clips: Sequence[Clip], fit: Sequence[int]) -> gap.Noise:
-    """Noise of recovered flow, fitted on the clips `fit`."""
-    chosen = [clips[i] for i in fit]
-    ideal, recovered = (
-        [np.asarray(clip.displacement[name]) for clip in chosen] for name in ("ideal", "recovered")
-    )
-    return gap.fit_noise(ideal, recovered, [clip.mask for clip in chosen])
 
 
 def with_noise(clips: Sequence[Clip], noise: gap.Noise, seed: int) -> list[Clip]:
@@ -128,8 +120,9 @@ def errors(
     name = f"{kind}-seed{settings.seed}"
 
     def compute() -> Errors:
-        noise = fitted_noise(clips, split.fit) if kind == "N" else None
-        own = clips if noise is None else with_noise(clips, noise, settings.seed)
+        own = clips
+        if kind == "N":
+            own = with_noise(clips, gap.fit_noise([clips[i] for i in split.fit]), settings.seed)
         predictor = training.fit(name, own, split, settings, work / "models")
         found = {test: evaluate(predictor, part, source).per_clip() for test, (part, source) in tests.items()}
         return {test: {key: [row[key] for row in rows] for key in KEYS} for test, rows in found.items()}

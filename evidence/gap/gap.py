@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from bench.bootstrap import Interval
+from learn.data.clips import Clip
 
 Curve = NDArray[np.float64]
 
@@ -70,15 +71,12 @@ class Noise:
         return np.asarray(out * mask, np.float32)
 
 
-def fit_noise(
-    ideal: Sequence[NDArray[np.float32]],
-    recovered: Sequence[NDArray[np.float32]],
-    masks: Sequence[NDArray[np.float32]],
-) -> Noise:
-    """Noise fitted to training sequences: gain by least squares, then spread and reach of the residual.
-
-    Displacements are (T, 2, N, N) mm each, masks (N, N) 0/1.
-    """
+def fit_noise(clips: Sequence[Clip]) -> Noise:
+    """Noise of recovered displacement: gain by least squares, then spread and reach of the residual."""
+    ideal, recovered = (
+        [np.asarray(clip.displacement[name]) for clip in clips] for name in ("ideal", "recovered")
+    )
+    masks = [clip.mask for clip in clips]
     top = sum(float((i * r).sum()) for i, r in zip(ideal, recovered, strict=True))
     gain = top / max(sum(float((i * i).sum()) for i in ideal), 1e-12)
     square = neighbours = 0.0

@@ -30,9 +30,7 @@ def measure(
     sequences: int = 500,
     frames: int = 52,
     size: int = 256,
-    width: int = 32,
     epochs: int = 50,
-    batch: int = 64,
     workers: int = 8,
     accelerator: str = "auto",
 ) -> None:
@@ -41,14 +39,14 @@ def measure(
     Continues if it was stopped.
     """
     job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences, "frames": frames})
-    base = preset("paper", size=size, epochs=epochs, batch=batch)
+    base = preset("paper", size=size, epochs=epochs, batch=64)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(partial(_make, job, size, cache), range(sequences)))
     clips = [labels.whole(job, index, base.grid, cache) for index in range(sequences)]
     on_gpu = accelerator != "cpu" and torch.cuda.is_available()
     settings = replace(
         base,
-        arch=replace(base.arch, width=width, output="magnitude"),
+        arch=replace(base.arch, output="magnitude"),
         learning_rate=2e-3,
         schedule="cosine",
         precision="bf16-mixed" if on_gpu else "32-true",

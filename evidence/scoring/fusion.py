@@ -8,7 +8,7 @@ under a membrane, were set on sequences with even numbers; odd ones are reported
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,9 @@ from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from evidence import cache, report, status
+from evidence.intervals import mean_of
 from evidence.pooled import PRETRAINED
 from evidence.study import Study
-from learn.evaluation.statistics import interval
 from learn.inference.shipped import find_model
 from synth.dataset.store import Dataset
 from synth.dataset.store import Sequence as Stored
@@ -31,18 +31,8 @@ from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
 Floats = NDArray[np.float64]
+Case = dict[str, Any]  # input of the methods: `cameras`, and whether the membrane is stated
 _STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
-
-
-@dataclass(frozen=True)
-class Case:
-    """Input of the methods."""
-
-    cameras: int
-    membrane_stated: bool
-
-
-CASES = tuple(Case(cameras, stated) for cameras in (1, 2) for stated in (False, True))
 
 
 def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, Any]:
@@ -51,17 +41,18 @@ def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, 
     `work`: folder of estimates, which a later run reuses; `every`: 1 for odd numbers, 0 for even ones.
     """
     rows = []
-    for case in CASES:
-        model = Model(find_model(PRETRAINED[case.cameras]))
+    for cameras, stated in product((1, 2), (False, True)):
+        model = Model(find_model(PRETRAINED[cameras]))
+        case = {"cameras": cameras, "membrane_stated": stated}
         found = [_cached(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
-            rows += [_row(case, tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
+            rows += [case | _row(tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
     return {"data": status.data(data), "rows": rows}
 
 
 def _cached(sequence: Stored, case: Case, model: Model, work: Path) -> dict[str, Any]:
-    key = cache.key(sequence.attrs["content_hash"], case.cameras, case.membrane_stated, model.identity)
+    key = cache.key(sequence.attrs["content_hash"], case, model.identity)
     return dict(
         cache.result(work, f"fusion-{sequence.index}", key, lambda: _estimated(sequence, case, model))
     )
@@ -75,7 +66,7 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
         sequence["tissue"][:].astype(bool),
         sequence.attrs["scale_mm_per_px"],
         sequence.attrs["young_kpa"],
-        membrane if case.membrane_stated else "unknown",
+        membrane if case["membrane_stated"] else "unknown",
     )
     physics, both = Physics(), Fusion(MAIN, PHYSICS)
     frames: list[dict[str, ForceEstimate]] = []
@@ -83,14 +74,14 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
         flow, sure = sequence["flow_recovered"][k], sequence["flow_confidence"][k].astype(np.float32)
         estimates: dict[str, ForceEstimate] = {}
         moved = None
-        if case.cameras == 2:
+        if case["cameras"] == 2:
             moved = Moved(sequence["motion_recovered"][k], sequence["motion_deviation"][k])
         for name, method in ((MAIN, model), (PHYSICS, physics)):
             estimates[name] = method(FrameMotion(flow, sure, motion=moved), scene, False)
         frames.append(estimates)
     for estimates, revised in zip(frames, physics.revise(np.zeros(len(frames), bool)), strict=True):
         estimates[PHYSICS] = revised
-    for estimates, fused in zip(frames, both.fuse(frames, scene, case.cameras), strict=True):
+    for estimates, fused in zip(frames, both.fuse(frames, scene, case["cameras"]), strict=True):
         estimates[FUSION] = fused
     rows = {
         name: [[*one[name].force_mn.tolist(), one[name].low_mn, one[name].high_mn] for one in frames]
@@ -99,7 +90,7 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
     return {"membrane": membrane, "true": sequence["force"][:].tolist(), "estimated": rows}
 
 
-def _row(case: Case, tissue: str, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _row(tissue: str, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     scores: dict[str, list[float]] = {"whole": [], "size": [], "bias": [], "coverage": [], "width": []}
     for one in found:
         true, rows = np.array(one["true"]), np.array(one["estimated"][name], np.float64)
@@ -111,11 +102,8 @@ def _row(case: Case, tissue: str, name: str, found: Sequence[dict[str, Any]]) ->
         scores["bias"].append(float(off[size > _STRONG * peak].mean() / peak))
         scores["coverage"].append(float(((size >= low) & (size <= high)).mean()))
         scores["width"].append(float((high - low).mean() / peak))
-    row: dict[str, Any] = asdict(case) | {"tissue": tissue, "method": name, "sequences": len(found)}
-    for key, values in scores.items():
-        over = interval(np.array(values), np.random.default_rng(0))
-        row[key] = [over.mean, over.low, over.high]
-    return row
+    row = {"tissue": tissue, "method": name, "sequences": len(found)}
+    return row | {key: mean_of(values) for key, values in scores.items()}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

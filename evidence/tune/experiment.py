@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from evidence import report
+from evidence.intervals import mean_of
 from evidence.study import Study
-from learn.evaluation.statistics import interval
 from synth.job import reader
 from synth.tune import search
 from synth.tune.grid import differences
@@ -125,8 +125,7 @@ def _over(values: list[float | None]) -> str:
     """Mean over sequences with its interval, in percent."""
     if None in values:
         return "out of range"
-    found = interval(100 * np.asarray(values, np.float64), np.random.default_rng(0))
-    return report.mean_cell([found.mean, found.low, found.high], ".1f")
+    return report.mean_cell(mean_of(values), ".1f", 100)
 
 
 STUDY = Study(measure, "tune/tune.json", page)

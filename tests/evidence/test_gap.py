@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from made_clip import made_clip
 
 from evidence.gap import experiment, gap
 from synth.errors import UserError
@@ -30,7 +32,12 @@ def test_fitted_noise_is_that_added() -> None:
     mask[6:-6, 6:-6] = 1
     ideal = [np.cumsum(rng.normal(size=(6, 2, 1, 1)), axis=0).astype(np.float32) * mask for _ in range(8)]
     true = gap.Noise(0.9, 0.12, 2.0)
-    found = gap.fit_noise(ideal, [true.add(i, mask, rng) for i in ideal], [mask] * 8)
+    both = [{"ideal": i, "recovered": true.add(i, mask, rng)} for i in ideal]
+    clips = [
+        replace(made_clip(k, one["ideal"], np.zeros((6, 3)), mask), displacement=one)
+        for k, one in enumerate(both)
+    ]
+    found = gap.fit_noise(clips)
     assert found.gain == pytest.approx(0.9, abs=0.02)
     assert found.sigma_mm == pytest.approx(0.12, rel=0.1)
     assert found.reach_cells == pytest.approx(2.0, rel=0.1)
