@@ -47,6 +47,11 @@ GRID = Grid(64)
 _COMPONENTS = 200  # principal components of displacement
 _BASIS = 150  # sequences that they are found on
 _BATCH, _LEAST, _MOST = 16, 4, 80  # frames a batch, epochs
+SAME = "in distribution"  # tested sequences of the dataset that estimators are fitted on
+Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]
+"""By name: clips, and whether each lacks a membrane."""
+_PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
+_NAMES = {1: "monocular", 2: "stereo"}
 
 
 @dataclass(frozen=True)
@@ -158,13 +163,6 @@ def map_figures(predictor: Predictor, part: Sequence[Clip], source: str) -> dict
         "map_r2": round(known["map_r2_pooled"], 4),
         "false_positives": round(known["false_positive_relative"], 5),
     }
-
-
-SAME = "in distribution"  # tested sequences of the dataset that estimators are fitted on
-Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]
-"""By name: clips, and whether each lacks a membrane."""
-_PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
-_NAMES = {1: "monocular", 2: "stereo"}
 
 
 def measure(

@@ -35,6 +35,11 @@ from synth.job.schema import FemSection, FlowSection, Job, RenderSection
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
 _MODELS = (models.RIDGE, models.NEAREST, models.PHYSICS)
 _NO_COST = ("peak_rss_mb", "store")  # timings of a sequence that are not costs of making it
+_NAME = "{law} {tets}, {spp} spp, {flow}"  # of a row's pipeline
+PARTS = {"": "errors", "across_": "across"}
+"""The whole force, and its part across the line of sight: prefix of a row's keys, and key of the errors."""
+_ENDS = ("rmse", "low", "high")
+_WHAT = {"": "the force", "across_": "the force across the line of sight"}
 
 
 @dataclass(frozen=True)
@@ -176,13 +181,6 @@ def errors(one: Pipeline, made: Sequences, tested: Sequences, work: Path) -> dic
     key = cache.key(one.name, [clip.content_hash for clip in (*fit, *tests)])
     found: dict[str, Any] = cache.result(work / "estimates", one.name.replace(", ", "-"), key, compute)
     return found
-
-
-_NAME = "{law} {tets}, {spp} spp, {flow}"  # of a row's pipeline
-PARTS = {"": "errors", "across_": "across"}
-"""The whole force, and its part across the line of sight: prefix of a row's keys, and key of the errors."""
-_ENDS = ("rmse", "low", "high")
-_WHAT = {"": "the force", "across_": "the force across the line of sight"}
 
 
 def measure(

@@ -31,6 +31,11 @@ FRAMES = 6  # frames a scene; the last shows no instrument
 _FAMILIES = ("healthy", "pale", "hyperaemic", "oedematous", "calf")
 _GESTURES = ("pull", "push", "slide", "retract")  # together they use every instrument
 _AWAY_MM = 300.0  # outside every view
+_HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
+_BATCH, _RATE = 8, 3e-3
+
+Picture = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -86,13 +91,6 @@ def _pose(
     tip = near + max(0.0, rng.uniform(-6, 12)) * shaft  # in contact a third of the time
     spread = rng.uniform(0.3, 9.0)
     return tip + np.array([[0.5], [-0.5]]) * spread * side, np.stack([shaft, shaft])
-
-
-_HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
-_BATCH, _RATE = 8, 3e-3
-
-Picture = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
 
 
 def measure(out: Path = toolnet.WEIGHTS.parent, scenes: int = 39, steps: int = 700, seed: int = 0) -> None:

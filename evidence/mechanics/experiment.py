@@ -31,6 +31,9 @@ FRAMES, FPS, SIZE, VERTICES = 8, 8.0, (192, 144), 8000  # 1 s, one or two period
 
 PLAIN = "plain"
 _UNTOUCHED = 1e-6  # load of a tool without effect
+ON_PLAIN, ON_MIXTURE = "plain", "mixture"
+PARTS = {"across": "the force across the line of sight", "whole": "the force"}
+Errors = list[float | None]  # of every sequence [%]; None: refused
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,7 @@ class Condition:
     """Mechanical properties of tissue."""
 
     fem: Mapping[str, Any] = field(default_factory=dict)  # job keys in addition to the common ones
-    removed: bool = (
-        False  # whether the untouched tissue's motion is subtracted, as by a perfect pulse removal
-    )
+    removed: bool = False  # whether the untouched tissue's motion is subtracted: a perfect pulse removal
     mixed: bool = True  # whether it is in the mixture
 
 
@@ -130,11 +131,6 @@ def subtracted(clip: Clip, own: Clip) -> Clip:
         content_hash=f"{clip.content_hash}-{own.content_hash}",
         displacement={name: moved - pulse for name, moved in clip.displacement.items()},
     )
-
-
-ON_PLAIN, ON_MIXTURE = "plain", "mixture"
-PARTS = {"across": "the force across the line of sight", "whole": "the force"}
-Errors = list[float | None]  # of every sequence [%]; None: refused
 
 
 def measure(

@@ -22,6 +22,12 @@ Picture = NDArray[np.uint8]
 # A highlight is lighter than its surroundings by this much, and nearly white.
 _BRIGHTER_L = 12.0
 _WHITE_L = 88.0
+_SIDE, _STEP = 160, 40
+OUTLINE = (
+    "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
+    " 0.37,0.86 0.28,0.76"
+)
+"""Of the cortex in the photograph of the stored results."""
 
 
 def statistics(rgb: Picture) -> dict[str, float]:
@@ -121,14 +127,6 @@ def _elongation(label: NDArray[np.int32], chosen: NDArray[np.int64]) -> float:
         spread = np.linalg.eigvalsh(np.cov(away.T, bias=True) + np.eye(2) / 12)
         found.append(float(np.sqrt(spread[1] / spread[0])))
     return float(np.median(found[1:] or found))
-
-
-_SIDE, _STEP = 160, 40
-OUTLINE = (
-    "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
-    " 0.37,0.86 0.28,0.76"
-)
-"""Of the cortex in the photograph of the stored results."""
 
 
 def measure(
