@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Curve = NDArray[np.float64]
+from synth.arrays import Floats
+
 Interval = tuple[float, float]
 
 RESAMPLES = 1000
@@ -13,7 +13,7 @@ LEAST_SAMPLES = 8
 LEVEL = 0.95
 
 
-def block_length(x: Curve) -> float:
+def block_length(x: Floats) -> float:
     """Mean block length for the stationary bootstrap of the mean of `x`, in samples.
 
     Politis and White, "Automatic block-length selection for the dependent bootstrap" (Econometric Reviews
@@ -47,7 +47,7 @@ def block_length(x: Curve) -> float:
     return float(np.clip(length, 1.0, min(n / 3, 3 * np.sqrt(n))))
 
 
-def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) -> Floats:
     """Counts of each of `n` samples in each stationary bootstrap resample, (resamples, n).
 
     Politis and Romano, "The stationary bootstrap" (JASA 1994): blocks of geometric length from uniform
@@ -63,7 +63,7 @@ def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) 
     return np.bincount(flat, minlength=resamples * n).reshape(resamples, n).astype(np.float64)
 
 
-def interval(values: Curve) -> Interval:
+def interval(values: Floats) -> Interval:
     """The middle 95% of resampled values (R,); those that are not finite are left out."""
     values = values[np.isfinite(values)]
     if len(values) == 0:

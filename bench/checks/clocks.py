@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.checks.sensor import LEAST_FRAMES, SensorMotion, correlation
 from bench.checks.times import rising_times
 from bench.recording.clocks import find_other_unit
 from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
+from synth.arrays import Floats
 from synth.recording_flow.finding import Finding
-
-Curve = NDArray[np.float64]
 
 _COVERED = 0.9  # least share of the video that the sensor should cover; by hand
 # Chosen by hand between the corrupted and the clean recordings of docs/results/scoring/stability.
@@ -69,7 +67,7 @@ def check_motion(sensor: SensorMotion) -> list[Finding]:
     return [Finding("warning", "clocks", found)] if found else []
 
 
-def _clocks(time_s: Curve) -> Iterator[tuple[str, Curve]]:
+def _clocks(time_s: Floats) -> Iterator[tuple[str, Floats]]:
     """Possible faults of the clock, and the frames' times (T,) [s] that follow."""
     frame, since = float(np.median(np.diff(time_s))), time_s - time_s[0]
     yield "the video runs backwards", time_s[-1] - since

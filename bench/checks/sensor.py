@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.flow_size import FlowSize
 from bench.methods.fusion import Fusion
@@ -19,9 +18,8 @@ from bench.methods.protocol import Method
 from bench.recording.folder import Recording
 from bench.sensor.alignment import AlignedSensor
 from bench.tracking.tracking import TrackedRecording
+from synth.arrays import Floats
 from synth.recording_flow.finding import Finding
-
-Curve = NDArray[np.float64]
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
 _LOADED = 0.25  # share of the range of force above which the tissue is not at rest; by hand
@@ -100,14 +98,14 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
 class SensorMotion:
     """The sensor's force, the tissue's motion and the methods' forces in the frames that have all of them."""
 
-    time_s: Curve  # (T,) of the tracked frames [s]
-    axes_mn: Curve  # (T, 3) the sensor's force
-    moved: Curve  # (T,) mean motion of the tissue since the rest frame, any unit
-    forces_mn: tuple[Curve, ...] = ()  # of each method, (T, 3) in the camera's axes; none if E is unknown
+    time_s: Floats  # (T,) of the tracked frames [s]
+    axes_mn: Floats  # (T, 3) the sensor's force
+    moved: Floats  # (T,) mean motion of the tissue since the rest frame, any unit
+    forces_mn: tuple[Floats, ...] = ()  # of each method, (T, 3) in the camera's axes; none if E is unknown
     observed_axes: int = 0  # number of camera axes that the video shows; 0 if the sensor has other axes
 
     @property
-    def size_mn(self) -> Curve:
+    def size_mn(self) -> Floats:
         """(T,) magnitude of the sensor's force."""
         return np.asarray(np.linalg.norm(self.axes_mn, axis=1))
 
@@ -117,7 +115,7 @@ class SensorMotion:
         return not np.ptp(self.axes_mn, axis=0).any()
 
     @property
-    def compared(self) -> tuple[Curve, list[Curve]]:
+    def compared(self) -> tuple[Floats, list[Floats]]:
         """The observed components of the sensor and of each method; no method if they are next to nothing."""
         n = self.observed_axes or 3
         axes, forces = self.axes_mn[:, :n], [force[:, :n] for force in self.forces_mn]
@@ -206,7 +204,7 @@ def check_constant(sensor: SensorMotion) -> list[Finding]:
     return []
 
 
-def correlation(one: Curve, other: Curve) -> float:
+def correlation(one: Floats, other: Floats) -> float:
     """Pearson's correlation of two curves (T,); 0 if one is constant."""
     if not (np.ptp(one) > 0 and np.ptp(other) > 0):
         return 0.0

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording.folder import Recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.tracking.tracking import TrackedRecording
+from synth.arrays import Floats
 from synth.recording_flow.finding import Finding
 
 # Chosen by hand.
@@ -57,7 +57,7 @@ def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding
     return found
 
 
-def rising_times(tracked: TrackedRecording) -> NDArray[np.float64]:
+def rising_times(tracked: TrackedRecording) -> Floats:
     """Times (T,) [s] of the decoded frames whose time is later than all before."""
     t = np.array([time_s for _, time_s in tracked.decoded if time_s is not None], np.float64)
     latest = np.maximum.accumulate(np.append(-np.inf, t[:-1])) if len(t) else t

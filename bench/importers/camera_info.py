@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.importers.registry import Floats
+from synth.arrays import Floats
 from synth.errors import UserError
 
 _TERMS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.importers.registry import MOST_FRAMES, Floats, Intake, one_of
+from bench.importers.registry import MOST_FRAMES, Intake, one_of
+from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
@@ -57,7 +57,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         orientation = reader.GetMetaData("UltrasoundImageOrientation")
         notes.append(f"orientation {orientation}: pictures are imported as stored")
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
+    def pictures() -> Iterator[Pixels]:
         for k in range(count):
             reader.SetExtractIndex([0, 0, k])
             reader.SetExtractSize([size[0], size[1], 0])

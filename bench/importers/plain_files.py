@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.importers.registry import Floats, Intake, picture_files
+from bench.importers.registry import Intake, picture_files
 from bench.recording import csv_table
+from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 from synth.video import read as video
 
@@ -22,7 +22,7 @@ _FORCES = (
     ("force.x", "force.y", "force.z"),
 )
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-_Pictures = Callable[[], Iterator[NDArray[np.uint8]]]
+_Pictures = Callable[[], Iterator[Pixels]]
 _NANOSECONDS = 1e15  # larger numbers are no seconds of any clock: `rostopic echo -p` writes nanoseconds
 
 

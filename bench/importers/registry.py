@@ -12,18 +12,17 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording import clocks, writer
+from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 from synth.video.file_numbers import natural_order
 
-Floats = NDArray[np.float64]
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
 """Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
 BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")  # topics
@@ -51,8 +50,8 @@ class SecondView:
     """Pictures of the right camera or the depth camera, not yet decoded."""
 
     kind: Literal["right", "depth"]
-    frame: NDArray[np.int64]  # (M,) number of the frame that belongs to each picture; -1: none
-    pictures: Callable[[], Iterator[NDArray[Any]]]
+    frame: Ints  # (M,) number of the frame that belongs to each picture; -1: none
+    pictures: Callable[[], Iterator[Array]]
     """The pictures in order: RGB (H, W, 3) uint8, or depth (H, W) mm, uint16 or float32; 0, NaN: unknown."""
     lens: Mapping[str, object] | None = None  # section `depth` of meta.yaml; None: unknown, or stereo
     pair: Mapping[str, Floats] | None = None
@@ -64,7 +63,7 @@ class Intake:
     """The contents of a source; its pictures are not yet decoded."""
 
     times_s: Floats  # (T,) of the frames [s]
-    pictures: Callable[[], Iterator[NDArray[Any]]]
+    pictures: Callable[[], Iterator[Array]]
     """The T frames in order: grey (H, W) or RGB[A] (H, W, C) uint8 or uint16; after `read_source`
     (H, W, 3) uint8."""
     force_s: Floats = field(default_factory=lambda: np.zeros(0))  # (N,) s; empty: no force
@@ -103,7 +102,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
         found: Intake = import_module(maker).read_source(source, dict(use or {}))
     _refuse_odd(source, found)
 
-    def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[NDArray[Any]]:
+    def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[Array]:
         with _damage_as_user_error(source):
             size = None
             for k, picture in enumerate(map(_as_rgb, view.pictures()) if rgb else view.pictures()):
@@ -203,7 +202,7 @@ def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | 
     return names[0] if names else None
 
 
-def _as_rgb(picture: NDArray[Any]) -> NDArray[np.uint8]:
+def _as_rgb(picture: Array) -> Pixels:
     """Converts grey or colour to (H, W, 3) uint8 sRGB; 16 bits are cut to 8. UserError for other types."""
     if picture.dtype == np.uint16:
         picture = (picture >> 8).astype(np.uint8)

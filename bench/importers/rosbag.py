@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.importers import camera_info
 from bench.importers.camera_info import Lens, join_pair
-from bench.importers.registry import Floats, Intake, SecondView, one_of
+from bench.importers.registry import Intake, SecondView, one_of
+from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -32,8 +32,8 @@ _CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4,
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _HEADER = 12  # bytes before the PNG in a compressed depth picture
 
-_Read = Callable[[Path, Any], NDArray[Any]]
-_Pictures = Callable[..., Iterator[NDArray[Any]]]
+_Read = Callable[[Path, Any], Array]
+_Pictures = Callable[..., Iterator[Array]]
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
@@ -55,7 +55,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     def opened() -> Any:
         return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
-    def pictures(topic: str, read: _Read = _picture) -> Iterator[NDArray[Any]]:
+    def pictures(topic: str, read: _Read = _picture) -> Iterator[Array]:
         with opened() as bag:
             for _, message in _messages(bag, topic):
                 yield read(source, message)
@@ -121,7 +121,7 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     )
 
 
-def partners(times_s: Floats, frames_s: Floats) -> NDArray[np.int64]:
+def partners(times_s: Floats, frames_s: Floats) -> Ints:
     """The frame of each picture of another camera, (M,), mutually nearest in time; -1: none.
 
     Args:
@@ -134,14 +134,14 @@ def partners(times_s: Floats, frames_s: Floats) -> NDArray[np.int64]:
     return np.where((picture[frame] == np.arange(len(times_s))) & (apart <= step / 2), frame, -1)
 
 
-def _nearest(times_s: Floats, among_s: Floats) -> NDArray[np.int64]:
+def _nearest(times_s: Floats, among_s: Floats) -> Ints:
     """Index into `among_s` of the time nearest to each of (N,) times."""
     order = np.argsort(among_s, kind="stable")
     rising = among_s[order]
     return order[np.searchsorted((rising[1:] + rising[:-1]) / 2, times_s)]
 
 
-def _lens(bag: Any, pictures: str, named: str | None, picture: NDArray[Any]) -> Lens | None:
+def _lens(bag: Any, pictures: str, named: str | None, picture: Array) -> Lens | None:
     names = sorted({c.topic for c in bag.connections if c.msgtype in _LENSES})
     usual = camera_info.info_name(pictures)
     if not named and usual not in names:
@@ -183,9 +183,7 @@ def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
         yield 1e-9 * logged, bag.deserialize(raw, connection.msgtype)
 
 
-def _table(
-    bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int
-) -> NDArray[np.float64]:
+def _table(bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int) -> Floats:
     """Times [s] and values of a topic's messages, (N, 1 + width), all on one clock."""
     rows = [
         (logged, message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec, *read(message))
@@ -211,7 +209,7 @@ def _place(message: Any) -> tuple[float, float, float]:
     return place.x, place.y, place.z
 
 
-def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
+def _picture(source: Path, message: Any) -> Pixels:
     if hasattr(message, "format"):
         return checked_file.decode_picture(bytes(message.data)).astype(np.uint8)[..., ::-1]
     channels = _CHANNELS.get(message.encoding)
@@ -224,7 +222,7 @@ def _picture(source: Path, message: Any) -> NDArray[np.uint8]:
     return picture
 
 
-def _depth(source: Path, message: Any) -> NDArray[Any]:
+def _depth(source: Path, message: Any) -> Array:
     """Depth (H, W) mm, uint16 or float32; by ROS's REP 118 16-bit pictures are in mm, floats in metres."""
     if hasattr(message, "format"):
         if "compressedDepth" in message.format and message.format.startswith("32FC1"):

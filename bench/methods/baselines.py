@@ -19,12 +19,12 @@ from sklearn.model_selection import PredefinedSplit, cross_val_predict
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext
 from learn.data.clips import assumed_young
 from learn.data.grid import Grid, GridView, certainty
+from synth.arrays import Floats
 from synth.errors import UserError
 
 if TYPE_CHECKING:
     from learn.data.clips import Clip
 
-Floats = NDArray[np.float64]
 Rule = Callable[[Field, Field, Field], Floats]
 """Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
 only, in x. In stereo displacement is (3, N, N) mm and confidence (2, N, N), lateral and in depth."""

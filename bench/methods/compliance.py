@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from synth.arrays import Floats, Map
 from synth.dataset import provenance
 from synth.fem import surface_embedding
 from synth.fem.membrane import MembraneSheet
@@ -26,8 +26,6 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
 from synth.system import cache
-
-Floats = NDArray[np.float64]
 
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
@@ -115,7 +113,7 @@ def build(components: int, tissue: TissueKind) -> Compliance:
 
 
 @lru_cache(maxsize=4)
-def _stored(tissue: TissueKind) -> NDArray[np.float32]:
+def _stored(tissue: TissueKind) -> Map:
     """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
     return cache.cached(
@@ -129,7 +127,7 @@ def _stored(tissue: TissueKind) -> NDArray[np.float32]:
     )
 
 
-def _dumped(matrix: NDArray[np.float32]) -> bytes:
+def _dumped(matrix: Map) -> bytes:
     np.save(held := io.BytesIO(), matrix)
     return held.getvalue()
 

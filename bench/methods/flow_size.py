@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
+from synth.arrays import Floats
 
 PEAK_PERCENTILE = 98.0  # for the largest displacement, without outliers of flow at edges; by hand
 
@@ -23,7 +23,7 @@ class FlowSize:
     in some frames only would change the statistic more.
     """
 
-    def __init__(self, measure: Callable[[NDArray[np.float64]], float]) -> None:
+    def __init__(self, measure: Callable[[Floats], float]) -> None:
         """`measure`: the statistic [mm] of at least one length, (P,) mm."""
         self._measure = measure
 

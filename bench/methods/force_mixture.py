@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri, softmax
+
+from synth.arrays import Floats
 
 _DRAWS = 400  # by hand: 20 draws lie below a quantile of 0.05
 _SURELY = 6.25  # 90% quantile of chi-squared with 3 degrees of freedom; below it 0 is in the interval
@@ -18,13 +19,13 @@ _SURELY = 6.25  # 90% quantile of chi-squared with 3 degrees of freedom; below i
 class ForceMixture:
     """A method's probability distribution of a force, a mixture of M Gaussians."""
 
-    weight: NDArray[np.float64]  # (M,) with sum 1
-    force: NDArray[np.float64]  # (M, 3), mN or, over E, mN/kPa
-    covariance: NDArray[np.float64]  # (M, 3, 3)
+    weight: Floats  # (M,) with sum 1
+    force: Floats  # (M, 3), mN or, over E, mN/kPa
+    covariance: Floats  # (M, 3, 3)
     common: float = 0.0  # relative standard deviation common to all components, not in `covariance`
 
     @property
-    def mean(self) -> NDArray[np.float64]:
+    def mean(self) -> Floats:
         """(3,)."""
         return np.asarray(self.weight @ self.force, np.float64)
 
@@ -37,7 +38,7 @@ class ForceMixture:
         along = np.einsum("ma,mb->mab", self.force, self.force)
         return replace(self, covariance=self.covariance + gain**2 * along)
 
-    def observe(self, force: NDArray[np.float64], covariance: NDArray[np.float64]) -> ForceMixture:
+    def observe(self, force: Floats, covariance: Floats) -> ForceMixture:
         """The posterior after an independent estimate `force` (3,) with error `covariance` (3, 3).
 
         A product of Gaussians (Bishop, Pattern Recognition and Machine Learning, 2006, section 2.3).
@@ -53,7 +54,7 @@ class ForceMixture:
         )
 
 
-def mix(parts: Sequence[ForceMixture], weight: NDArray[np.float64]) -> ForceMixture:
+def mix(parts: Sequence[ForceMixture], weight: Floats) -> ForceMixture:
     """The mixture of distributions with weights of sum 1."""
     return ForceMixture(
         np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
@@ -85,6 +86,6 @@ def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
 
 
 @lru_cache(maxsize=1)
-def _normals() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _normals() -> tuple[Floats, Floats]:
     rng = np.random.default_rng(0)
     return rng.normal(size=(_DRAWS, 3)), rng.permutation(ndtri((np.arange(_DRAWS) + 0.5) / _DRAWS))

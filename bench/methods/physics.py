@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
@@ -24,10 +23,9 @@ from bench.methods.posterior import Observation, Posterior
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from learn.data.clips import assumed_young
 from learn.data.grid import GridView
+from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
 from synth.job.types import MembraneState
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ class Physics:
             self._weights = weigh_tissues(scene, self._frames[-1:], self._weights.own_mm)
         return self._estimate(observed, picture)
 
-    def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
         assert self._scene is not None
         own = [one for one, free in zip(self._frames, contact_free, strict=True) if free and one.size_mm > 0]

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.protocol import ForceEstimate, FrameMotion, Method, MethodContext, Revising
+from synth.arrays import Mask
 from synth.errors import UserError, as_user_error
 from synth.plugins import Registry, check_answer
 
@@ -40,7 +40,7 @@ class Plugged:
             estimate = self._method(copy.deepcopy(frame), scene, picture)
         return self._checked(estimate, frame.confidence.shape)
 
-    def _revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def _revise(self, contact_free: Mask) -> list[ForceEstimate]:
         with as_user_error(self._label):
             estimates = list(self._method.revise(contact_free.copy()))
             if len(estimates) != len(contact_free):

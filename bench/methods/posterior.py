@@ -19,15 +19,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.special import logsumexp
 
 from bench.methods import compliance
 from bench.methods.compliance import OPENING_MM, TissueKind
 from bench.methods.force_mixture import ForceMixture
+from synth.arrays import Floats, Map
 
-Floats = NDArray[np.float64]
 Axes = tuple[float, float, float]
 
 
@@ -64,7 +63,7 @@ class LoadBasis:
     size: Floats  # (R,) standard deviation along each direction under loads of unit size
     force: Floats  # (3, R) total force per coefficient [mN/mm]
     omitted: Floats  # (3,) variance of the total force in the omitted directions, loads of unit size
-    contacts: NDArray[np.float32]  # (R, H, 3) coefficients of contacts of 1 mN along each axis
+    contacts: Map  # (R, H, 3) coefficients of contacts of 1 mN along each axis
     loads: Floats  # (3 K, R) mN at the nodes per coefficient
     shares: Floats  # (K, H) share of each contact carried by each node
     around: Floats  # (P, P) weights of means over neighbouring points

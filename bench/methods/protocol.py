@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.force_mixture import ForceMixture
+from synth.arrays import Floats, Map, Mask
 from synth.job.types import MembraneState
 from synth.recording_flow.frame_motion import FrameMotion as FrameMotion
 
-Field = NDArray[np.float32]  # (H, W, ...) on the pixels that flow is computed on
+Field = Map  # (H, W, ...) on the pixels that flow is computed on
 
 
 @dataclass(frozen=True)
 class MethodContext:
     """A recording's constants, for the pixels that flow is computed on."""
 
-    tissue: NDArray[np.bool_]
+    tissue: Mask
     """(H, W)."""
     scale_mm_per_px: float
     young_kpa: float | None
@@ -42,7 +42,7 @@ class MethodContext:
 class ForceEstimate:
     """A method's estimate of one frame."""
 
-    force_mn: NDArray[np.float64]
+    force_mn: Floats
     """(3,) force on the tissue in camera axes [mN]; of magnitudes alone in x, with NaN for y and z."""
     density: Field | None = None
     """(H, W) magnitude of the force density on the rest frame's pixels [kPa], for the force maps."""
@@ -97,7 +97,7 @@ class Method(Protocol):
 class Revising(Protocol):
     """A method that estimates all frames again at the end of a video."""
 
-    def revise(self, contact_free: NDArray[np.bool_]) -> list[ForceEstimate]:
+    def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """An estimate of each frame since the start of the recording, without `density`.
 
         `contact_free`: (T,) whether the tissue is known to be without contact.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from synth.arrays import Floats
 
 _UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _TIMES_AS_LONG = 100.0
@@ -11,7 +12,7 @@ _SLOW_SENSOR_S = 0.1
 _SLOW_VIDEO_S = 1.0
 
 
-def find_other_unit(frame_s: NDArray[np.float64], force_s: NDArray[np.float64]) -> str:
+def find_other_unit(frame_s: Floats, force_s: Floats) -> str:
     """Describes which of two clocks seems not to be in seconds; empty if neither does or it can't be decided.
 
     A sensor may run for hours next to a short video. So the longer record must be far longer, and sampled

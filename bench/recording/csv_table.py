@@ -9,17 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.system import checked_file
 
 _LARGEST_BYTES = 512 << 20
 
 
-def read_csv(
-    path: Path, required: Sequence[str], optional: Sequence[str] = ()
-) -> dict[str, NDArray[np.float64]]:
+def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Floats]:
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
     Args:

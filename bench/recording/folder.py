@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording import csv_table, meta
 from bench.recording.meta import Meta
+from synth.arrays import Floats, Mask
 from synth.errors import UserError
 from synth.job.types import Section
 from synth.video import file_numbers
@@ -45,9 +45,9 @@ _EPOCH_S = 1e8  # three years, longer than any recording: larger times count fro
 class Force:
     """The sensor's samples on its own clock, converted in unit and sign only."""
 
-    time_s: NDArray[np.float64]  # (N,) strictly rising [s]
-    force_mn: NDArray[np.float64]  # (N, 3) force on the tissue [mN]; NaN where the file has none
-    gravity: NDArray[np.float64] | None = None  # (N, 3) unit vector in the sensor's axes: gx, gy, gz
+    time_s: Floats  # (N,) strictly rising [s]
+    force_mn: Floats  # (N, 3) force on the tissue [mN]; NaN where the file has none
+    gravity: Floats | None = None  # (N, 3) unit vector in the sensor's axes: gx, gy, gz
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Recording:
         others = "mask.png is used for" if self.masks.default else "no tool is assumed in"
         return f"masks/ has {count} of {frames} frames; {others} the others"
 
-    def tissue_mask(self, size: tuple[int, int]) -> NDArray[np.bool_]:
+    def tissue_mask(self, size: tuple[int, int]) -> Mask:
         """Mask (H, W) of trackable tissue in the rest frame: `tissue.png`, else the whole picture."""
         tissue = np.ones(size, bool) if self.tissue is None else video.read_mask(self.tissue, size)
         if self.region is not None:
@@ -268,7 +268,7 @@ def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[
     return times
 
 
-def _rising(time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _rising(time: Floats) -> Mask:
     """Rows (N,) to keep so that times rise: those later than all before, or earlier than all after.
 
     Whichever keeps more rows: a single wrong time must not exclude all that follow.

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 
 from bench.recording.folder import Recording
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.flow.estimator import Map
 from synth.flow.stereo import calibration
-from synth.flow.stereo.rig import Floats, StereoRig
+from synth.flow.stereo.rig import StereoRig
 from synth.recording_flow.decode import Footage
 from synth.recording_flow.frame_motion import FrameMotion, Size
 from synth.recording_flow.stereo import DepthVideo, RightVideo

@@ -7,9 +7,9 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording import writer
+from synth.arrays import Pixels
 from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
 from synth.errors import UserError, as_path
@@ -81,6 +81,6 @@ def _write_pictures(
         _write(folder / f"{t:06d}.png", rgb[..., ::-1])
 
 
-def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+def _write(path: Path, picture: Pixels) -> None:
     if not cv2.imwrite(str(path), np.ascontiguousarray(picture)):
         raise UserError(f"{path}: could not be written")

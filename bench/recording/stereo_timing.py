@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map, Pixels
 from synth.flow import image
 from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo.track import StereoTracker
 
-Motion = NDArray[np.float64]  # (T, P, 2) px of P points since the rest frame, the first; NaN: not tracked
-Places = NDArray[np.float32]
+Motion = Floats  # (T, P, 2) px of P points since the rest frame, the first; NaN: not tracked
 
 _CORNERS, _APART_PX, _LEAST_POINTS = 200, 5, 8
 _WINDOW = (13, 13)
@@ -43,9 +42,9 @@ class StereoTiming:
         at = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
         x, y = np.rint(at).astype(int).T
         in_right = at - np.column_stack([stereo.rest.disparity[y, x], np.zeros(len(at))])
-        self._at: list[Places] = [at, in_right.astype(np.float32)]
+        self._at: list[Map] = [at, in_right.astype(np.float32)]
         self._last = list(self._at)
-        self._moved: list[list[Places]] = [[np.zeros_like(at)] for _ in range(2)]
+        self._moved: list[list[Map]] = [[np.zeros_like(at)] for _ in range(2)]
         self._time_s = [0.0]
 
     def add(self, left: Rgb, right: Rgb, time_s: float) -> None:
@@ -70,7 +69,7 @@ class StereoTiming:
         step_s = float(np.median(np.diff(self._time_s)))
         return lag * step_s, self._time_s[since] if since > _LEAST_FRAMES else None
 
-    def _picture(self, rgb: Rgb, camera: int) -> NDArray[np.uint8]:
+    def _picture(self, rgb: Rgb, camera: int) -> Pixels:
         """Local contrast of the rectified picture, (H, W)."""
         grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, camera), (0, 0), 1)
         return image.local_contrast(grey, _WINDOW)
@@ -87,7 +86,7 @@ def find_lag(left: Motion, right: Motion) -> tuple[float, int]:
     moving = length > max(_MOVING * float(np.percentile(length, 90)), _MOVED_PX)
     left, right = left[:, moving], right[:, moving]
 
-    def apart(lag: float) -> NDArray[np.float64]:
+    def apart(lag: float) -> Floats:
         """Median squared difference of the cameras' motions, (T,); NaN beyond the video."""
         at = np.maximum(frames - lag, 0)
         below = np.minimum(at.astype(int), len(frames) - 2)

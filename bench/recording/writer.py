@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import av
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from synth.arrays import Array, Floats, Pixels
 from synth.video.write import encode
 
 if TYPE_CHECKING:
     from synth.render.camera.camera import Camera
-
-Floats = NDArray[np.float64]
 
 
 def write_frames(folder: Path, time_s: Floats) -> None:
@@ -57,7 +55,7 @@ def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
     storage.release()
 
 
-def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[NDArray[Any]]) -> None:
+def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[Array]) -> None:
     """Writes right or depth pictures as FOLDER/NNNNNN.png by frame number, without those of no frame (-1).
 
     Args:
@@ -80,7 +78,7 @@ def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[NDArray
 
 def write_video(
     path: Path,
-    pictures: Iterator[NDArray[np.uint8]],
+    pictures: Iterator[Pixels],
     times_s: Floats,
     crf: int = 12,
     progress: Callable[[int], None] = lambda done: None,
@@ -97,7 +95,7 @@ def write_video(
     options = {"crf": str(crf), "threads": "1"}
     rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))
 
-    def even() -> Iterator[NDArray[np.uint8]]:
+    def even() -> Iterator[Pixels]:
         for k, rgb in enumerate(pictures):
             yield rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
             progress(k + 1)

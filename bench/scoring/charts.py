@@ -6,12 +6,12 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.comparison import FUSION, PHYSICS
 from bench.scoring import metrics
-from bench.scoring.result import Curve, Result
+from bench.scoring.result import Result
 from bench.sensor.clock_sync import Offset
+from synth.arrays import Floats
 from synth.publish.svg import svg
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def draw_force(result: Result, others: bool = False) -> str:
     return svg(_WIDE, _HIGH + 40, draw)
 
 
-def scale_curves(result: Result) -> tuple[Curve | None, dict[str, Curve], str]:
+def scale_curves(result: Result) -> tuple[Floats | None, dict[str, Floats], str]:
     """Magnitudes of the sensor's and each method's force, (T,) each, and the axis label.
 
     Without a known E forces are scaled: by the gain of a separate press, if there is one; else the sensor by
@@ -152,7 +152,7 @@ def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
     return svg(_HALF, _HIGH, draw)
 
 
-def _scored_pairs(result: Result) -> tuple[Curve, Curve]:
+def _scored_pairs(result: Result) -> tuple[Floats, Floats]:
     """Sensor and main method in the scored frames for which both have a force."""
     assert result.sensor_mn is not None
     predicted = result.methods[result.main].size_mn
@@ -160,16 +160,16 @@ def _scored_pairs(result: Result) -> tuple[Curve, Curve]:
     return result.sensor_mn[good], predicted[good]
 
 
-def _largest(values: NDArray[np.float64]) -> float:
+def _largest(values: Floats) -> float:
     """The largest value; 1 if none is above zero."""
     return float(np.nanmax(values, initial=0.0)) or 1.0
 
 
-def _band(axes: Axes, x: Curve, low: Curve, high: Curve, name: str, colour: str) -> None:
+def _band(axes: Axes, x: Floats, low: Floats, high: Floats, name: str, colour: str) -> None:
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, label=name)
 
 
-def _dots(axes: Axes, x: Curve, y: Curve) -> None:
+def _dots(axes: Axes, x: Floats, y: Floats) -> None:
     many = len(x) > 100
     axes.scatter(x, y, 12 if many else 28, _MAIN, alpha=0.45 if many else 0.8, linewidths=0)
 

@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.checks.judgement import judge
 from bench.checks.sensor import find_sensor_motion
@@ -22,15 +21,15 @@ from bench.recording.folder import Recording
 from bench.recording.meta import Meta, Span
 from bench.recording.pixel_scale import PixelScale
 from bench.scoring import metrics
-from bench.scoring.result import Curve, Gain, Result, Scored
+from bench.scoring.result import Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
+from synth.arrays import Array, Floats, Mask
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import first_fault, problems
 from synth.recording_flow.flow import LocalFlow
 
-Flags = NDArray[np.bool_]
 _MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones
 _SEED = 0  # of the bootstrap, for reproducible intervals
 
@@ -97,16 +96,16 @@ def evaluate_recording(
 class _Reference:
     """The data that every method is scored against."""
 
-    time_s: Curve
+    time_s: Floats
     sensor: AlignedSensor
-    lost: Flags  # (T,) frames without valid forces
-    scored: Flags  # (T,) frames that are scored, unless they are lost
-    press: Flags | None  # (T,) frames of the calibrating press; None without one
+    lost: Mask  # (T,) frames without valid forces
+    scored: Mask  # (T,) frames that are scored, unless they are lost
+    press: Mask | None  # (T,) frames of the calibrating press; None without one
     absolute: bool  # whether E is known
     notes: tuple[str, ...]  # on frames that are not scored
 
 
-def _speed(tracked: TrackedRecording) -> Curve:
+def _speed(tracked: TrackedRecording) -> Floats:
     """Speed of the tissue, (T,) mm/s; NaN where this frame or the one before is lost."""
     lost = ~np.array(tracked.trusted)
     return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
@@ -138,11 +137,11 @@ def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor,
     return _Reference(time_s, sensor, lost, scored & ~again, press, known, tuple(notes))
 
 
-def _within(time_s: Curve, span: Span) -> Flags:
+def _within(time_s: Floats, span: Span) -> Mask:
     return (time_s >= span[0]) & (time_s <= span[1])
 
 
-def _repeated(tracked: TrackedRecording, sensor_mn: Curve | None) -> Flags:
+def _repeated(tracked: TrackedRecording, sensor_mn: Floats | None) -> Mask:
     """Frames (T,) with the picture of the tracked frame before: identical, or frozen while force changed."""
     pairs = list(zip(tracked.frame, [-1, *tracked.frame[:-1]], strict=True))
     # Repeats of frames that were not tracked do not count.
@@ -171,7 +170,7 @@ def _score_methods(
     return scored
 
 
-def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference) -> Gain:
+def _fit_gain(size: Floats, main: str, first: Scored | None, against: _Reference) -> Gain:
     """The gain from a length of flow, (T,) mm, to force.
 
     Fitted on the press if there is one. Else in hindsight on the scored frames, which favours the baseline:
@@ -188,7 +187,7 @@ def _fit_gain(size: Curve, main: str, first: Scored | None, against: _Reference)
     return Gain(metrics.gain(sensor, size, against.scored), "hindsight")
 
 
-def _score(force: Curve, first: Scored | None, against: _Reference) -> Scored:
+def _score(force: Floats, first: Scored | None, against: _Reference) -> Scored:
     """Scores one method's force (T, 3) against the sensor; `first`: the main method, if this is another."""
     size, sensor, used = _magnitude(force), against.sensor.size_mn, against.scored
     axes = against.sensor.axes_mn
@@ -229,11 +228,11 @@ def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], agains
     return replace(scored, low_mn=low, high_mn=high, interval=interval)
 
 
-def _mean(values: NDArray[Any]) -> float:
+def _mean(values: Array) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
-def _magnitude(force: Curve) -> Curve:
+def _magnitude(force: Floats) -> Floats:
     """Magnitude of each force from its finite components, (T,) mN."""
     size = np.sqrt(np.nansum(force**2, axis=1))
     size[~np.isfinite(force).any(axis=1)] = np.nan

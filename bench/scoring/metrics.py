@@ -13,8 +13,7 @@ from bench import bootstrap
 from bench.bootstrap import Interval
 from learn.evaluation import metrics
 from learn.evaluation.metrics import Metric
-
-Curve = NDArray[np.float64]  # (T,)
+from synth.arrays import Floats, Mask
 
 _LARGEST_LAG_S = 0.5
 _LEAST_CONTACT_MN = 1e-3
@@ -51,7 +50,7 @@ RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
 _AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "ccc": "ccc", "r2": "r2"}
 
 
-def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
+def agreement(sensor: Floats, predicted: Floats) -> dict[str, float]:
     """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2 and gain over samples where both are finite.
 
     Args:
@@ -65,7 +64,7 @@ def agreement(sensor: Curve, predicted: Curve) -> dict[str, float]:
     return {"n": float(len(x)), **scores, "gain": metrics.line(x, y)[0]}
 
 
-def agreement_intervals(sensor: Curve, predicted: Curve, rng: np.random.Generator) -> dict[str, Interval]:
+def agreement_intervals(sensor: Floats, predicted: Floats, rng: np.random.Generator) -> dict[str, Interval]:
     """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2 by a block bootstrap of the samples.
 
     The block length is the largest of those of the sensor, the prediction and their difference. Arguments as
@@ -81,7 +80,7 @@ def agreement_intervals(sensor: Curve, predicted: Curve, rng: np.random.Generato
     return {key: bootstrap.interval(drawn[name]) for name, key in _AGREEMENT.items()}
 
 
-def difference_interval(sensor: Curve, first: Curve, second: Curve, rng: np.random.Generator) -> Interval:
+def difference_interval(sensor: Floats, first: Floats, second: Floats, rng: np.random.Generator) -> Interval:
     """Interval of MAE(first) − MAE(second), paired: the same samples are drawn for both."""
     gap = np.abs(first - sensor) - np.abs(second - sensor)
     gap = gap[np.isfinite(gap)]
@@ -91,13 +90,13 @@ def difference_interval(sensor: Curve, first: Curve, second: Curve, rng: np.rand
     return bootstrap.interval(weights @ gap / len(gap))
 
 
-def gain(sensor: Curve, predicted: Curve, where: NDArray[np.bool_]) -> float:
+def gain(sensor: Floats, predicted: Floats, where: Mask) -> float:
     """The least-squares factor from `predicted` to `sensor` over the samples `where`."""
     good = where & np.isfinite(sensor) & np.isfinite(predicted)
     return ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
 
 
-def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
+def lag(time_s: Floats, sensor: Floats, predicted: Floats) -> dict[str, float]:
     """The lag of `predicted` behind `sensor`, lag_s [s], and the correlation with it removed, r_at_lag.
 
     It is only reported: scores are at lag 0. It is found on a uniform grid with a step of a quarter of the
@@ -128,13 +127,13 @@ def lag(time_s: Curve, sensor: Curve, predicted: Curve) -> dict[str, float]:
     return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
 
 
-def contact_threshold(sensor: Curve, noise_floor_mn: float) -> float:
+def contact_threshold(sensor: Floats, noise_floor_mn: float) -> float:
     """The sensor's force at contact [mN]: 3 times its noise floor, at least 5% of its peak, never 0."""
     peak = float(np.nanmax(sensor, initial=0.0))
     return max(3 * noise_floor_mn, 0.05 * peak, _LEAST_CONTACT_MN)
 
 
-def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
+def in_contact(curve: Floats, threshold_mn: float) -> Mask:
     """Contact (T,) with hysteresis: it starts at the threshold and ends at half of it."""
     state, out = False, np.zeros(len(curve), bool)
     for k, value in enumerate(curve):
@@ -144,7 +143,7 @@ def in_contact(curve: Curve, threshold_mn: float) -> NDArray[np.bool_]:
     return out
 
 
-def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) -> list[slice]:
+def events(time_s: Floats, contact: Mask, shortest_s: float = 0.15) -> list[slice]:
     """Contacts of at least `shortest_s`, after closing shorter gaps; a sample lasts a median step."""
     step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
@@ -155,7 +154,9 @@ def events(time_s: Curve, contact: NDArray[np.bool_], shortest_s: float = 0.15) 
     return [slice(int(a), int(b) + 1) for a, b in zip(first[long], last[long], strict=True)]
 
 
-def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[slice]) -> list[dict[str, float]]:
+def per_event(
+    time_s: Floats, sensor: Floats, predicted: Floats, spans: list[slice]
+) -> list[dict[str, float]]:
     """A row per contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
 
     Times, peak and impulse are those of the sensor. Errors are over the samples with a prediction, and NaN
@@ -179,7 +180,7 @@ def per_event(time_s: Curve, sensor: Curve, predicted: Curve, spans: list[slice]
     return rows
 
 
-def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
+def _event_errors(t: Floats, x: Floats, y: Floats) -> dict[str, float]:
     """Errors of a contact's predicted force `y` against the sensor's `x`, both in mN."""
     known = np.isfinite(y)
     if known.sum() < 2:
@@ -194,7 +195,7 @@ def _event_errors(t: Curve, x: Curve, y: Curve) -> dict[str, float]:
     }
 
 
-def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict[str, float]:
+def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> dict[str, float]:
     """Scores of contact detection.
 
     Returns:
@@ -212,11 +213,11 @@ def contact_scores(sensor: Curve, predicted: Curve, threshold_mn: float) -> dict
 
 
 def compute_all(
-    time_s: Curve,
-    sensor: Curve,
-    predicted: Curve,
+    time_s: Floats,
+    sensor: Floats,
+    predicted: Floats,
     noise_floor_mn: float = 0.0,
-    used: NDArray[np.bool_] | None = None,
+    used: Mask | None = None,
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """All scores of a predicted curve against a sensor's, and the table of its contacts.
 
@@ -261,7 +262,7 @@ def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
     return [{key: value if key in own else math.nan for key, value in row.items()} for row in rows]
 
 
-def limits_of_agreement(difference: Curve, group: NDArray[np.integer]) -> dict[str, float]:
+def limits_of_agreement(difference: Floats, group: NDArray[np.integer]) -> dict[str, float]:
     """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, for samples in groups of correlated error.
 
     Bland and Altman, "Agreement between methods of measurement with multiple observations per individual"

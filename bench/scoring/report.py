@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 
@@ -22,6 +21,7 @@ from bench.scoring.result import Result
 from bench.tracking.tracking import Snapshot, TrackedRecording, picture_masks
 from learn.evaluation.metrics import Metric
 from learn.evaluation.tables import open_table
+from synth.arrays import Map, Pixels
 from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
@@ -183,9 +183,7 @@ def _largest_depth(done: TrackedRecording) -> float:
     return max(float(np.percentile(np.stack(depths), 99.8)), 1e-3) if depths else 0.0
 
 
-def _depth_colours(
-    grey: NDArray[np.uint8], depth: NDArray[np.float32], largest: float, tissue: NDArray[np.float32]
-) -> NDArray[np.uint8]:
+def _depth_colours(grey: Pixels, depth: Map, largest: float, tissue: Map) -> Pixels:
     """Motion in depth, (h, w, 3): blue away from the camera, red towards it."""
     share = np.clip(depth / largest, -1, 1)[..., None]
     colours = np.where(share > 0, np.array([31, 111, 235]), np.array([194, 53, 43])).astype(np.uint8)
@@ -259,7 +257,7 @@ def _flat(tree: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
     return rows
 
 
-def _jpeg(rgb: NDArray[np.uint8]) -> str:
+def _jpeg(rgb: Pixels) -> str:
     done, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
     assert done
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")

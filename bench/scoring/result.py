@@ -9,18 +9,17 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.bootstrap import Interval
 from bench.recording.pixel_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
+from synth.arrays import Floats, Mask
 from synth.formats import SCORE
 from synth.recording_flow.finding import Finding, first_fault
 from synth.system import packages
 
-Curve = NDArray[np.float64]
 _METHOD_KEYS = (
     "interval", "scores", "intervals", "calibrated", "worse_by_mn", "gain", "components", "events",
 )  # fmt: skip
@@ -41,8 +40,8 @@ class Gain:
 class Scored:
     """One method on one recording."""
 
-    force_mn: Curve  # (T, 3) camera axes [mN]
-    size_mn: Curve  # (T,) magnitude [mN]
+    force_mn: Floats  # (T, 3) camera axes [mN]
+    size_mn: Floats  # (T,) magnitude [mN]
     scores: dict[str, float] = field(default_factory=dict)  # empty without a sensor
     components: dict[str, dict[str, float]] = field(default_factory=dict)
     """Agreement by camera axis, if the sensor's axes are the camera's."""
@@ -53,8 +52,8 @@ class Scored:
     worse_by_mn: Interval | None = None
     """Interval of the main method's MAE minus this one's, paired; None for the main method."""
     gain: Gain | None = None  # of a length of flow; None for force estimators
-    low_mn: Curve | None = None  # (T,) lower end of the 90% prediction interval [mN]; None: no intervals
-    high_mn: Curve | None = None  # (T,) upper end
+    low_mn: Floats | None = None  # (T,) lower end of the 90% prediction interval [mN]; None: no intervals
+    high_mn: Floats | None = None  # (T,) upper end
     interval: dict[str, float] = field(default_factory=dict)
     """`level`, mean `width_mn` and, with a sensor and a known E, `coverage` of those intervals."""
 
@@ -66,19 +65,19 @@ class Result:
     recording: str
     main: str
     """Name of the method that the report is about."""
-    time_s: Curve
-    sensor_mn: Curve | None
+    time_s: Floats
+    sensor_mn: Floats | None
     """(T,) magnitude at the frames' times [mN]."""
-    sensor_axes_mn: Curve | None
+    sensor_axes_mn: Floats | None
     """(T, 3)."""
     methods: dict[str, Scored]
     scale: PixelScale
     relative_uncertainty: float
     """Relative standard deviation of every force from scale (force is proportional to its square) and E."""
     noise_floor_mn: float
-    scored: NDArray[np.bool_]
+    scored: Mask
     """(T,) whether the frame is scored: not in calibration spans."""
-    lost: NDArray[np.bool_]
+    lost: Mask
     """(T,) whether tracking was lost: no method has an estimate there."""
     sync: Offset | None
     """The search for the clocks' offset; None if there was none."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording import clocks
 from bench.recording.folder import Force, Recording
@@ -13,16 +12,15 @@ from bench.recording.meta import SensorMeta, Span, Sync
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation, find_rotation
+from synth.arrays import Floats
 from synth.recording_flow.pulse import SurfaceMotion
-
-Curve = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class AlignedSensor:
     """The sensor at the frames' times, on the video's clock."""
 
-    axes_mn: Curve | None = None  # (T, 3) mN, NaN without samples; None if nothing can be scored
+    axes_mn: Floats | None = None  # (T, 3) mN, NaN without samples; None if nothing can be scored
     noise_floor_mn: float = 0.0
     steps: tuple[str, ...] = ()  # of the processing, in order, in words
     offset: Offset | None = None  # found by correlation; None without a search
@@ -31,13 +29,13 @@ class AlignedSensor:
     notes: tuple[str, ...] = ()  # for the user
 
     @property
-    def size_mn(self) -> Curve | None:
+    def size_mn(self) -> Floats | None:
         """(T,) magnitude [mN]."""
         return None if self.axes_mn is None else np.linalg.norm(self.axes_mn, axis=1)
 
 
 def align_sensor(
-    recording: Recording, time_s: Curve, speed: Curve, surface: SurfaceMotion | None
+    recording: Recording, time_s: Floats, speed: Floats, surface: SurfaceMotion | None
 ) -> AlignedSensor:
     """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames.
 
@@ -79,7 +77,7 @@ def describe_span(span: Span) -> str:
 
 
 def _find_offset(
-    force: Force, sensor: SensorMeta, sync: Sync, time_s: Curve, speed: Curve
+    force: Force, sensor: SensorMeta, sync: Sync, time_s: Floats, speed: Floats
 ) -> tuple[float, Offset | None]:
     """The offset to add to the sensor's times [s], and the search for it if there was one."""
     if sync.method == "clock":

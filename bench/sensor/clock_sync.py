@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from bench import bootstrap
 from bench.recording.meta import LEAST_INTERVALS
-
-Curve = NDArray[np.float64]
+from synth.arrays import Floats
 
 _STEPS_PER_FRAME = 8
 _LEAST_R = 0.4
@@ -36,7 +35,7 @@ class Offset:
 
 
 def find_offset(
-    frame_s: Curve, speed: Curve, sensor_s: Curve, force_mn: NDArray[np.float64], search_s: float
+    frame_s: Floats, speed: Floats, sensor_s: Floats, force_mn: Floats, search_s: float
 ) -> Offset:
     """The offset with the highest correlation between changes of force and motion.
 
@@ -93,15 +92,13 @@ def find_offset(
     return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused, tried)
 
 
-def _change(frame_s: Curve, sensor_s: Curve, force_mn: NDArray[np.float64]) -> Curve:
+def _change(frame_s: Floats, sensor_s: Floats, force_mn: Floats) -> Floats:
     """Magnitude of the change of force over each frame interval [mN]; NaN outside the sensor's record."""
     at = np.stack([np.interp(frame_s, sensor_s, f, left=np.nan, right=np.nan) for f in force_mn.T], axis=1)
     return np.asarray(np.linalg.norm(np.diff(at, axis=0), axis=1), np.float64)
 
 
-def _correlations(
-    weights: NDArray[np.float64], change: NDArray[np.float64], moved: Curve
-) -> NDArray[np.float64]:
+def _correlations(weights: Floats, change: Floats, moved: Floats) -> Floats:
     """Weighted correlations, (B, L), for weights (B, K) and changes (L, K)."""
     n = weights.sum(axis=1, keepdims=True)
     mean_y = weights @ moved[:, None] / n
@@ -114,7 +111,7 @@ def _correlations(
     return np.where((var_x > 1e-12) & (var_y > 1e-18), r, np.nan)
 
 
-def _refined(offsets: NDArray[np.floating], r: Curve, best: int) -> float:
+def _refined(offsets: NDArray[np.floating], r: Floats, best: int) -> float:
     """Maximum of the parabola through the best offset and its neighbours."""
     if best in (0, len(r) - 1):
         return float(offsets[best])

@@ -10,9 +10,9 @@ from scipy import signal
 
 from bench.recording.folder import Force
 from bench.recording.meta import SensorMeta
+from synth.arrays import Floats, Mask
 from synth.errors import UserError
 
-Curve = NDArray[np.float64]
 STANDARD_GRAVITY = 9.80665  # m/s² = mN/g
 
 _GAP = 5.0  # sample intervals from which there is a gap
@@ -25,8 +25,8 @@ _NO_UNIT = 0.1  # largest deviation from 1 of the length of gravity's direction
 class Processed:
     """Force on the tissue, on the video's clock."""
 
-    time_s: Curve  # (N,) rising [s]
-    force_mn: Curve  # (N, 3) mN; NaN in gaps
+    time_s: Floats  # (N,) rising [s]
+    force_mn: Floats  # (N, 3) mN; NaN in gaps
     noise_floor_mn: float  # filtered standard deviation without contact, all components; 0: unknown
     steps: tuple[str, ...]  # of the processing, in order, in words
 
@@ -55,7 +55,7 @@ def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processe
     return Processed(force.time_s + offset_s, values, floor, tuple(steps))
 
 
-def force_at(processed: Processed, time_s: Curve) -> Curve:
+def force_at(processed: Processed, time_s: Floats) -> Floats:
     """Force at the given times by linear interpolation, (T, 3) mN; NaN in gaps and outside the samples."""
     t, values = processed.time_s, processed.force_mn
     out = np.stack([np.interp(time_s, t, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
@@ -66,7 +66,7 @@ def force_at(processed: Processed, time_s: Curve) -> Curve:
     return out
 
 
-def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Curve:
+def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Floats:
     if sensor.mass_g == 0:
         return force.force_mn.copy()
     if force.gravity is None:
@@ -83,7 +83,7 @@ def _weightless(force: Force, sensor: SensorMeta, steps: list[str]) -> Curve:
     return np.asarray(force.force_mn - sign * sensor.mass_g * STANDARD_GRAVITY * force.gravity, np.float64)
 
 
-def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -> Curve:
+def _tared(time_s: Floats, values: Floats, sensor: SensorMeta, steps: list[str]) -> Floats:
     """Subtracts tare and drift: interpolated medians of the contact-free spans, constant beyond them."""
     if not sensor.free_s:
         return values
@@ -102,7 +102,7 @@ def _tared(time_s: Curve, values: Curve, sensor: SensorMeta, steps: list[str]) -
     return np.asarray(values - zero, np.float64)
 
 
-def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]) -> Curve:
+def _smooth(time_s: Floats, values: Floats, cut_hz: float | None, steps: list[str]) -> Floats:
     """Butterworth filter of each run of samples without gaps, resampled to uniform times and back."""
     if cut_hz is None:
         return values
@@ -130,7 +130,7 @@ def _smooth(time_s: Curve, values: Curve, cut_hz: float | None, steps: list[str]
     return out
 
 
-def _step(time_s: Curve) -> float:
+def _step(time_s: Floats) -> float:
     """Sample interval [s]: the median of means over a few dozen samples.
 
     The means make it correct for stamps in bursts, the median makes it independent of gaps.
@@ -139,7 +139,7 @@ def _step(time_s: Curve) -> float:
     return float(np.median(time_s[across:] - time_s[:-across])) / across
 
 
-def runs(time_s: Curve, good: NDArray[np.bool_], gap_s: float) -> list[NDArray[np.intp]]:
+def runs(time_s: Floats, good: Mask, gap_s: float) -> list[NDArray[np.intp]]:
     """Indices of good samples, split at gaps longer than `gap_s`."""
     where = np.flatnonzero(good)
     if len(where) == 0:
@@ -147,7 +147,7 @@ def runs(time_s: Curve, good: NDArray[np.bool_], gap_s: float) -> list[NDArray[n
     return list(np.split(where, np.flatnonzero(np.diff(time_s[where]) > gap_s) + 1))
 
 
-def _floor(time_s: Curve, values: Curve, sensor: SensorMeta) -> float:
+def _floor(time_s: Floats, values: Floats, sensor: SensorMeta) -> float:
     spreads = []
     for start, stop in sensor.free_s:
         inside = values[(time_s >= start) & (time_s <= stop)]

@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from bench import bootstrap
 from bench.recording.meta import LEAST_TURNING
-
-Floats = NDArray[np.float64]
+from synth.arrays import Floats
 
 _FLAT = 0.1  # least standard deviation of force in any direction, as a share of the largest
 _EXPLAINED = 0.5  # least share of the motion's variance

@@ -16,6 +16,7 @@ from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
 from bench.recording.meta import Meta, Span
 from bench.recording.right_pictures import RightPictures, StereoQuality
+from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding
@@ -37,10 +38,10 @@ class Snapshot:
     """A downsampled frame for the report."""
 
     position: int  # index into the curves
-    rgb: NDArray[np.uint8]  # (h, w, 3)
-    flow: NDArray[np.float32]  # (h, w, 2) px of the downsampled picture
-    density: NDArray[np.float32] | None  # (h, w) kPa, of the traction
-    depth: NDArray[np.float32] | None = None  # (h, w) mm, motion away from the camera; None: monocular
+    rgb: Pixels  # (h, w, 3)
+    flow: Map  # (h, w, 2) px of the downsampled picture
+    density: Map | None  # (h, w) kPa, of the traction
+    depth: Map | None = None  # (h, w) mm, motion away from the camera; None: monocular
 
 
 @dataclass
@@ -49,7 +50,7 @@ class TrackedRecording:
 
     frame: list[int] = field(default_factory=list)  # numbers in the recording
     time_s: list[float] = field(default_factory=list)
-    force_mn: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)  # by method: (3,) each
+    force_mn: dict[str, list[Floats]] = field(default_factory=dict)  # by method: (3,) each
     # By method: `low_mn` and `high_mn` of each `ForceEstimate`.
     bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     speed: list[float] = field(default_factory=list)  # mean over the tissue since the previous frame [mm/s]
@@ -60,8 +61,8 @@ class TrackedRecording:
     repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
     snapshots: list[Snapshot] = field(default_factory=list)
     pictured: str = ""  # method whose force map the snapshots show
-    rest: NDArray[np.uint8] | None = None  # (h, w, 3) rest frame, downsampled as the snapshots
-    tissue: NDArray[np.bool_] | None = None  # (h, w), likewise
+    rest: Pixels | None = None  # (h, w, 3) rest frame, downsampled as the snapshots
+    tissue: Mask | None = None  # (h, w), likewise
     size: tuple[int, int] = (0, 0)  # height, width of the recording [px]
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
@@ -125,9 +126,7 @@ def track_recording(
     return forces.out
 
 
-def _gather_turning(
-    out: TrackedRecording, frame: FrameMotion, span_s: Span | None, tissue: NDArray[np.bool_]
-) -> None:
+def _gather_turning(out: TrackedRecording, frame: FrameMotion, span_s: Span | None, tissue: Mask) -> None:
     """Adds a frame to the motion over `sensor.turn_s`, if it is in that span."""
     if span_s is None or frame.time_s is None or not frame.trusted:
         return
@@ -165,7 +164,7 @@ def _describe(
         ]
 
 
-def _context(about: Meta, tissue: NDArray[np.bool_], mm_per_px: float) -> MethodContext:
+def _context(about: Meta, tissue: Mask, mm_per_px: float) -> MethodContext:
     return MethodContext(
         tissue, mm_per_px, about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
     )
@@ -189,7 +188,7 @@ class _Forces:
         self.out = TrackedRecording(pictured=self.pictured or "", rest=_shrunk(rest.rgb))
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
-        self.last: NDArray[np.float32] | None = None
+        self.last: Map | None = None
         self.stride, self.cameras = 1, 1
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
@@ -248,7 +247,7 @@ class _Forces:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
 
-    def _snap(self, position: int, frame: FrameMotion, density: NDArray[np.float32] | None) -> None:
+    def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""
         small = None if density is None else _shrunk(density)
         flow = _shrunk(frame.flow) * np.float32(_ratio(frame.rgb.shape[1]))
@@ -272,7 +271,7 @@ def _shrunk(array: NDArray[A]) -> NDArray[A]:
     return np.asarray(cv2.resize(array, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA), array.dtype)
 
 
-def picture_masks(tracked: TrackedRecording) -> NDArray[np.uint8] | None:
+def picture_masks(tracked: TrackedRecording) -> Pixels | None:
     """The rest frame (h, w, 3), tinted red by the share of frames in which a pixel is masked and yellow where
     the rest frame is masked; None if nothing is masked."""
     summary, rest = tracked.summary, tracked.rest

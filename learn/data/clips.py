@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
+from synth.arrays import Array, Floats, Map
 from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
@@ -57,17 +57,17 @@ class Clip:
     content_hash: str
     group: str  # sequences of equal group are never on both sides of a split
     young_kpa: float
-    mask: NDArray[np.float32]  # (N, N) 0/1, tissue
-    displacement: dict[str, NDArray[np.float32]]
+    mask: Map  # (N, N) 0/1, tissue
+    displacement: dict[str, Map]
     """`ideal`, `recovered` and/or `noisy`: (T, 2, N, N) mm in picture axes; `motion` and/or `motion-ideal`:
     (T, 3, N, N) mm in camera axes."""
-    confidence: NDArray[np.float32]  # (T, N, N) 0..1 of the recovered flow; 1 without one
-    density: NDArray[np.float32]
+    confidence: Map  # (T, N, N) 0..1 of the recovered flow; 1 without one
+    density: Map
     """(T, 3, N, N) force density per unit stiffness, camera axes [mN/mm² at E = 1 kPa]. Its sum times the
     cell's area times E is the force on the tissue in view: force in cells that are mostly not tissue is moved
     to the nearest tissue cell; only force off the grid is missing."""
-    force: NDArray[np.float64]  # (T, 3) mN, total force on the tissue, camera axes
-    motion_confidence: NDArray[np.float32] | None = None
+    force: Floats  # (T, 3) mN, total force on the tissue, camera axes
+    motion_confidence: Map | None = None
     """(T, 2, N, N) 0..1 of recovered stereo motion, across and along the optical axis; None without it."""
     opening: str = ""  # place of the craniotomy on a user's brain; empty for procedural brains
     membrane: MembraneState = "unknown"
@@ -76,7 +76,7 @@ class Clip:
     def frames(self) -> int:
         return len(self.density)
 
-    def confidence_of(self, source: str) -> NDArray[np.float32]:
+    def confidence_of(self, source: str) -> Map:
         """Confidence in a displacement, (T, 1, N, N), with depth (T, 2, N, N); 1 for ground truth."""
         if source == "recovered":
             return np.asarray(self.confidence)[:, None]
@@ -117,7 +117,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     tissue, area, force = (sequence.read_whole(name) for name in ("tissue", "area", "force"))
     view = GridView(tissue, scale, grid)
 
-    def on_grid(field: str, prepare: Callable[[Any], Any]) -> NDArray[np.float32]:
+    def on_grid(field: str, prepare: Callable[[Any], Any]) -> Map:
         """Means over the tissue of each frame of a field."""
         frames = (prepare(values) for values in sequence.read_sealed(field))
         return np.stack([view.mean(frame) * view.mask for frame in frames])
@@ -243,7 +243,7 @@ def unpack(file: Path) -> Clip:
         return Clip(**plain, displacement=displacement, **arrays)
 
 
-def _checksum(arrays: Mapping[str, NDArray[Any]]) -> int:
+def _checksum(arrays: Mapping[str, Array]) -> int:
     """Of all values, in order of their names."""
     found = 0
     for name in sorted(arrays):
@@ -251,7 +251,7 @@ def _checksum(arrays: Mapping[str, NDArray[Any]]) -> int:
     return found
 
 
-def target(clip: Clip, frame: int, components: int) -> NDArray[np.float32]:
+def target(clip: Clip, frame: int, components: int) -> Map:
     """Training target of a frame: force density, or with one component its length.
 
     Returns (C, N, N) mN/mm² at E = 1 kPa.
@@ -259,11 +259,11 @@ def target(clip: Clip, frame: int, components: int) -> NDArray[np.float32]:
     density = np.asarray(clip.density[frame])
     if components == 3:
         return density
-    length: NDArray[np.float32] = np.sqrt(np.square(density).sum(0, keepdims=True))
+    length: Map = np.sqrt(np.square(density).sum(0, keepdims=True))
     return length
 
 
-def amount(clip: Clip, components: int, pitch_mm: float) -> NDArray[np.float64]:
+def amount(clip: Clip, components: int, pitch_mm: float) -> Floats:
     """True total force that a map of C components is compared with, (T, C) [mN at E = 1 kPa].
 
     A vector map sums to the force on the tissue. In a map of lengths two jaws that pull against each other
@@ -273,7 +273,7 @@ def amount(clip: Clip, components: int, pitch_mm: float) -> NDArray[np.float64]:
     if components == 3:
         return clip.force / clip.young_kpa
     length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
-    total: NDArray[np.float64] = length.sum((1, 2))[:, None] * pitch_mm**2
+    total: Floats = length.sum((1, 2))[:, None] * pitch_mm**2
     return total
 
 

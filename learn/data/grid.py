@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from torch import Tensor
 
+from synth.arrays import Map, Mask
 from synth.errors import UserError, as_positive
 from synth.job.types import MembraneState, Positive
 
@@ -51,7 +52,7 @@ class Scales:
     spread: Positive  # root mean square of the target over tissue cells and components, unit of `target`
 
 
-def centre(tissue: NDArray[np.bool_]) -> tuple[float, float]:
+def centre(tissue: Mask) -> tuple[float, float]:
     """Centroid of the tissue mask as (x, y) px. `tissue`: (H, W) bool. Raises UserError if it is empty."""
     rows, cols = np.nonzero(tissue)
     if rows.size == 0:
@@ -74,7 +75,7 @@ class GridView:
 
     def __init__(
         self,
-        tissue: NDArray[np.bool_],
+        tissue: Mask,
         scale_mm_per_px: float,
         grid: Grid,
         centre_px: tuple[float, float] | None = None,
@@ -98,7 +99,7 @@ class GridView:
         if not self.mask.any():
             raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue covers no cell of the network's grid")
 
-    def mean(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+    def mean(self, values: NDArray[np.floating]) -> Map:
         """Mean over the tissue in each cell; 0 where there is none.
 
         `values`: (..., H, W). Returns (..., N, N) float32 in their unit.
@@ -107,20 +108,18 @@ class GridView:
         good = self._share > 1e-6
         return np.where(good, over / np.where(good, self._share, 1.0), 0.0).astype(np.float32)
 
-    def sum(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+    def sum(self, values: NDArray[np.floating]) -> Map:
         """Totals over each cell, which preserve the sum inside the grid.
 
         `values`: (..., H, W), amount per pixel. Returns (..., N, N) float32, amount per cell.
         """
         return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
 
-    def to_image(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+    def to_image(self, values: NDArray[np.floating]) -> Map:
         """See `to_image`: (..., N, N) → (..., H, W) float32."""
         return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
 
-    def matches(
-        self, tissue: NDArray[np.bool_], scale_mm_per_px: float, centre_px: tuple[float, float] | None
-    ) -> bool:
+    def matches(self, tissue: Mask, scale_mm_per_px: float, centre_px: tuple[float, float] | None) -> bool:
         """Whether it was made from these arguments."""
         same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.scale_mm_per_px)
         return same and np.array_equal(self.tissue, tissue)
@@ -147,7 +146,7 @@ def to_image(
     centre_px: Sequence[float],
     scale_mm_per_px: float,
     pitch_mm: float,
-) -> NDArray[np.float32]:
+) -> Map:
     """Values of a grid's cells at a picture's pixels, bilinear, 0 outside the grid.
 
     `values`: (..., N, N); `shape`: (H, W) of the picture; `centre_px`: x, y of the grid's centre in it.
@@ -165,7 +164,7 @@ def to_image(
     return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
 
 
-def settled(amount: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+def settled(amount: Map, mask: Map) -> Map:
     """Moves amounts outside the mask to the nearest cell inside, which preserves the total.
 
     A cell at the tissue's edge may hold force though it is mostly not tissue.
@@ -294,7 +293,7 @@ def channels(
     return torch.cat(parts, dim=1)
 
 
-def certainty(deviation_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+def certainty(deviation_mm: Map) -> Map:
     """Confidence in 0..1 of motion across and along the optical axis, (2, ...).
 
     `deviation_mm`: (..., 3), standard deviation of the motion [mm].

@@ -16,6 +16,7 @@ from learn.data.grid import Grid
 from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments
 from learn.evaluation.statistics import Interval, Paired, interval, null_if_nan, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
+from synth.arrays import Floats, Map, Mask
 from synth.system.terminal import ProgressCallback
 
 FALSE_POSITIVE_MN = 5.0
@@ -40,8 +41,8 @@ class ClipScore:
     name: str
     young_kpa: float
     map: NDArray[np.floating]  # (7,) `moments` of the density's length, over tissue cells of all frames
-    true_mn: NDArray[np.float64]  # (T,) size of the total force; of a map of lengths see `amount`
-    predicted_mn: NDArray[np.float64]
+    true_mn: Floats  # (T,) size of the total force; of a map of lengths see `amount`
+    predicted_mn: Floats
     others: dict[str, float]  # further scores by key of `METRICS`
 
     def as_row(self) -> dict[str, float]:
@@ -51,7 +52,7 @@ class ClipScore:
         return row | {f"force_{name}": value for name, value in asdict(force).items()} | self.others
 
 
-def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipScore:
+def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     """Scores the prediction of one sequence. `predicted`: (T, C, N, N), physical."""
     grid, parts, young = card.settings.grid, predicted.shape[1], clip.young_kpa
     pitch = grid.pitch_mm
@@ -63,7 +64,7 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
     free = inside & ~contact
     total = total_force(predicted, grid)
     predicted_mn = force_size(total)
-    true_mn: NDArray[np.float64] = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
+    true_mn: Floats = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
     centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
     off = [d for d in (float(np.linalg.norm(one)) for one in centres) if math.isfinite(d)]
@@ -86,7 +87,7 @@ def score(clip: Clip, predicted: NDArray[np.float32], card: ModelCard) -> ClipSc
     return ClipScore(clip.name, young, agreed, true_mn, predicted_mn, others)
 
 
-def _off_contact(contact: NDArray[np.bool_], grid: Grid) -> NDArray[np.bool_]:
+def _off_contact(contact: Mask, grid: Grid) -> Mask:
     """(T, N, N) cells further than `RIM_MM` from any contact in the same frame."""
     out = np.ones_like(contact)
     for t in np.flatnonzero(contact.any((1, 2))):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
+from synth.arrays import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ METRICS = {
 """Scores that `learn eval` lists, by their key in its JSON, which has some more."""
 
 
-def moments(true: Floats, predicted: Floats) -> Floats:
+def moments(true: Array, predicted: Array) -> Array:
     """Sums over pairs (true, predicted), of which every agreement score is a function; sums of parts add up.
 
     Returns: (7,) count and sums of t, p, t², p², tp and |p − t|.
@@ -92,12 +91,12 @@ class Agreement:
     ccc: float
 
 
-def agreement(moments: Floats) -> Agreement:
+def agreement(moments: Array) -> Agreement:
     """Agreement from moments (7,). R², r and CCC are NaN for constant truth, r for a constant prediction."""
     return Agreement(**{name: float(value) for name, value in agreements(moments).items()})
 
 
-def agreements(moments: Floats) -> dict[str, NDArray[np.float64]]:
+def agreements(moments: Array) -> dict[str, Array]:
     """Fields of `Agreement`, each (...), from many moments (..., 7) at once."""
     n, t, p, tt, pp, tp, absolute = np.moveaxis(np.asarray(moments, np.float64), -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -116,23 +115,23 @@ def agreements(moments: Floats) -> dict[str, NDArray[np.float64]]:
         }
 
 
-def false_positive_share(predicted: Floats, free: NDArray[np.bool_], threshold: float) -> float:
+def false_positive_share(predicted: Array, free: Mask, threshold: float) -> float:
     """Share of the cells `free` with a prediction above `threshold`, in its unit; NaN if there are none."""
     return float((predicted[free] > threshold).mean()) if free.any() else float("nan")
 
 
-def contact_mm(map_: Floats, pitch_mm: float) -> NDArray[np.float64]:
+def contact_mm(map_: Array, pitch_mm: float) -> Array:
     """Centroid (x, y) [mm on the grid] of a map (N, N) ≥ 0 above half its peak; NaN without force."""
     peak = float(map_.max(initial=0.0))
     if peak <= 0:
         return np.full(2, np.nan)
     weight = np.where(map_ >= 0.5 * peak, map_, 0.0).astype(np.float64)
     rows, cols = np.indices(map_.shape)
-    centre: NDArray[np.float64] = np.array([(weight * cols).sum(), (weight * rows).sum()]) / weight.sum()
+    centre: Array = np.array([(weight * cols).sum(), (weight * rows).sum()]) / weight.sum()
     return centre * pitch_mm
 
 
-def line(x: Floats, y: Floats) -> tuple[float, float]:
+def line(x: Array, y: Array) -> tuple[float, float]:
     """Slope and intercept of `y` on `x` by least squares; NaN for constant `x`."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if len(x) == 0 or np.ptp(x) == 0:

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from learn.evaluation.metrics import agreements
-
-Floats = NDArray[np.float64]
+from synth.arrays import Array, Floats
 
 LEAST_GROUPS = 5
 """Of fewer specimens a 95% interval would hardly exceed the range of their means."""
@@ -82,7 +80,7 @@ def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.G
 
 def _bootstrap(
     statistic: Callable[..., Any],
-    data: tuple[NDArray[Any], ...],
+    data: tuple[Array, ...],
     rng: np.random.Generator,
     draws: int,
     method: Literal["BCa", "percentile"] = "BCa",

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
 from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, force_size, net_force
 from learn.uncertainty.conformal import LEVELS
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.job.types import MembraneState
 from synth.recording_flow.finding import first_fault, judge_young, problems
@@ -79,7 +79,7 @@ def apply(
     return out
 
 
-def _ends(found: Sequence[FrameForce], trusted: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+def _ends(found: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
     """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where not `trusted` (T,)."""
     if not found[0].bands:
         return {}
@@ -111,10 +111,10 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
 
 def stiffness(
     predictor: Predictor,
-    displacement: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    force_mn: NDArray[np.float64],
-    confidence: NDArray[np.float32] | None = None,
+    displacement: Map,
+    mask: Map,
+    force_mn: Floats,
+    confidence: Map | None = None,
 ) -> float:
     """Young's modulus [kPa] by a least-squares fit of the prediction to the known force of a press.
 

@@ -8,7 +8,6 @@ from itertools import repeat
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.inference.grid_placement import GridPlacement, Point
@@ -16,6 +15,7 @@ from learn.inference.predict import ForceMap, Predictor, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_out_of_distribution
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.stereo.track import Moved
@@ -26,13 +26,13 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 def predict_force(
     model: Predictor,
-    flow: Iterable[NDArray[np.float32]],
-    tissue: NDArray[np.bool_],
+    flow: Iterable[Map],
+    tissue: Mask,
     scale_mm_per_px: float,
     young_kpa: float | None = None,
-    confidence: Iterable[NDArray[np.float32]] | None = None,
+    confidence: Iterable[Map] | None = None,
     membrane: MembraneState = "unknown",
-) -> NDArray[np.float64]:
+) -> Floats:
     """Force of each frame of one video, (T, 3) mN on the tissue, camera axes; the rest frame's is subtracted.
 
     A model without direction returns the size in x, and NaN in y and z.
@@ -55,10 +55,10 @@ def predict_force(
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0
     estimator = ForceEstimator(model, inside, scale_mm_per_px, young_kpa, membrane)
-    known: Iterator[NDArray[np.float32]] = repeat(np.ones(size, np.float32))
+    known: Iterator[Map] = repeat(np.ones(size, np.float32))
     if confidence is not None:
         known = _each("confidence", confidence, size, (0.0, 1.0))
-    found = list[NDArray[np.float64]]()
+    found = list[Floats]()
     for moved in _each("flow", flow, (*size, 2)):
         if (weight := next(known, None)) is None:
             raise UserError(f"confidence: has {len(found)} frames, flow has more")
@@ -68,7 +68,7 @@ def predict_force(
     return np.array(found).reshape(-1, 3)
 
 
-def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32]]:
+def _each(what: str, frames: object, *about: Any) -> Iterator[Map]:
     """Checked frames of an argument. UserError for another shape or range, as `check_answer`."""
     if not isinstance(frames, Iterable):
         raise UserError(f"{what}: expected an array a frame, got {type(frames).__name__}")
@@ -79,7 +79,7 @@ def _each(what: str, frames: object, *about: Any) -> Iterator[NDArray[np.float32
 class FrameForce:
     """A model's estimate for one frame."""
 
-    force_mn: NDArray[np.float64]
+    force_mn: Floats
     """(3,) total force on the tissue in camera axes [mN], the estimate at rest subtracted; of a model without
     direction the size in x, the others NaN."""
     map: ForceMap  # the network's prediction, nothing subtracted
@@ -96,7 +96,7 @@ class ForceEstimator:
     def __init__(
         self,
         predictor: Predictor,
-        tissue: NDArray[np.bool_],
+        tissue: Mask,
         scale_mm_per_px: float,
         young_kpa: float | None,
         membrane: MembraneState = "unknown",
@@ -106,7 +106,7 @@ class ForceEstimator:
         self._scale, self._young_kpa, self._membrane = scale_mm_per_px, young_kpa, membrane
         self._at_rest: dict[Point, ForceMap] = {}
         self.placement = GridPlacement(tissue, scale_mm_per_px, predictor.grid)
-        self._tracked: list[NDArray[np.float64]] = []  # (F,) `motion_features` of each tracked frame
+        self._tracked: list[Floats] = []  # (F,) `motion_features` of each tracked frame
 
     def estimate(self, frame: FrameMotion) -> FrameForce:
         """The force of a frame. Raises as `Predictor`."""
@@ -160,7 +160,7 @@ class ForceEstimator:
         part = np.float32(UNKNOWN_YOUNG_KPA / found.young_kpa)
         return replace(found, density=part * found.density, young_kpa=UNKNOWN_YOUNG_KPA)
 
-    def _bound(self, force: NDArray[np.float64], found: ForceMap) -> dict[float, Band]:
+    def _bound(self, force: Floats, found: ForceMap) -> dict[float, Band]:
         """Intervals of a frame's force, as `FrameForce.bands`."""
         if found.motion is None:
             return {}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.grid import Grid, centre, check_scale
+from synth.arrays import Map, Mask
 from synth.flow.confidence import LOW_CONFIDENCE
 
 Point = tuple[float, float]
@@ -22,7 +22,7 @@ _OFF_CENTRE = 0.25  # share of the grid's width; the grid is moved to motion fur
 class GridPlacement:
     """The grid's position, frame by frame; it is moved only if motion is far from its centre."""
 
-    def __init__(self, tissue: NDArray[np.bool_], scale_mm_per_px: float, grid: Grid) -> None:
+    def __init__(self, tissue: Mask, scale_mm_per_px: float, grid: Grid) -> None:
         """`tissue`: (H, W). UserError if it is empty, or if the scale is invalid."""
         self.centre_px = centre(tissue)  # current centre of the grid
         self.moves = 0  # number of times the grid was moved
@@ -34,7 +34,7 @@ class GridPlacement:
         self._tissue = tissue
         self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
 
-    def place(self, flow: NDArray[np.float32], confidence: NDArray[np.float32] | None) -> Point:
+    def place(self, flow: Map, confidence: Map | None) -> Point:
         """The grid's centre for a frame, from flow (H, W, 2) px and its confidence (H, W) in 0..1.
 
         Pixels of low confidence don't count; None: all count.
@@ -50,7 +50,7 @@ class GridPlacement:
             self.centre_px, self.moves = found, self.moves + 1
         return self.centre_px
 
-    def _strongest(self, power: NDArray[np.float32]) -> Point:
+    def _strongest(self, power: Map) -> Point:
         """The centre of the strongest motion; of two places the stronger, not their mean."""
         height, width = power.shape
         size = (max(1, width // _COARSE), max(1, height // _COARSE))

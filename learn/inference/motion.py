@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.clips import FIELDS, check_readable, has_depth
+from synth.arrays import Array, Floats, Mask
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
@@ -43,10 +43,10 @@ class Motion:
     name: str
     # One pass, or for a video with heartbeat and breathing a second one without them: the last one counts.
     passes: Iterator[MotionPass]
-    tissue: NDArray[np.bool_]  # (H, W) in the rest frame
+    tissue: Mask  # (H, W) in the rest frame
     scale_mm_per_px: float
     young_kpa: float | None
-    force_mn: NDArray[np.float64] | None = None  # (T,) size of the true force, if known
+    force_mn: Floats | None = None  # (T,) size of the true force, if known
     shrink: int = 1  # factor by which pictures were shrunk before flow
     scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
 
@@ -191,7 +191,7 @@ def _arrays(path: Path) -> Motion:
     )
 
 
-def _positive(path: Path, found: dict[str, NDArray[Any]], name: str) -> float:
+def _positive(path: Path, found: dict[str, Array], name: str) -> float:
     """The number under a name. UserError unless it is one and positive."""
     if found[name].size != 1 or not 0 < found[name].item() < math.inf:
         raise UserError(f"{path}: {name} must be one positive number")

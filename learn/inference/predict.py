@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from learn import checkpoint
@@ -19,6 +18,7 @@ from learn.data.grid import Grid, GridView, certainty, channels, membrane_code
 from learn.inference.shipped import find_model
 from learn.network.d2fnet import freeze, fused
 from learn.uncertainty.features import motion_features
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError, as_path, as_positive, as_user_error
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
@@ -69,11 +69,11 @@ class Predictor:
 
     def __call__(
         self,
-        flow: NDArray[np.float32],
-        tissue: NDArray[np.bool_],
+        flow: Map,
+        tissue: Mask,
         scale_mm_per_px: float,
         young_kpa: float | None = None,
-        confidence: NDArray[np.float32] | None = None,
+        confidence: Map | None = None,
         moved: Moved | None = None,
         *,
         centre_px: tuple[float, float] | None = None,
@@ -110,10 +110,10 @@ class Predictor:
     def on_grid(
         self,
         view: GridView,
-        flow: NDArray[np.float32],
-        confidence: NDArray[np.float32] | None = None,
+        flow: Map,
+        confidence: Map | None = None,
         moved: Moved | None = None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    ) -> tuple[Map, Map | None]:
         """The network's input of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
 
         Arguments and errors as `__call__`.
@@ -134,12 +134,12 @@ class Predictor:
     @torch.inference_mode()
     def density(
         self,
-        displacement: NDArray[np.float32],
-        mask: NDArray[np.float32],
+        displacement: Map,
+        mask: Map,
         young_kpa: float,
-        confidence: NDArray[np.float32] | None = None,
+        confidence: Map | None = None,
         membrane: MembraneState = "unknown",
-    ) -> NDArray[np.float32]:
+    ) -> Map:
         """Force density of frames already on the grid, (T, C, N, N) mN/mm² at `young_kpa`.
 
         Args:
@@ -186,7 +186,7 @@ class Predictor:
 class ForceMap:
     """A model's force map of one frame."""
 
-    density: NDArray[np.float32]
+    density: Map
     """(C, N, N): force density [mN per mm² of the picture plane], C = 1 its length or 3 its x, y, z in
     camera axes."""
     grid: Grid
@@ -194,16 +194,16 @@ class ForceMap:
     """Young's modulus that the map is for: the one given, else the training data's typical one."""
     young_known: bool
     view: GridView
-    motion: NDArray[np.float64] | None = None
+    motion: Floats | None = None
     """(F,) `motion_features` of the frame, by a model with intervals."""
 
     @property
-    def magnitude(self) -> NDArray[np.float32]:
+    def magnitude(self) -> Map:
         """(N, N), ≥ 0, in mN/mm²."""
         return length(self.density)
 
     @property
-    def force_mn(self) -> NDArray[np.float64] | None:
+    def force_mn(self) -> Floats | None:
         """(3,) total force on the tissue in camera axes [mN]; None if the model gives no direction."""
         return total_force(self.density[None], self.grid)[0] if len(self.density) == 3 else None
 
@@ -212,20 +212,20 @@ class ForceMap:
         """Size of the total force [mN]."""
         return float(force_size(total_force(self.density[None], self.grid))[0])
 
-    def to_image(self) -> NDArray[np.float32]:
+    def to_image(self) -> Map:
         """Magnitude on the picture's pixels, (H, W), 0 outside the grid."""
         return self.view.to_image(self.magnitude)
 
 
-def length(density: NDArray[np.float32], axis: int = -3) -> NDArray[np.float32]:
+def length(density: Map, axis: int = -3) -> Map:
     """Length over the component axis; the value itself if there is one component."""
     if density.shape[axis] == 1:
         return density.squeeze(axis)
-    out: NDArray[np.float32] = np.sqrt(np.square(density).sum(axis))
+    out: Map = np.sqrt(np.square(density).sum(axis))
     return out
 
 
-def total_force(density: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]:
+def total_force(density: Map, grid: Grid) -> Floats:
     """Total force of maps (T, C, N, N) mN/mm², (T, 3) mN in camera axes.
 
     A map without direction gives the size in x, and NaN in y and z.
@@ -234,12 +234,12 @@ def total_force(density: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]
     return total if total.shape[1] == 3 else np.pad(total, ((0, 0), (0, 2)), constant_values=np.nan)
 
 
-def net_force(density: NDArray[np.float32], at_rest: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]:
+def net_force(density: Map, at_rest: Map, grid: Grid) -> Floats:
     """`total_force` minus that of `at_rest` (1, C, N, N), the prediction for no motion; a size is ≥ 0."""
     net = total_force(density, grid) - total_force(at_rest, grid)
     return net if density.shape[1] == 3 else np.maximum(net, 0.0)
 
 
-def force_size(force_mn: NDArray[np.float64]) -> NDArray[np.float64]:
+def force_size(force_mn: Floats) -> Floats:
     """(T,) size of forces (T, 3) of `total_force`."""
     return np.asarray(np.sqrt(np.nansum(force_mn**2, axis=-1)))

@@ -16,6 +16,7 @@ from learn.data.grid import to_image
 from learn.inference.apply import apply
 from learn.inference.motion import VideoOptions, motions
 from learn.inference.predict import Predictor, length
+from synth.arrays import Pixels
 from synth.dataset.store import Sequence, open_sequence
 from synth.errors import UserError
 from synth.job.types import MembraneState
@@ -24,8 +25,6 @@ from synth.system import checked_file
 from synth.system.checked_file import write_whole
 from synth.video import read as video
 from synth.video.write import encode_video
-
-Rgb = NDArray[np.uint8]
 
 _WIDEST_PX = 1280
 
@@ -168,7 +167,7 @@ def _number(value: float) -> str:
     return f"{value:.6g}" if np.isfinite(value) else ""
 
 
-def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
+def _pictures(source: Path, wanted: set[int]) -> Iterator[Pixels] | None:
     if video.is_video(source):
         return (one.rgb for one in video.read_frames(source, video.FPS) if one.index in wanted)
     if source.suffix != ".zarr":
@@ -177,7 +176,9 @@ def _pictures(source: Path, wanted: set[int]) -> Iterator[Rgb] | None:
     return (sequence["rgb"][t] for t in sorted(wanted))
 
 
-def _drawn(found: dict[str, Any], times: NDArray[np.floating], pictures: Iterator[Rgb]) -> Iterator[Rgb]:
+def _drawn(
+    found: dict[str, Any], times: NDArray[np.floating], pictures: Iterator[Pixels]
+) -> Iterator[Pixels]:
     force, size = found["total_force_mn"], length(found["density"])
     largest, curve = float(np.max(size, initial=0.0)), None
     for t, rgb in enumerate(pictures):

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from numpy.typing import NDArray
 from tensorboardX import SummaryWriter
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 from torchmetrics.aggregation import MeanMetric
@@ -31,6 +30,7 @@ from learn.split import Split, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
 from learn.training.gpu_batches import place_frames
 from learn.training.threads import make_fabric
+from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
 from synth.system.terminal import ProgressCallback
 
@@ -241,7 +241,7 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
     }
 
 
-def _gain(forces: NDArray[np.float64], anatomies: int) -> float:
+def _gain(forces: Floats, anatomies: int) -> float:
     """Slope through the origin of true on predicted force, within `_GAINS`; 1 for too few anatomies."""
     pp, tp = forces[4:6]
     if anatomies < _GAIN_ANATOMIES or not tp > 0:
@@ -249,7 +249,7 @@ def _gain(forces: NDArray[np.float64], anatomies: int) -> float:
     return min(max(float(tp / pp), _GAINS[0]), _GAINS[1])
 
 
-def moments(true: torch.Tensor, predicted: torch.Tensor) -> NDArray[np.float64]:
+def moments(true: torch.Tensor, predicted: torch.Tensor) -> Floats:
     """`metrics.moments`, summed on the tensors' own device."""
     t, p = true.double(), predicted.double()
     sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])

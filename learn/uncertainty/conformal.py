@@ -11,9 +11,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from synth.arrays import Floats
 
 LEVELS = (0.9, 0.68)  # coverage of a new unit's frames
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import FiniteFloat
 
+from synth.arrays import Floats
 from synth.job.types import Positive
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from synth.arrays import Floats, Map, Mask
 
 MOTION = ("log motion", "divergence", "uniform share", "spread", "confidence", "tissue share")
 DEPTH = ("log depth motion", "confidence of depth", "uniform share of depth")  # of stereo
@@ -24,9 +24,9 @@ def motion_names(depth: bool) -> tuple[str, ...]:
 
 
 def motion_features(
-    displacement: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    confidence: NDArray[np.float32] | None,
+    displacement: Map,
+    mask: Map,
+    confidence: Map | None,
     extent_mm: float,
 ) -> Floats:
     """Features of each frame, in the order of `motion_names`.
@@ -72,12 +72,12 @@ def motion_features(
     return np.stack(columns, axis=1)
 
 
-def is_moving(motion: Floats) -> NDArray[np.bool_]:
+def is_moving(motion: Floats) -> Mask:
     """(T,) whether the motion of frames with `motion_features` (T, F) is above `RESTING_MM`."""
     return np.asarray(motion[:, 0] > np.log(RESTING_MM + FLOOR_MM))
 
 
-def estimate_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: float) -> Floats:
+def estimate_features(size: Floats, magnitude: Map, cell_mm2: float) -> Floats:
     """Features of each frame's force estimate, in the order of `ESTIMATE`, (T, 2).
 
     Args:
@@ -90,7 +90,7 @@ def estimate_features(size: Floats, magnitude: NDArray[np.float32], cell_mm2: fl
     return np.stack([np.log(size + _LOW_SHARE), np.log(area + 1.0)], axis=1)
 
 
-def _coarse(values: NDArray[np.float32], inside: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _coarse(values: Map, inside: Mask) -> tuple[Floats, Floats]:
     """Means over the tissue of blocks of cells, (T, C, n, n), and each block's share of tissue, (n, n)."""
     block = max(1, len(inside) // _ACROSS)
     n = len(inside) // block
@@ -104,7 +104,7 @@ def _coarse(values: NDArray[np.float32], inside: NDArray[np.bool_]) -> tuple[Flo
     return pool(values) / np.where(share > 0, share, 1.0), share
 
 
-def _divergence(shift: Floats, here: NDArray[np.bool_], pitch_mm: float) -> Floats:
+def _divergence(shift: Floats, here: Mask, pitch_mm: float) -> Floats:
     """(T,) root mean square of the divergence of (T, 2, n, n), by forward differences in the tissue."""
     ends = here[:-1, :-1] & here[:-1, 1:] & here[1:, :-1]
     if not ends.any():

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from learn.uncertainty import conformal
@@ -20,10 +19,9 @@ from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.error_model import ErrorModel, fit_error_model
 from learn.uncertainty.features import ESTIMATE, estimate_features
 from learn.uncertainty.out_of_distribution import MotionDistribution
+from synth.arrays import Floats, Map
 from synth.errors import UserError
 from synth.job.types import Positive
-
-Floats = NDArray[np.float64]
 
 LEVEL = LEVELS[0]  # reported where there is one interval only
 _LEAST = 1e-3  # lower limit of the expected error, as a share of the training data's force
@@ -36,7 +34,7 @@ class Prediction:
     motion: Floats  # (T, F) `motion_features`
     force: Floats
     """(T, 3) total force in camera axes [mN at 1 kPa]; without direction the size in x, else NaN."""
-    magnitude: NDArray[np.float32]  # (T, N, N) ≥ 0, the map [mN/mm² or mN, at 1 kPa]
+    magnitude: Map  # (T, N, N) ≥ 0, the map [mN/mm² or mN, at 1 kPa]
     pitch_mm: float
 
     @property

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import FiniteFloat
 
 from learn.uncertainty.conformal import quantile, share_quantile
 from learn.uncertainty.features import is_moving
+from synth.arrays import Floats
 from synth.job.types import Positive
-
-Floats = NDArray[np.float64]
 
 FRAMES = 0.99  # share of held-out frames within `MotionDistribution.frame_limit`
 RECORDINGS = 0.95  # share of held-out recordings within `MotionDistribution.recording_limit`

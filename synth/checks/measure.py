@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Mask
 from synth.dataset.store import Sequence
 
 
@@ -41,7 +41,7 @@ def truth(good: bool, where: str) -> Measure:
     return Measure(0.0 if good else 1.0, 0.0, where)
 
 
-def inner(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def inner(mask: Mask, pixels: int) -> Mask:
     """The mask (H, W) eroded by `pixels`, also at the edge of the picture."""
     side = 2 * pixels + 1
     core = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0)

@@ -7,14 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.checks.measure import Measure, inner, truth
 from synth.dataset.store import Sequence
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera_motion import CameraMotion
-
-Floats = NDArray[np.float64]
 
 
 def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

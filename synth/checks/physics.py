@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Map, Mask, Pixels
 from synth.checks.measure import Measure, inner
 from synth.dataset.store import Sequence
 
@@ -130,17 +131,17 @@ def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]
         yield Measure(float((corners & (turned < 0)).sum()) / count, 0.005, f"frame {t}: turned over")
 
 
-def _targets(flow: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _targets(flow: Floats) -> tuple[Map, Map]:
     """Column and row (H, W) to which each rest pixel has moved."""
     rows, columns = np.indices(flow.shape[:2], np.float32)
     return (columns + flow[..., 0]).astype(np.float32), (rows + flow[..., 1]).astype(np.float32)
 
 
-def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _near(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)), bool)
 
 
-def _contrast(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _contrast(rgb: Pixels) -> Map:
     """Brightness normalised by its local mean and contrast, to be independent of lighting."""
     grey = cv2.GaussianBlur(rgb.mean(axis=2, dtype=np.float32), (0, 0), 1.0)
     mean = cv2.GaussianBlur(grey, (0, 0), 8.0)

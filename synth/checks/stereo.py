@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map, Mask
 from synth.checks import optics
 from synth.checks.measure import Measure, inner
 from synth.dataset.store import Sequence
 from synth.render.camera import camera as cameras
-
-Floats = NDArray[np.float64]
 
 _EVERY = 9  # every 9th rest pixel is checked
 _FEWEST = 50  # least number of points for a median
@@ -62,7 +61,7 @@ def right_of(sequence: Sequence) -> cameras.Camera:
 
 
 def _depth(
-    sequence: Sequence, t: int, name: str, pixels: Floats, moved: Floats, visible: NDArray[np.bool_]
+    sequence: Sequence, t: int, name: str, pixels: Floats, moved: Floats, visible: Mask
 ) -> Iterator[Measure]:
     """A camera's depth at pixels (N, 2), against that of the points (N, 3) mm visible there."""
     if name in sequence and visible.sum() > _FEWEST:
@@ -72,7 +71,7 @@ def _depth(
         yield Measure(most, 5e-4, f"frame {t}: {name} of 90%")
 
 
-def _sampled(field: NDArray[np.floating], pixels: Floats) -> NDArray[np.float32]:
+def _sampled(field: NDArray[np.floating], pixels: Floats) -> Map:
     x, y = np.ascontiguousarray(pixels.T, np.float32)
     found = cv2.remap(field.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR, borderValue=0)
     return np.asarray(found[0], np.float32)

@@ -17,6 +17,8 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from synth.arrays import Array, Pixels
+
 _CODECS = ["BytesCodec", "BloscCodec", "Crc32cCodec"]
 _MISSING = 2**64 - 1
 
@@ -30,7 +32,7 @@ class ShardReader:
         self._unpack = numcodecs.Blosc()
         self._entries: dict[int, NDArray[np.uint64]] = {}
 
-    def __getitem__(self, t: int) -> NDArray[Any]:
+    def __getitem__(self, t: int) -> Array:
         """Frame `t`; negative `t` count from the end."""
         if not -self._length <= t < self._length:
             raise IndexError(t)
@@ -70,7 +72,7 @@ def open_frames(array: zarr.Array[Any], folder: Path | None) -> ShardReader | No
     return ShardReader(folder, array.shape, array.shards[0], np.dtype(array.dtype))
 
 
-def _checked(data: bytes, length: int) -> NDArray[np.uint8]:
+def _checked(data: bytes, length: int) -> Pixels:
     if len(data) != length or length < 4:
         raise ValueError("the file is truncated")
     inner, stated = np.frombuffer(data, np.uint8)[:-4], int.from_bytes(data[-4:], "little")

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from synth.arrays import Array
 from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
 from synth.errors import InvalidValue, NotFinite, UserError, as_path, did_you_mean
@@ -62,7 +62,7 @@ class Writer:
         """Whether the job stores that field; `put` ignores others."""
         return _field(name).name in self._wanted
 
-    def put(self, name: str, array: NDArray[Any]) -> None:
+    def put(self, name: str, array: Array) -> None:
         """Writes a whole field, of the shape in the field table for this sequence.
 
         Raises ValueError for another shape or type, NotFinite if a value is NaN or infinite.
@@ -75,7 +75,7 @@ class Writer:
         else:
             self._writer(name).write(array)
 
-    def put_frame(self, name: str, t: int, array: NDArray[Any]) -> None:
+    def put_frame(self, name: str, t: int, array: Array) -> None:
         """Writes frame `t` of a field, without its first axis; frames must be in order. Raises as `put`."""
         if self.wants(name):
             self._writer(name).append(t, array)
@@ -125,7 +125,7 @@ class _FieldWriter:
         self._field, self.shape, self.filled = field, shape, 0
         self._dtype = dtype = np.dtype("float16" if half else field.dtype)
         self.hash = field_hasher(field.name, dtype, shape)
-        self._pending: list[NDArray[Any]] = []
+        self._pending: list[Array] = []
         self.largest = self.rounding = 0.0
         chunk, shard = shape, None
         if field.framed:
@@ -151,7 +151,7 @@ class _FieldWriter:
             config={"write_empty_chunks": True},
         )
 
-    def append(self, t: int, frame: NDArray[Any]) -> None:
+    def append(self, t: int, frame: Array) -> None:
         if not self._field.framed:
             raise ValueError(f"{self._field.name}: is not stored by frame")
         if t != self.filled:
@@ -162,11 +162,11 @@ class _FieldWriter:
             self._array[self.filled - len(self._pending) : self.filled] = np.stack(self._pending)
             self._pending.clear()
 
-    def write(self, array: NDArray[Any]) -> None:
+    def write(self, array: Array) -> None:
         self._array[...] = self._accept(array, self.shape, "")
         self.filled = self.shape[0]
 
-    def _accept(self, array: NDArray[Any], shape: tuple[int, ...], where: str) -> NDArray[Any]:
+    def _accept(self, array: Array, shape: tuple[int, ...], where: str) -> Array:
         """A checked copy of a frame or field, as stored; adds it to the hash and the greatest length."""
         name, dtype = self._field.name, self._dtype
         array = np.asarray(array)
@@ -205,7 +205,7 @@ class FieldReader:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, selection: Any) -> NDArray[Any]:
+    def __getitem__(self, selection: Any) -> Array:
         single = isinstance(selection, (int, np.integer))
         try:
             values = self._shards[int(selection)] if single and self._shards else self._array[selection]
@@ -218,7 +218,7 @@ class FieldReader:
                 why += " or its server does not support range requests"
             raise UserError(f"{self._where}: cannot be read, {why} ({error})") from error
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.asarray(self[...], dtype)
 
 
@@ -264,12 +264,12 @@ class Sequence:
         except (ValueError, RecursionError):  # NaN in an unchecked attribute, or unlimited nesting
             return False
 
-    def read_whole(self, name: str) -> NDArray[Any]:
+    def read_whole(self, name: str) -> Array:
         """A field without a frame axis, as `read_sealed`."""
         (values,) = self.read_sealed(name)
         return values
 
-    def read_sealed(self, name: str) -> Iterator[NDArray[Any]]:
+    def read_sealed(self, name: str) -> Iterator[Array]:
         """Yields a field frame by frame, or as a whole if it has no frame axis.
 
         Raises:
@@ -388,7 +388,7 @@ def _field(name: str) -> Field:
     return FIELDS[name]
 
 
-def _check_limits(field: Field, values: NDArray[Any], where: str) -> None:
+def _check_limits(field: Field, values: Array, where: str) -> None:
     """Raises UserError if a value is not finite, or outside the table's limits."""
     if values.dtype.kind != "f" or not values.size:
         return

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Indices
 from synth.fem.mesh.element import Quadrature, scatter
 from synth.system.jit import compiled
 
-Floats = NDArray[np.float64]
-Cells = NDArray[np.int32]
-
 
 @compiled
-def gradient(cells: Cells, slope: Floats, u: Floats, out: Floats) -> None:
+def gradient(cells: Indices, slope: Floats, u: Floats, out: Floats) -> None:
     """Displacement gradient at every quadrature point, in place.
 
     Args:
@@ -38,7 +35,7 @@ def gradient(cells: Cells, slope: Floats, u: Floats, out: Floats) -> None:
 
 
 @compiled
-def divergence(cells: Cells, slope: Floats, weight: Floats, stress: Floats, out: Floats) -> None:
+def divergence(cells: Indices, slope: Floats, weight: Floats, stress: Floats, out: Floats) -> None:
     """Nodal forces that balance a stress, in place: the transpose of `gradient`.
 
     Args:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem.surface_embedding import vertex_area
 from synth.geometry.triangles import Shape
-
-Floats = NDArray[np.float64]
 
 _ROUNDING = 1e-6
 """Part of a quantity's largest value that passes for 0: other engines may compute in single precision."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import NotFinite, UserError
 from synth.fem.system import State, System
 from synth.job.laws import LEAST_JACOBIAN
-
-Floats = NDArray[np.float64]
 
 TOLERANCE = 2e-4
 """Force out of balance, as a part of the load, at which a step ends."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
 from synth.fem.laws import lame, least_determinant
 from synth.job.laws import LAWS, Law, load_law
-
-Floats = NDArray[np.float64]
 
 _STEP, _CLOSE = 1e-5, 1e-4
 

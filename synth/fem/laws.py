@@ -12,11 +12,9 @@ neo-hookean     mu/2 (tr C - 3) - mu log J + lambda/2 (log J)^2 (Bonet & Wood, N
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.system.jit import compiled
-
-Floats = NDArray[np.float64]
 
 NUMBER = {"linear": 0, "corotational": 1, "neo-hookean": 2}
 """Number of each law in the compiled loops."""

@@ -20,13 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Indices
 from synth.fem.mesh.element import face_shape_slope, scatter
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.system.jit import compiled
-
-Floats = NDArray[np.float64]
 
 _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 """Barycentric quadrature points of degree 2, of equal weight: exact at small strain for flat faces."""
@@ -44,7 +42,7 @@ class MembraneSheet:
 class Membrane:
     """A membrane on F faces of the surface, with Q quadrature points and n nodes each."""
 
-    faces: NDArray[np.int32]  # (F, n) nodes
+    faces: Indices  # (F, n) nodes
     slope: Floats  # (F, Q, n, 2) 1/mm, of the shape functions along the two rest tangents
     tangent: Floats  # (F, Q, 3, 2) orthonormal tangents at rest
     weight: Floats  # (F, Q) mm^2 at rest
@@ -124,7 +122,7 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
 
 @compiled
 def _pull(
-    faces: NDArray[np.int32],
+    faces: Indices,
     slope: Floats,
     tangent: Floats,
     weight: Floats,

@@ -14,15 +14,13 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.fem.equilibrium import TOLERANCE, LoadPath, follow_loads, minimise_energy
 from synth.fem.material import Tissue
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.fem.mesh.tetrahedra import RIM_MM
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System
 from synth.geometry.triangles import Shape
-
-Floats = NDArray[np.float64]
 
 HEART_HZ, BREATH_HZ = (1.0, 1.7), (0.2, 0.35)
 """Heart and breathing rate of an adult at rest: 60 to 102 and 12 to 21 a minute. On the exposed brain their

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.fem import surface_embedding, tool_gesture
 from synth.fem.deformation import Deformation
 from synth.fem.equilibrium import solve_path
@@ -18,8 +18,6 @@ from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
 from synth.job.laws import check_load
-
-Floats = NDArray[np.float64]
 
 _STEP_S = 0.03  # longest time step of dynamics
 _DAMPING = 2.0  # mass-proportional, 1/s

@@ -17,13 +17,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints
 from synth.fem.mesh.element import gradients, shape
 from synth.fem.mesh.tetrahedra import FACES, Tets, outer_faces
 from synth.system.jit import compiled
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 _EVEN_MM = 2.0  # length over which rotation is averaged
 

@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 
+from synth.arrays import Floats, Ints
 from synth.errors import UserError
 from synth.fem import foreign_law
 from synth.fem.assembly import divergence, gradient, stiffness
@@ -17,8 +17,6 @@ from synth.fem.laws import NUMBER, lame, least_determinant, resist_swelling, str
 from synth.fem.membrane import Membrane, MembraneSheet, cover
 from synth.fem.mesh.element import Quadrature, quadrature, quality
 from synth.fem.mesh.tetrahedra import Tets
-
-Floats = NDArray[np.float64]
 
 _FLATTEST = 0.01  # mean ratio; measured: one sliver of 0.002 under a contact takes a quarter of the motion
 
@@ -46,7 +44,7 @@ class System:
     mesh: Quadrature
     law: str
     poisson: float
-    free: NDArray[np.int64]  # (D,) degrees of freedom that can move
+    free: Ints  # (D,) degrees of freedom that can move
     hold: sp.csr_array  # (N, N) mN/mm, as in `Tets`
     stiffness: sp.csr_array  # (3N, 3N) mN/mm at rest, springs and membrane included
     factor: SuperLU  # of the free part of `stiffness`

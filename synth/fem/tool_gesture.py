@@ -7,11 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints
 from synth.errors import UserError
 from synth.geometry.triangles import Shape
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
 FRICTION = 0.4  # drag of a sliding tip, as a part of its push

@@ -5,20 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from synth.arrays import Floats, Map
 from synth.render.camera.camera_sensor import processed
 from synth.render.camera.colour_processing import PLAIN, ColourProcessing
-
-Floats = npt.NDArray[np.float64]
 
 _PIXELS, _DIRECTIONS, _QUANTILES = 6000, 48, 100
 _OFF_DIAGONAL = -0.6, 0.2  # range in published cameras
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
 
 
-def fit_colours(light: npt.NDArray[np.float32], video: Floats) -> tuple[ColourProcessing, float]:
+def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and the cost.
 
     Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011). Directions in

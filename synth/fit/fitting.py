@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from synth.arrays import Map, Mask, Pixels
 from synth.fit.colours import fit_colours
 from synth.fit.photograph import Photograph
-from synth.fit.statistics import Map, Mask, Picture, measure
+from synth.fit.statistics import measure
 from synth.job.schema import Family, Job
 from synth.render.appearance.family import FAMILIES
 from synth.render.camera import camera_sensor
@@ -45,7 +46,7 @@ class TissueFrame(NamedTuple):
     usable: Mask  # (H, W) tissue
     sensor: CameraSensor  # default sensor with the sequence's exposure and white balance
 
-    def record(self, keys: dict[str, Any]) -> Picture:
+    def record(self, keys: dict[str, Any]) -> Pixels:
         """The picture (H, W, 3) sRGB recorded by the sensor with these keys."""
         return camera_sensor.record(self.radiance, replace(self.sensor, **keys), np.random.default_rng(0))
 

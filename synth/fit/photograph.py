@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from PIL import Image, JpegImagePlugin
 
+from synth.arrays import Mask, Pixels
 from synth.errors import UserError
-from synth.fit.statistics import Mask, Picture
 from synth.flow import mask_detection
 from synth.job.schema import RenderSection, SensorSection
 from synth.render.camera import video_link
@@ -40,7 +40,7 @@ class Compression(NamedTuple):
             tables = [list(table) for table in image.quantization.values()]
             return cls(tables[:2], _SAMPLING[max(0, JpegImagePlugin.get_sampling(image))], finer)
 
-    def apply(self, rgb: Picture) -> Picture:
+    def apply(self, rgb: Pixels) -> Pixels:
         """A picture (H, W, 3) compressed alike at the file's resolution, and resampled back."""
         if not self.tables:
             return rgb
@@ -51,7 +51,7 @@ class Compression(NamedTuple):
         back = np.asarray(Image.open(packed).convert("RGB"))
         return np.asarray(cv2.resize(back, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
-    def bitrate_mbps(self, rgb: Picture) -> float | None:
+    def bitrate_mbps(self, rgb: Pixels) -> float | None:
         """The bitrate, for 640 x 480, at which H.264 has the same loss on a frame; None: it is invisible."""
         lost = cv2.PSNR(rgb, self.apply(rgb))
         if lost > _INVISIBLE_DB:
@@ -69,7 +69,7 @@ class Compression(NamedTuple):
 class Photograph(NamedTuple):
     """A photograph for the measurement of appearance and camera."""
 
-    rgb: Picture  # (H, W, 3) sRGB
+    rgb: Pixels  # (H, W, 3) sRGB
     usable: Mask  # (H, W) cortex, without instruments
     mm_per_px: float
     compression: Compression

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Map, Mask, Pixels
 from synth.flow import mask_detection
-
-Picture = npt.NDArray[np.uint8]
-Map = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 _BANDS_PX = ((0.7, 1.4), (2.8, 5.6))
 _BLOCK, _SMOOTHEST = 16, 0.2  # px; noise is measured where such blocks are smoothest
 _LAPLACIAN = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 
 
-def measure(rgb: Picture, usable: Mask, reach: float = 1.0) -> dict[str, float]:
+def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     """Statistics by which a photograph can be compared with a rendered frame of another cortex.
 
     `vignette`: loss of light in the corners, a logarithm. `noise`: standard deviation in grey levels where

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, first_line
 from synth.geometry.triangles import Shape
 from synth.geometry.vtk import read_vtk
 from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
-
-Floats = NDArray[np.float64]
 
 KINDS = ("obj", "stl", "ply", "off", "vtk")  # suffixes of the files that can be read
 
@@ -74,7 +72,7 @@ def load_brain(
     return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, held)
 
 
-def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, NDArray[np.int64]]:
+def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
     """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3).
 
     `fill_holes`: every hole is closed by a fan of triangles, so that each edge has two faces. UserError: the
@@ -108,7 +106,7 @@ def axes(out: Floats) -> Floats:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
+def _heights(vertices: Floats, faces: Ints) -> Floats:
     """Heights at which the z axis intersects the faces [mm]."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], axis=1)
@@ -117,7 +115,7 @@ def _heights(vertices: Floats, faces: NDArray[np.int64]) -> Floats:
     return np.asarray((parts[hit] * vertices[faces[hit], 2]).sum(axis=1) / whole[hit])
 
 
-def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+def _read(path: Path) -> tuple[Floats, Ints]:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in KINDS:
         raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(KINDS)}")
@@ -140,7 +138,7 @@ def _read(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     return _merged(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
-def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     """The surface without duplicate vertices and faces, faces without area, and vertices without faces."""
     if len(vertices) == 0 or len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -154,7 +152,7 @@ def _merged(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, NDArray
     return vertices[first][used], faces.reshape(-1, 3)
 
 
-def _filled(vertices: Floats, faces: NDArray[np.int64], name: str) -> NDArray[np.int64]:
+def _filled(vertices: Floats, faces: Ints, name: str) -> Ints:
     """The faces, with a fan of triangles over each hole."""
     import trimesh
 
@@ -166,14 +164,14 @@ def _filled(vertices: Floats, faces: NDArray[np.int64], name: str) -> NDArray[np
     return np.asarray(mesh.faces, np.int64)
 
 
-def _open_share(vertices: Floats, faces: NDArray[np.int64]) -> float:
+def _open_share(vertices: Floats, faces: Ints) -> float:
     """Area of the flat lid that would close the surface over the surface's area: 0 if closed, below 1."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     areas = np.cross(b - a, c - a)  # doubled; their sum is 0 for a closed surface
     return float(np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum())
 
 
-def _volume(vertices: Floats, faces: NDArray[np.int64]) -> float:
+def _volume(vertices: Floats, faces: Ints) -> float:
     """Volume by the divergence theorem about the centroid; approximate if there are holes."""
     corner = (vertices - vertices.mean(axis=0))[faces]
     return float(abs(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6))

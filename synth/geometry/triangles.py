@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from synth.arrays import Array, Floats, Indices
 from synth.system.jit import compiled
-
-Floats = npt.NDArray[np.float64]
 
 
 class Shape(NamedTuple):
     """A triangle mesh, world axes."""
 
     vertices: Floats  # (V, 3) mm
-    faces: npt.NDArray[np.int32]  # (F, 3)
+    faces: Indices  # (F, 3)
 
 
 def joined(*shapes: Shape) -> Shape:
@@ -27,7 +25,7 @@ def joined(*shapes: Shape) -> Shape:
     return Shape(vertices, np.concatenate(faces).astype(np.int32))
 
 
-def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] = "") -> npt.NDArray[np.int32]:
+def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] = "") -> Indices:
     """Faces of a grid of vertices, row by row: both halves of its cells, (2, cells, 3).
 
     `closed`: the last row or column is joined to the first.
@@ -39,7 +37,7 @@ def grid_faces(rows: int, columns: int, closed: Literal["", "rows", "columns"] =
     return np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32)
 
 
-def lengths(vectors: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def lengths(vectors: Array) -> Array:
     """Length (...) of short vectors (..., C): bit-identical to `norm`, but ten times as fast."""
     total = vectors[..., 0] * vectors[..., 0]
     for k in range(1, vectors.shape[-1]):

@@ -11,12 +11,10 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import InvalidValue, UserError, as_user_error
 from synth.plugins import Registry
-
-Floats = NDArray[np.float64]
 
 LARGEST_LOAD = {"linear": 0.2, "corotational": 0.2, "neo-hookean": 0.4}
 """Largest P = F/(E a^2) at which a law is accepted: its worst error there is 6.0%, and a straight push of the

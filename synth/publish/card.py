@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.dataset import index, location, split
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import open_sequence
@@ -115,7 +115,7 @@ def _limits(folder: Folder, job: Job) -> list[str]:
     return [line for line in text.splitlines() if line]
 
 
-def column(rows: Iterable[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
+def column(rows: Iterable[Mapping[str, Any]], name: str) -> Floats:
     """The values (n,) of one column, without missing ones."""
     return np.array([row[name] for row in rows if row.get(name) is not None], np.float64)
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.dataset import size_forecast
 from synth.dataset.store import open_sequence
 from synth.fem import tool_gesture
@@ -82,7 +82,7 @@ def _draw_scenario(job: Job, index: int) -> Rgb:
     return caption(picture, label, job.render.size[1] - 8)
 
 
-def poised(gesture: Gesture, surface: CortexSurface) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     touching = ToolMotion(np.zeros(1), np.zeros(1), np.zeros((1, 2)))
     shape = Shape(surface.vertices, surface.faces)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial import ConvexHull, cKDTree
 
+from synth.arrays import Floats, Indices, Pixels
 from synth.errors import UserError
 from synth.geometry.brain_surface import axes, read_brain
 from synth.job import writer
@@ -19,8 +19,6 @@ from synth.job.schema import AnatomySection, CraniotomySection, FemSection, Job
 from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
 from synth.sequence.fem_mechanics import build_volume
 from synth.sequence.scene import at_rest
-
-Floats = NDArray[np.float64]
 
 _PLACES = 250
 _PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # samples on the surface: some in every pixel of the height map
@@ -89,7 +87,7 @@ def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: 
 
 def draw_openings(
     mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False
-) -> NDArray[np.uint8]:
+) -> Pixels:
     """Picture (H, W, 3) of the brain from six sides, with the outline and number (from 1) of each opening."""
     vertices, faces = read_brain(mesh, fill_holes)
     corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2
@@ -102,7 +100,7 @@ def draw_openings(
     for side in (*np.eye(3), *-np.eye(3)):
         flat = axes(side)[:2].T * [scale, -scale]
 
-        def pixel(where: Floats, flat: Floats = flat) -> NDArray[np.int32]:
+        def pixel(where: Floats, flat: Floats = flat) -> Indices:
             return np.asarray(np.rint((where - middle) @ flat + _TILE_PX / 2), np.int32)
 
         tile = np.zeros((_TILE_PX, _TILE_PX, 3), np.uint8)

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Mask, Pixels
 from synth.dataset.store import Sequence as Sequence_
 from synth.errors import UserError
 
-Rgb = NDArray[np.uint8]  # (H, W, 3) uint8, sRGB
+Rgb = Pixels  # (H, W, 3) uint8, sRGB
 
 INK = (40, 40, 40)
 _CAPTION_PX = 26
@@ -46,7 +47,7 @@ def overlay(base: Rgb, colours: Rgb, weight: NDArray[np.floating]) -> Rgb:
     return np.round(blend).astype(np.uint8)
 
 
-def arrows(base: Rgb, flow: NDArray[np.floating], where: NDArray[np.bool_], gain: float) -> Rgb:
+def arrows(base: Rgb, flow: NDArray[np.floating], where: Mask, gain: float) -> Rgb:
     """Flow (H, W, 2) px as arrows on a grid, 24 across, lengthened by `gain`, in the mask `where` (H, W)."""
     picture = base.copy()
     height, width = where.shape

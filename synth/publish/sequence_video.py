@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Ints, Map, Mask
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish import picture as drawing
@@ -88,7 +89,7 @@ def draw_video(
         yield picture
 
 
-def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: dict[str, float]) -> Rgb:
+def _overlaid(sequence: Sequence, t: int, tissue: Mask, largest: dict[str, float]) -> Rgb:
     picture, words = sequence["rgb"][t], [f"{sequence['time'][t]:.2f} s"]
     if "force" in largest:
         size = np.linalg.norm(sequence["traction"][t], axis=-1)
@@ -102,7 +103,7 @@ def _overlaid(sequence: Sequence, t: int, tissue: NDArray[np.bool_], largest: di
     return drawing.caption(drawing.legible(picture), "  ".join(words))
 
 
-def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> NDArray[np.float32]:
+def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> Map:
     """Values (H, W) on the rest frame's pixels, warped to a frame by its flow from there (H, W, 2) px.
 
     The flow is inverted by fixed-point iteration, which converges for smooth motion.
@@ -147,5 +148,5 @@ def mark(curve: Rgb, k: int, count: int) -> Rgb:
     return marked
 
 
-def _columns(count: int, width_px: int) -> NDArray[np.int64]:
+def _columns(count: int, width_px: int) -> Ints:
     return np.round(np.linspace(_LEFT_PX, width_px - 1 - _LEFT_PX, count)).astype(int)

@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.flow.estimator import Flags
 from synth.recording_flow.camera_motion import CameraPath
-from synth.recording_flow.harmonic_fit import Floats, Rhythm, Span, find_rhythms, fit, visible_rates
+from synth.recording_flow.harmonic_fit import Rhythm, Span, find_rhythms, fit, visible_rates
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.flow.estimator import Flags
 from synth.recording_flow.camera_motion import (
     CameraPath,
     Course,
-    Floats,
     Similarity,
     SimilarityBasis,
     weigh_outliers,

@@ -8,12 +8,13 @@ from itertools import chain
 
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.flow import image, mask_detection
 from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
-from synth.flow.stereo.rig import Floats, Intrinsics, StereoRig
+from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker
 from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size

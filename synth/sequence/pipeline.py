@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Mask, Pixels
 from synth.dataset.store import Writer
 from synth.fields import FIELDS
 from synth.flow import mask_detection, track
@@ -54,8 +54,8 @@ class _Task:
 class _Video:
     """Video of one camera."""
 
-    rgb: NDArray[np.uint8]  # (T, H, W, 3)
-    tools: NDArray[np.bool_]  # (T, H, W) pixels of the instruments
+    rgb: Pixels  # (T, H, W, 3)
+    tools: Mask  # (T, H, W) pixels of the instruments
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:

@@ -13,11 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map, Mask
 from synth.geometry.triangles import lengths
-
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Force = NDArray[np.float64]
 
 _FORCE_SHARE = 0.02  # standard deviation of the first stage's noise, as a share of a label
 _FRAMES = 0.3  # share of the frames that the second stage disturbs
@@ -28,7 +25,7 @@ _NEAR, _LEAST_REACH = 1.5, 0.05  # the contact's surroundings: 1.5 times its rea
 _LOW = 30  # percentile of force below which a point may be disturbed
 
 
-def intensity(traction: NDArray[np.floating], force_mn: float) -> Force:
+def intensity(traction: NDArray[np.floating], force_mn: float) -> Floats:
     """The published label: the load scaled so that its largest value is the total force.
 
     Args:
@@ -42,7 +39,7 @@ def intensity(traction: NDArray[np.floating], force_mn: float) -> Force:
     return np.asarray(traction, np.float64) * (force_mn / peak if peak > 0 else 0.0)
 
 
-def with_noise(label: Force, tissue: Mask, share: float, rng: np.random.Generator) -> Force:
+def with_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generator) -> Floats:
     """First stage: normal noise, a `share` of each label (H, W, 3) mN, on those of the tissue (H, W)."""
     out = np.zeros_like(label)
     mine = label[tissue]
@@ -61,7 +58,7 @@ def noisy_frames(frames: int, rng: np.random.Generator) -> Mask:
     return chosen
 
 
-def disturbed(flow: Map, label: Force, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Force]:
+def disturbed(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Floats]:
     """Second stage, in one frame: flow (H, W, 2) px and label (H, W) mN with some points disturbed."""
     flow, label = flow.copy(), label.copy()
     place = np.argwhere(tissue)
@@ -97,7 +94,7 @@ class Published:
         share = _FORCE_SHARE if labels == "published" else 0.0
         return cls(share, tissue, noisy_frames(frames, rng), rng)
 
-    def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Force) -> dict[str, Map]:
+    def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Floats) -> dict[str, Map]:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.
 
         Args:

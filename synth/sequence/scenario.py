@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem import tool_gesture
 from synth.fem.material import Pia, Tissue
@@ -27,7 +27,6 @@ from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
 
-Floats = NDArray[np.float64]
 Random = np.random.Generator
 Range = tuple[float, float]
 

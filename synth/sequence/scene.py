@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.fem.deformation import Deformation
 from synth.fem.surface_embedding import vertex_area
@@ -28,8 +28,6 @@ from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(RenderedFrame):
@@ -42,7 +40,7 @@ class Frame(RenderedFrame):
     index: int
     """Number of the frame; 0 is the rest frame."""
     time_s: float
-    traction: NDArray[np.float32]
+    traction: Map
     """(H, W, 3) kPa on the tissue, camera axes, at the rest frame's pixels: the label."""
     force: Floats
     """(3,) mN on the tissue, camera axes: the sum of traction times `Scene.area`."""
@@ -90,12 +88,12 @@ class RestScene:
         return Renderer(content, self.view, appearance.sensor, job.render, job.store.extra)
 
     @property
-    def tissue(self) -> NDArray[np.bool_]:
+    def tissue(self) -> Mask:
         """(H, W) brain in the rest frame."""
         return self.renderer.rest.tissue
 
     @property
-    def area(self) -> NDArray[np.float32]:
+    def area(self) -> Map:
         """(H, W) mm^2 of rest surface in each pixel of the rest frame."""
         return self.renderer.rest.area
 

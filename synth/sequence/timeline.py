@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.fem.deformation import Deformation
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera import Camera
@@ -20,7 +20,7 @@ _SUBFRAMES = 4  # pictures averaged over an open shutter
 class Timeline:
     """Surface, instruments, microscope and lamps of one sequence over time."""
 
-    rest: NDArray[np.float64]  # (V, 3) mm, the surface at rest
+    rest: Floats  # (V, 3) mm, the surface at rest
     motion: Deformation
     camera: Camera  # at rest
     camera_motion: CameraMotion

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map
 from synth.errors import UserError
 from synth.fem.tool_gesture import trajectory
 from synth.flow.estimator import create
@@ -24,8 +25,6 @@ from synth.render.camera import camera
 from synth.sequence.scene import Frame, Scene, at_rest
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import Stopwatch
-
-Floats = NDArray[np.float64]
 
 _PARTS = (0.7, 0.85, 1.0)  # of the way to the largest force, where frames are looked at
 _CELLS = (48, 36)  # across and down: displacement is averaged over them, for every size of picture
@@ -70,7 +69,7 @@ class Probe:
         stages = [*(spent / job.frames for spent in sequence_s), rendering_s, flow_s]
         return [label, recovered, *(max(1e-6, spent) for spent in stages)]
 
-    def _error(self, scene: Scene, flows: Iterable[NDArray[np.float32]]) -> float:
+    def _error(self, scene: Scene, flows: Iterable[Map]) -> float:
         """Root mean square over frames, instruments together."""
         residual = np.stack([cells_mm(scene, flow) for flow in flows]) - self._true_mm
         errors = np.einsum("kip,kp->ki", self._weights, residual.reshape(len(residual), -1))
@@ -105,7 +104,7 @@ def linearise(scene: Scene, frames: list[Frame]) -> Floats:
     return np.asarray(np.linalg.pinv(responses * root).swapaxes(1, 2) * root)
 
 
-def cells_mm(scene: Scene, flow: NDArray[np.float32]) -> Floats:
+def cells_mm(scene: Scene, flow: Map) -> Floats:
     """Means (P, 2) mm of flow (H, W, 2) px over the tissue in each cell; 0 in cells without any."""
     tissue = scene.tissue[..., None]
     return np.asarray(scene.view.mm_per_px * _cells(flow * tissue) / np.maximum(_cells(tissue), 1e-6))

@@ -20,17 +20,15 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import cache
 from synth.tune.grid import Settings, changed, differences, list_settings, show
 from synth.tune.probe import Probe
-
-Floats = NDArray[np.float64]
 
 _DRAWS = 5  # of a probe sequence, until full fidelity carries one out
 _TRIES, _CAREFUL = 6, 0.7  # of whole jobs; a miss is stepped back from to this part of the growth it adds

@@ -8,9 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from synth.arrays import Mask
 from synth.errors import UserError
 from synth.video.file_numbers import match_numbers, number_files
 from synth.video.read import read_mask
@@ -47,7 +45,7 @@ class MaskFiles:
     def __bool__(self) -> bool:
         return bool(self.by_frame) or self.default is not None
 
-    def read(self, index: int, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    def read(self, index: int, size: tuple[int, int]) -> Mask | None:
         """The mask (H, W) of a frame, None if there is none. UserError for another size."""
         path = self.by_frame.get(index, self.default)
         return None if path is None else read_mask(path, size)

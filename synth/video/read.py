@@ -12,8 +12,8 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
-from numpy.typing import NDArray
 
+from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
@@ -23,7 +23,6 @@ SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
 FPS = 25.0  # assumed if a video's times are unknown
 
-Rgb = NDArray[np.uint8]
 
 _LARGEST_BYTES = 1 << 40
 _WIDEST = 4.0  # largest aspect ratio of a pixel: a larger one is a damaged header
@@ -43,7 +42,7 @@ class Picture:
 
     index: int  # position in a video, or the number in the name of a still image
     time_s: float | None  # presentation time on the video's clock [s]; None if the file states none
-    rgb: Rgb  # (H, W, 3) uint8
+    rgb: Pixels  # (H, W, 3) uint8
 
 
 def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
@@ -149,12 +148,12 @@ def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
         yield Picture(index, None, rgb)
 
 
-def read_picture(path: Path) -> Rgb:
+def read_picture(path: Path) -> Pixels:
     """A still image as (H, W, 3) uint8 sRGB, 16-bit ones reduced to 8. UserError if it is unreadable."""
     return np.ascontiguousarray(checked_file.read_picture(path)[..., ::-1]).astype(np.uint8)
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     """The mask (H, W) of a picture: above half of its maximum, or not 0 if it holds class numbers.
 
     The opacity of a picture of one colour is its mask. UserError: unreadable, or not of `size` (height,

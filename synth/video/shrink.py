@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Mask
+
 A = TypeVar("A", bound=np.generic)
 
 
@@ -21,6 +23,6 @@ def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
     return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
 
 
-def shrink_mask(mask: NDArray[np.bool_], shrink: int, above: int) -> NDArray[np.bool_]:
+def shrink_mask(mask: Mask, shrink: int, above: int) -> Mask:
     """Downsamples a mask (H, W); True where more than `above` / 255 of a pixel is True."""
     return np.asarray(shrink_picture(mask.astype(np.uint8) * 255, shrink) > above)

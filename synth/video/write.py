@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -21,7 +21,7 @@ _TICKS = 90_000  # a second
 
 
 def encode_video(
-    target: Path, frames: Iterable[NDArray[np.uint8]], fps: float, *, quality: int = 23, group: int = 12
+    target: Path, frames: Iterable[Pixels], fps: float, *, quality: int = 23, group: int = 12
 ) -> Path:
     """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers can play.
 
@@ -46,13 +46,13 @@ def encode_video(
 
 def encode(
     container: OutputContainer,
-    frames: Iterable[NDArray[np.uint8]],
+    frames: Iterable[Pixels],
     rate: Fraction | int,
     pixels: str,
     options: Mapping[str, str],
     *,
     bits_per_s: int | None = None,
-    times_s: NDArray[np.float64] | None = None,
+    times_s: Floats | None = None,
 ) -> None:
     """Encodes frames with H.264 as the only stream of an open file.
 

@@ -7,16 +7,13 @@ from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope, scatter, shape
 from synth.job import schema
 
 FIRM_PER_MM = 2.0  # springs of skull, dura and attachments, in E per mm: 10 times as stiff as the tissue
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 _FINE = 9
@@ -60,7 +57,7 @@ def springs(points: Floats, cells: Ints, attachments: Sequence[schema.Attachment
     return sp.csr_array(total)
 
 
-def within(attachment: schema.AttachmentSection, at: Floats) -> NDArray[np.bool_]:
+def within(attachment: schema.AttachmentSection, at: Floats) -> Mask:
     """Mask (...) of the points (..., 3) mm that an attachment holds."""
     away = at - np.asarray(attachment.point)
     inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm

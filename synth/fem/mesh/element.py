@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Array, Floats, Indices, Ints
 from synth.fem.mesh.refine import EDGES
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _A, _B = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
 TET_POINTS = np.full((4, 4), _B) + (_A - _B) * np.eye(4)
@@ -57,7 +53,7 @@ def face_shape_slope(bary: Floats) -> Floats:
     return np.asarray(slope[..., 1:] - slope[..., :1])
 
 
-def scatter(local: Floats, nodes: NDArray[Any], size: int) -> sp.csr_array:
+def scatter(local: Floats, nodes: Array, size: int) -> sp.csr_array:
     """Sums element matrices (E, n, n) over their nodes (E, n) into (size, size)."""
     n = nodes.shape[1]
     rows, columns = np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, (1, n)).ravel()
@@ -95,7 +91,7 @@ def quality(corners: Floats) -> Floats:
 class Quadrature:
     """A mesh's quadrature: M elements with Q points and n nodes each."""
 
-    cells: NDArray[np.int32]  # (M, n) nodes
+    cells: Indices  # (M, n) nodes
     slope: Floats  # (M, Q, n, 3) gradients of the shape functions at the points, 1/mm
     weight: Floats  # (M, Q) mm^3
     nodes: int  # N, number of nodes

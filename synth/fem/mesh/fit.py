@@ -10,14 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.linalg import spsolve
 
+from synth.arrays import Floats, Ints
 from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, quality, scatter
 from synth.fem.mesh.lattice_stuffing import halve
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _REACH, _STEPS, _HALVINGS = 0.5, 6, 6  # search distance in a face's longest sides, steps of it, bisections
 _FARTHEST = 0.5  # largest shift of a corner, as a part of its shortest side

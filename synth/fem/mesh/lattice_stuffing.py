@@ -10,14 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from synth.arrays import Floats, Ints, Mask
 from synth.fem.mesh.element import bary_slope
 from synth.fem.mesh.refine import edges_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _SNAP = 0.3  # largest shift of a corner, in edges; less leaves flat pieces, more flattens neighbours
 _HALVINGS = 14
@@ -68,7 +65,7 @@ def halve(
     inside: Callable[[Floats], Floats],
     start: Floats,
     way: Floats,
-    begins: NDArray[np.bool_],
+    begins: Mask,
     low: Floats,
     high: Floats,
     times: int,

@@ -10,16 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import map_coordinates
 from scipy.sparse.linalg import spsolve
 
+from synth.arrays import Floats, Ints
 from synth.fem.mesh.element import face_shape, jacobians, quality, scatter
 from synth.fem.mesh.refine import EDGES
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Field = Callable[[Floats], Floats]
 """Height (n,) mm at (n, 2) mm."""
 

@@ -8,8 +8,8 @@ from itertools import product
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
 from synth.fem.mesh import attachments, winding
 from synth.fem.mesh.attachments import FIRM_PER_MM
@@ -21,8 +21,6 @@ from synth.fem.mesh.relief import HeightMap, raise_top
 from synth.geometry.brain_surface import Brain
 from synth.job import schema
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Contact = tuple[float, float, float]
 """World x, y of a contact's centre and its radius, mm."""
 
@@ -49,7 +47,7 @@ class Tets:
 
     points: Floats  # (N, 3) mm: corners first, then nodes on the edges, in their middle but for curved ones
     cells: Ints  # (M, 10), positively oriented; midsides in the order of `refine.EDGES`
-    fixed: NDArray[np.bool_]  # (N,) nodes that cannot move: the walls a block is cut out at
+    fixed: Mask  # (N,) nodes that cannot move: the walls a block is cut out at
     hold: sp.csr_array  # (N, N) mm, for E = 1 kPa: springs of the skull and of attachments
     slip: sp.csr_array | None = None  # (3N, 3N) mm: springs along the normal alone, where tissue slips
 
@@ -230,7 +228,7 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
 def _finished(
     points: Floats,
     cells: Ints,
-    wall: NDArray[np.bool_],
+    wall: Mask,
     at: schema.CraniotomySection,
     held: Sequence[schema.AttachmentSection],
     slips: bool,

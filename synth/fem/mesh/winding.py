@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Ints
 from synth.system.jit import compiled
-
-Floats = NDArray[np.float64]
 
 _LEAF = 24
 _FAR = 2.5  # cluster radii from which a dipole is accurate: the error stays below 0.01 of a turn
@@ -25,7 +24,7 @@ class Winding:
     """Winding number of a surface: 1 inside, 0 outside, between the two near a hole."""
 
     corner: Floats  # (F, 3, 3) mm, faces in the order of their clusters
-    start: NDArray[np.int64]  # (C + 1,) where each cluster's faces begin
+    start: Ints  # (C + 1,) where each cluster's faces begin
     centre: Floats  # (C, 3) mm
     radius: Floats  # (C,) mm
     moment: Floats  # (C, 3) mm^2, area times normal
@@ -72,7 +71,7 @@ def prepare(vertices: Floats, faces: NDArray[np.integer]) -> Winding:
 def _number(
     at: Floats,
     corner: Floats,
-    start: NDArray[np.int64],
+    start: Ints,
     centre: Floats,
     radius: Floats,
     moment: Floats,

@@ -8,8 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import UserError
-from synth.flow.stereo.rig import Floats, Intrinsics, StereoRig
+from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.system import checked_file
 
 _LEFT = ("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"), ("D1", "distCoeffs1", "dist_coeffs_1")

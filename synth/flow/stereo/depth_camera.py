@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.flow.confidence import deviation
 from synth.flow.estimator import Flags, Flow, Map
 from synth.flow.stereo.depth_motion import Solver, fine
-from synth.flow.stereo.rig import Floats
 from synth.flow.stereo.track import Moved
 
 _CAUTION = 1.5  # factor of the deviation of depth, which ignores its correlated errors; chosen by hand

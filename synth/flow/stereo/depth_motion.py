@@ -31,11 +31,10 @@ import scipy.sparse as sparse
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from synth.arrays import Floats
 from synth.flow import kernels
 from synth.flow.estimator import Map
 from synth.system.jit import vectorised
-
-Floats = NDArray[np.float64]
 
 _FREEDOM = np.float32(4.0)  # degrees of freedom of Student's distribution
 _CHANNELS = np.float32(3.0)

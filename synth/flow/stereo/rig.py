@@ -12,12 +12,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.flow.estimator import Flags, Map
-
-Floats = NDArray[np.float64]
 
 _PARALLEL = 1e-9  # rotations and offsets of at most this count as zero
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Map
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
 # The published loader drops nodes right of this pixel, and assumes that all files have the same nodes.
 _LARGEST_X = 1400.0
 _NODES = 20_000
-
-Floats = NDArray[np.float32]
 
 
 def write_npz(dataset: Dataset, target: Path) -> None:
@@ -37,7 +35,7 @@ def write_npz(dataset: Dataset, target: Path) -> None:
     (target / "README.txt").write_text(_NOTE, "utf-8")
 
 
-def _arrays(sequence: Sequence, count: int) -> tuple[Floats, Floats, Floats]:
+def _arrays(sequence: Sequence, count: int) -> tuple[Map, Map, Map]:
     """Motion (T, N, 2) mm, intensity (T, N) N and position (T, N, 2) px of `count` points of the tissue."""
     tissue = np.argwhere(sequence["tissue"][:])
     rows, columns = tissue[np.linspace(0, len(tissue) - 1, count).round().astype(int)].T

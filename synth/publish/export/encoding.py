@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from synth.arrays import Array
+
 PICTURES = ("rgb", "rgb_right")  # fields that are pictures
 
 
-def as_png(picture: NDArray[Any]) -> bytes:
+def as_png(picture: Array) -> bytes:
     """A PNG of (H, W, 3) uint8, (H, W) uint8 or uint16, or of a mask (H, W) bool: 0 and 255."""
     from PIL import Image
 
@@ -22,7 +23,7 @@ def as_png(picture: NDArray[Any]) -> bytes:
     return file.getvalue()
 
 
-def write_png(path: Path, picture: NDArray[Any]) -> None:
+def write_png(path: Path, picture: Array) -> None:
     """Writes a picture (H, W) or (H, W, 3) as PNG, see `as_png`; creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(as_png(picture))
@@ -38,7 +39,7 @@ def write_exr(path: Path, radiance: NDArray[np.floating]) -> None:
         file.write(str(path))
 
 
-def as_npy(values: NDArray[Any]) -> bytes:
+def as_npy(values: Array) -> bytes:
     """The bytes of an .npy file of an array (...)."""
     file = io.BytesIO()
     np.save(file, values)

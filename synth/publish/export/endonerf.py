@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Array, Floats, Map
 from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
@@ -26,19 +26,17 @@ UNIT_MM = 0.01  # one step of a depth picture, and the unit of lengths: 16 bits 
 
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0])
 
-Floats = NDArray[np.float64]
-
 
 class _Maps(NamedTuple):
     """Positions in the recorded picture of the pixels of the pinhole's (cv2.remap), each (H, W)."""
 
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
+    x: Map
+    y: Map
 
-    def smooth(self, picture: NDArray[Any]) -> NDArray[Any]:
+    def smooth(self, picture: Array) -> Array:
         return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_CUBIC))
 
-    def nearest(self, picture: NDArray[Any], outside: float = 0) -> NDArray[Any]:
+    def nearest(self, picture: Array, outside: float = 0) -> Array:
         return np.asarray(cv2.remap(picture, self.x, self.y, cv2.INTER_NEAREST, borderValue=outside))
 
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from synth.arrays import Array
 from synth.dataset import index
 from synth.dataset.folder import Folder
 from synth.dataset.store import Dataset, Sequence
@@ -122,7 +122,7 @@ def _sequence(sequence: Sequence, frameless: list[str], columns: list[str]) -> d
     return {**{name: row[name] for name in columns}, **cells, "attributes": json.dumps(sequence.attrs)}
 
 
-def _cell(name: str, values: NDArray[Any]) -> Any:
+def _cell(name: str, values: Array) -> Any:
     if _is_picture(name):
         return {"bytes": as_png(values), "path": None}
     return values if values.ndim else values.item()

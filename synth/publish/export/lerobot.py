@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from synth.arrays import Array
 from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
 from synth.video.write import encode_video
@@ -26,8 +26,6 @@ _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _QUALITY, _GROUP = 18, 2  # with a key frame every two frames, random access is fast
 _PROBED = 100  # frames of an episode for the statistics of its pictures
 _COUNTS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-
-Numbers = NDArray[Any]
 
 
 def write_episodes(dataset: Dataset, target: Path) -> None:
@@ -61,7 +59,7 @@ def _write_episode(
     tasks += [task] if task not in tasks else []
     frames, fps = sequence.frames, float(sequence.attrs["fps"])
     frame = np.arange(frames)
-    columns: dict[str, Numbers] = {
+    columns: dict[str, Array] = {
         "force": sequence["force"][:].astype(np.float32),
         "young_kpa": np.full(frames, sequence.attrs["young_kpa"], np.float32),
         "scale_mm_per_px": np.full(frames, sequence.attrs["scale_mm_per_px"], np.float32),
@@ -101,7 +99,7 @@ def _write_episode(
     return row | {f"stats/{key}/{name}": value for key, one in stats.items() for name, value in one.items()}
 
 
-def _statistics(values: Numbers, beyond: tuple[int, ...]) -> dict[str, Any]:
+def _statistics(values: Array, beyond: tuple[int, ...]) -> dict[str, Any]:
     """Statistics over the rows of (N, K), each (K, *beyond)."""
     found = {
         "min": values.min(0),

@@ -6,11 +6,10 @@ Coordinates as there: (0, 0) is the corner of the top-left pixel, whose centre i
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Array, Ints
 from synth.checks import optics
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
@@ -18,8 +17,6 @@ from synth.publish.export.encoding import as_png
 from synth.render.camera.camera import rays
 
 _POINTS = 1024
-
-Floats = NDArray[np.float64]
 
 
 def write_tracks(dataset: Dataset, target: Path) -> None:
@@ -59,7 +56,7 @@ def write_tracks(dataset: Dataset, target: Path) -> None:
         np.savez_compressed(target / f"{sequence.index:06d}.npz", **arrays)
 
 
-def _choose(sequence: Sequence) -> NDArray[np.int64]:
+def _choose(sequence: Sequence) -> Ints:
     """Pixels (N, 2) as x, y: a square grid of up to `_POINTS` on tissue visible in frame 0."""
     shown = sequence["tissue"][:] & sequence["visible"][0]
     step = max(1, int(np.ceil(np.sqrt(shown.sum() / _POINTS))))
@@ -71,7 +68,7 @@ def _choose(sequence: Sequence) -> NDArray[np.int64]:
     return pixels
 
 
-def _in_depth(sequence: Sequence, pixels: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+def _in_depth(sequence: Sequence, pixels: Ints) -> dict[str, Array]:
     """Tracks of pixels (N, 2) of frame 0 in space, and the camera's intrinsics."""
     view, right = optics.camera_of(sequence), sequence.attrs["right"]
     (fx, _, cx), (_, fy, cy), _ = view.K
