@@ -1,7 +1,5 @@
 """Learning curves: estimators recover a known force and are tested on held-out sequences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

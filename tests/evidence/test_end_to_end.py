@@ -1,7 +1,5 @@
 """Whole pipelines: errors of known estimates, orientations of clips, ridge, the cache."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Measurements of the physics at small size: refinement of the mesh, discs on the half-space."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Measurements of flow: errors, ground truth of scenes and videos, figures of stereo."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates

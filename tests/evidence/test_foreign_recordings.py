@@ -1,7 +1,5 @@
 """Recordings simulated and rendered by other programs: interpolation, forces, calibration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The gap on known errors, the noise model on known noise, and the split."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Measurements of learning: size of disturbances, scores of controls, cached runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace as replace_field
 from pathlib import Path
 

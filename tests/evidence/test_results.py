@@ -1,7 +1,5 @@
 """Stored results: their provenance and charts, whether they are up to date, making all of them again."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Measurements of scoring: ex vivo stand-ins, and a pulsating cortex from pictures to scores."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
