@@ -20,7 +20,9 @@ from synth.job.schema import Job
 from synth.system.stopwatch import Stopwatch
 
 JOB = Job(seed=1, sequences=2, frames=5, render={"size": (64, 48)}, flow={"backend": "ideal"})
-KINDS = "bit", "truncated", "removed", "swapped", "rewritten", "edited", "key gone"
+KINDS = (
+    "bit", "bytes", "truncated", "emptied", "removed", "zeroed", "swapped", "rewritten", "edited", "key gone"
+)  # fmt: skip
 EACH = 5
 
 
@@ -35,17 +37,22 @@ def damage(store: Path, kind: str, rng: np.random.Generator) -> None:
     """Damages a store; some damage changes no value, e.g. an unused bit of the compressed data."""
     every = sorted(path for path in store.rglob("*") if path.is_file())
     chunks = [path for path in every if "c" in path.relative_to(store).parts]
-    among = every if kind in ("bit", "removed") else chunks
+    among = every if kind in ("bit", "emptied", "removed") else chunks
     path = among[int(rng.integers(len(among)))]
     data = bytearray(path.read_bytes())
     at = int(rng.integers(len(data)))
-    if kind == "bit":
-        data[at] ^= 1 << int(rng.integers(8))
+    if kind in ("bit", "bytes"):
+        for k in [at] if kind == "bit" else rng.integers(len(data), size=16):
+            data[k] ^= 1 << int(rng.integers(8))
         path.write_bytes(data)
     elif kind == "truncated":
         path.write_bytes(data[:at])
+    elif kind == "emptied":
+        path.write_bytes(b"")
     elif kind == "removed":
         path.unlink()
+    elif kind == "zeroed":
+        path.write_bytes(data[:at] + bytes(len(data[at : at + 512])) + data[at + 512 :])
     elif kind == "swapped":  # both files are intact, but of other frames or another field
         other = chunks[int(rng.integers(len(chunks)))]
         path.write_bytes(other.read_bytes())
