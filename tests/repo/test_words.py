@@ -30,7 +30,7 @@ OLD = {
 TEXT = (".py", ".pyi", ".md", ".yaml", ".toml", ".jinja", ".css", ".cff", ".yml", "Makefile", "Dockerfile")
 WORDS = re.compile("|".join(rf"(?<![a-z])(?:{old})(?![a-z])" for old in OLD), re.IGNORECASE)
 EXEMPT = ("CHANGELOG.md", "tests/repo/test_words.py")
-LIQUID = "synth/render/"
+LIQUID = ("synth/render/", "docs/reference/python.md")
 """Where a film is a layer of liquid, or Mitsuba's."""
 
 
