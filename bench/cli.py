@@ -180,7 +180,7 @@ def check(
     from bench.checks.check_recording import check_recording
     from synth.recording_flow.finding import first_fault
     from synth.system.checked_file import make_folder
-    from synth.system.text_lines import hang
+    from synth.system.terminal import hang
 
     if picture is not None:
         make_folder(picture.parent)  # fails before the video is decoded

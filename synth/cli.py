@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from synth.errors import UserError, as_user_error
-from synth.fit.command import fit
 from synth.system.cli_errors import Commands
-from synth.tune.command import tune
 
 app = typer.Typer(
     name="synth",
@@ -24,18 +23,79 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
-Source = Annotated[str, typer.Argument(help="A job file, or a named job: tiny, demo, paper.")]
-Overrides = Annotated[list[str] | None, typer.Argument(help="Changes to the job, as section.key=value.")]
-Out = Annotated[Path, typer.Argument(help="A dataset's folder.")]
-Index = Annotated[int, typer.Option("--sequence", "-s", help="Which sequence, by its index.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+Source = Annotated[str, Argument(help="A job file, or a named job: tiny, demo, paper.")]
+Overrides = Annotated[list[str] | None, Argument(help="Changes to the job, as section.key=value.")]
+Out = Annotated[Path, Argument(help="A dataset's folder.")]
+Index = Annotated[int, Option("--sequence", "-s", help="Which sequence, by its index.")]
+Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
-app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')(tune)
-app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38")(fit)
+
+@app.command(epilog='Example: synth tune demo --budget "force 3%" --out tuned.yaml')
+def tune(
+    job: Source,
+    overrides: Annotated[list[str] | None, Argument(help="Changes, as section.key=value.")] = None,
+    budget: Annotated[str, Option(help="By how much the force error may grow.")] = "force 3%",
+    out: Annotated[Path | None, Option("--out", "-o", help="To write; else JOB.tuned.yaml.")] = None,
+    probes: Annotated[int, Option(min=1, max=50, help="Sequences for every setting.")] = 3,
+    checks: Annotated[int, Option(min=0, max=50, help="Further sequences for whole jobs.")] = 3,
+) -> None:
+    """Writes the cheapest job whose force error is within a budget of full fidelity's.
+
+    On a few probe sequences one parameter at a time is changed (law, mesh, time step, surface, picture,
+    paths); the settings chosen are measured as a whole. The job gets no dearer unless it misses the
+    budget. A run that was stopped goes on when it is given again.
+    """
+    from synth.job import reader
+    from synth.tune import search
+
+    share, loaded = search.parse_budget(budget), reader.load_job(job, overrides or [])
+    out = out or Path(f"{Path(job).stem}.tuned.yaml")
+    _refuse_to_replace(out)
+    tuned = search.tune(search.Measurements(loaded), share, probes, checks)
+    search.write_job(tuned, job, overrides or [], out)
+    print("\n".join([*search.lines(tuned), "", f"wrote {out}"]))
+
+
+@app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38")
+def fit(
+    photo: Annotated[Path, Argument(help="A photograph of exposed cortex by your microscope.")],
+    out: Annotated[Path, Option("--out", "-o", help="The job file (YAML) to write.")] = Path(
+        "appearance.yaml"
+    ),
+    width_mm: Annotated[
+        float, Option(min=5, max=400, help="Width of the picture at the cortex [mm].")
+    ] = 35.0,
+    mask: Annotated[Path | None, Option(help="A mask of the cortex, white; default: detected.")] = None,
+    json: Json = False,
+) -> None:
+    """Measures a photograph's camera (colours, noise, blur, vignette, codec) and its appearance family."""
+    from synth.fit import fitting
+    from synth.fit.photograph import read_photograph
+    from synth.system.checked_file import write_whole
+
+    _refuse_to_replace(out)
+    given = read_photograph(photo, width_mm, mask)
+    found = fitting.fit_camera(given)
+    lines = [
+        f"# Measured in {photo.name} by synth fit, on {given.cortex_mm2:.0f} mm2 of cortex.",
+        f"# Blur and noise are for pixels of {given.mm_per_px:.4f} mm.",
+    ]
+    for section, keys in found.items():
+        lines += [f"{section}:", *(f"  {name}: {json_.dumps(value)}" for name, value in keys.items())]
+    write_whole(out, "\n".join(lines) + "\n")
+    if json:
+        print(json_.dumps({"job": found, "cortex_mm2": given.cortex_mm2, "out": str(out)}))
+    else:
+        print("\n".join([*lines, f"wrote {out}; draw it with: synth preview {out}"]))
+
+
+def _refuse_to_replace(out: Path) -> None:
+    if out.exists() or not out.resolve().parent.is_dir():
+        raise UserError(f"{out}: {'exists already' if out.exists() else 'its folder does not exist'}")
 
 
 @app.command(epilog="Example: synth new job.yaml")
-def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
+def new(path: Annotated[Path, Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
     """Writes a job file in which every key is explained."""
     from synth.job import writer
 
@@ -47,7 +107,7 @@ def new(path: Annotated[Path, typer.Argument(help="The job file to write.")] = P
 @app.command(epilog="Example: synth schema > job.schema.json")
 def schema(
     fields: Annotated[
-        bool, typer.Option("--fields", help="Print the fields of a sequence instead: axes, type, unit.")
+        bool, Option("--fields", help="Print the fields of a sequence instead: axes, type, unit.")
     ] = False,
 ) -> None:
     """Prints the JSON schema of job files, for editors."""
@@ -60,20 +120,19 @@ def schema(
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
     job: Annotated[
-        str,
-        typer.Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK)."),
+        str, Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK).")
     ],
     overrides: Overrides = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
-    count: Annotated[int, typer.Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
-    radius: Annotated[float, typer.Option(min=3, max=60, help="Radius of a brain's craniotomy [mm].")] = 12.0,
+    out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
+    count: Annotated[int, Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
+    radius: Annotated[float, Option(min=3, max=60, help="Radius of a brain's craniotomy [mm].")] = 12.0,
     json: Json = False,
 ) -> None:
     """Draws a contact sheet of a job's scenarios and prints the time and disk that the whole job needs.
 
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
-    from synth.dataset.size_forecast import amount
+    from synth.dataset.size_forecast import amount, estimate
     from synth.geometry.brain_surface import KINDS
     from synth.job import reader
     from synth.publish import contact_sheet, openings
@@ -93,17 +152,17 @@ def preview(
         return
     read = reader.load_job(job, overrides or [])
     with counting("Compiling the first time, drawing, then measuring the cost of a sequence") as progress:
-        made = contact_sheet.draw_sheet(read, count, progress)
-    write_picture(out, made.picture)
-    spent_s, cpu_s = made.stages_cpu_s, sum(made.stages_cpu_s.values())
+        picture, spent_s = contact_sheet.draw_sheet(read, count, progress)
+    write_picture(out, picture)
+    cpu_s, disk_bytes = sum(spent_s.values()), estimate(read) * read.sequences
     if json:
-        about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": made.disk_bytes}
+        about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": disk_bytes}
         print(json_.dumps({"sheet": str(out), "render_cpu_s": spent_s["render"], **about}))
         return
     stages = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent_s.items())
     print(
         f"wrote {out}\nthe whole job: {read.sequences} sequences of {read.frames} frames, about "
-        f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(made.disk_bytes)} of disk"
+        f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(disk_bytes)} of disk"
     )
 
 
@@ -112,29 +171,24 @@ def render(
     job: Source,
     overrides: Overrides = None,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
+        Path, Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
     ] = Path("out"),
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
-    ] = None,
+    workers: Annotated[int | None, Option(min=1, help="Number of processes; default: one per core.")] = None,
     engine: Annotated[
         str,
-        typer.Option(
+        Option(
             help="local, dask://host:port, tls://host:port, or a YAML file that describes a SLURM cluster."
         ),
     ] = "local",
-    gpus: Annotated[
-        str, typer.Option(help="GPUs shared by the workers: auto, none, or numbers as 0,1.")
-    ] = "auto",
+    gpus: Annotated[str, Option(help="GPUs shared by the workers: auto, none, or numbers as 0,1.")] = "auto",
     memory: Annotated[
-        float | None,
-        typer.Option(help="Memory limit of each process [GB]; default: its share of free memory."),
+        float | None, Option(help="Memory limit of each process [GB]; default: its share of free memory.")
     ] = None,
     mix_versions: Annotated[
-        bool, typer.Option("--mix-versions", help="Continue a dataset that another version of Sulcus began.")
+        bool, Option("--mix-versions", help="Continue a dataset that another version of Sulcus began.")
     ] = False,
     retry: Annotated[
-        bool, typer.Option("--retry", help="Compute sequences of this folder again that failed before.")
+        bool, Option("--retry", help="Compute sequences of this folder again that failed before.")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -144,7 +198,7 @@ def render(
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
 
-    _end_on_terminate()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it as Ctrl-C does
     read = load_job(job, overrides or [])
     if retry:
         Folder(out).clear_failures()
@@ -168,11 +222,6 @@ def render(
         raise typer.Exit(1)
 
 
-def _end_on_terminate() -> None:
-    """Lets SIGTERM, which clusters send, end a run as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-
 @app.command(epilog="Example: synth status out")
 def status(out: Out, json: Json = False) -> None:
     """Shows how many sequences are done, running and failed, and the time and disk still needed."""
@@ -187,16 +236,13 @@ def status(out: Out, json: Json = False) -> None:
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
 def split_command(
     out: Out,
-    by: Annotated[
-        str, typer.Option(help="anatomy, opening, family, gesture, stiffness or sequence.")
-    ] = "anatomy",
-    shares: Annotated[str, typer.Option(help="Of train, validation and test.")] = "0.7,0.15,0.15",
+    by: Annotated[str, Option(help="anatomy, opening, family, gesture, stiffness or sequence.")] = "anatomy",
+    shares: Annotated[str, Option(help="Of train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[
-        list[str] | None, typer.Option(help="An appearance family that is used for testing only.")
+        list[str] | None, Option(help="An appearance family that is used for testing only.")
     ] = None,
     share_anatomy: Annotated[
-        bool,
-        typer.Option("--share-anatomy", help="Allow one brain on all sides: for a dataset of one brain."),
+        bool, Option("--share-anatomy", help="Allow one brain on all sides: for a dataset of one brain.")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -209,7 +255,7 @@ def split_command(
     folder = Folder(out)
     radius_mm = folder.job().anatomy.craniotomy.radius_mm
     chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening"))
-    rows = index.split_anew(folder, chosen)
+    rows = index.write_index(folder, chosen)
     write_card(folder)
     write_croissant(folder)
     if (page := out / "report.html").exists():
@@ -223,7 +269,7 @@ def split_command(
 @app.command(epilog="Example: synth report out --to report.html")
 def report(
     out: Out,
-    to: Annotated[Path | None, typer.Option("--to", help="The page; default: report.html in OUT.")] = None,
+    to: Annotated[Path | None, Option("--to", help="The page; default: report.html in OUT.")] = None,
 ) -> None:
     """Writes the description of a dataset again: report.html, its card README.md, and croissant.json."""
     from synth.dataset.folder import Folder
@@ -244,21 +290,19 @@ def report(
 @app.command(epilog="Example: synth export out out-hf --to hf")
 def export(
     out: Out,
-    target: Annotated[Path, typer.Argument(help="The new folder.")],
+    target: Annotated[Path, Argument(help="The new folder.")],
     to: Annotated[
         str,
-        typer.Option(
+        Option(
             "--to",
             help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video.",
         ),
     ] = "folder",
     overlay: Annotated[
         list[str] | None,
-        typer.Option(help="Overlays of a video: flow, recovered, force, none. [default: flow and force]"),
+        Option(help="Overlays of a video: flow, recovered, force, none. [default: flow and force]"),
     ] = None,
-    interval: Annotated[
-        str | None, typer.Option(help="Time range of a video: FIRST:LAST in seconds.")
-    ] = None,
+    interval: Annotated[str | None, Option(help="Time range of a video: FIRST:LAST in seconds.")] = None,
 ) -> None:
     """Exports a dataset to the format of another library, or as videos."""
     from synth.publish.export.registry import export_dataset
@@ -288,7 +332,7 @@ def _interval(text: str | None) -> tuple[float, float] | None:
 def verify(
     out: Out,
     fast: Annotated[
-        bool, typer.Option("--fast", help="Check some frames of some sequences, without checksums.")
+        bool, Option("--fast", help="Check some frames of some sequences, without checksums.")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -307,16 +351,16 @@ def view(
     sequence: Index = 0,
     save: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--save", help="Write a recording (.rrd) or a picture (.png, .jpg) instead of opening the viewer."
         ),
     ] = None,
     frame: Annotated[
         list[int] | None,
-        typer.Option("--frame", "-f", help="Frame of a picture; repeatable; default: the largest force."),
+        Option("--frame", "-f", help="Frame of a picture; repeatable; default: the largest force."),
     ] = None,
     web: Annotated[
-        bool, typer.Option("--web", help="Open a browser, on a machine without a window system.")
+        bool, Option("--web", help="Open a browser, on a machine without a window system.")
     ] = False,
 ) -> None:
     """Opens a sequence in the viewer rerun: frames, depth, flow, traction and force over time.
@@ -334,7 +378,7 @@ def view(
     pictured = save is not None and save.suffix.lower() != ".rrd"
     if frame and not pictured:
         raise UserError("--frame needs --save with a name that ends with .png or .jpg")
-    _end_on_terminate()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it as Ctrl-C does
     chosen = open_sequence(location.store(out, sequence))
     if save is None:
         show_sequence(chosen, web=web)
@@ -350,7 +394,7 @@ def view(
 
 @app.command(epilog="Example: synth doctor .")
 def doctor(
-    folder: Annotated[Path, typer.Argument(help="Where datasets are to be written.")] = Path(),
+    folder: Annotated[Path, Argument(help="Where datasets are to be written.")] = Path(),
     json: Json = False,
 ) -> None:
     """Reports what this machine offers, what it lacks, and how to fix that."""

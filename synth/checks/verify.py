@@ -13,11 +13,11 @@ from synth.checks import contents, optics, physics, stereo
 from synth.checks.measure import Invariant, Measure, truth
 from synth.dataset import index, location, provenance, split
 from synth.dataset.folder import Folder
-from synth.dataset.store import Sequence, open_sequence
+from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job import identity
 from synth.system.stopwatch import Stopwatch
-from synth.system.text_lines import hang
+from synth.system.terminal import hang
 
 _FAST_FRAMES, _FRAMES = 2, 8
 _FAST_SEQUENCES = 20
@@ -66,10 +66,6 @@ class Check:
     cpu_s: float = 0.0
     failures: list[str] = field(default_factory=list)  # places of all bad measures
 
-    @property
-    def good(self) -> bool:
-        return not self.bad
-
     def add(self, measure: Measure, who: str) -> None:
         self.count += 1
         where = f"{who}: {measure.where}"
@@ -77,8 +73,8 @@ class Check:
             self.bad += 1
             self.failures.append(where)
         if measure.severity > (Measure(self.worst, self.limit, "").severity if self.offender else 0):
-            self.worst, self.limit, self.offender = measure.value, measure.limit, where
-            self.unit = measure.unit
+            self.worst, self.limit, self.unit = measure.value, measure.limit, measure.unit
+            self.offender = where
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class VerifyReport:
 
     @property
     def good(self) -> bool:
-        return all(check.good for check in self.checks)
+        return not any(check.bad for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
         return {**asdict(self), "good": self.good}
@@ -152,12 +148,14 @@ def check_sequence(
 
     try:
         sequence = open_sequence(path, sealed=False)
-        frames = _frames(sequence, fast)
+        force = np.linalg.norm(sequence["force"][:], axis=1)
     except UserError as error:
         yield "readable", truth(False, without_path(error))
         return
     yield "dataset", truth(sequence.attrs.get("job") == job, "belongs to another job")
-    broken = ""
+    # Frames are that of the largest load, and some spread over the sequence.
+    spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
+    frames, broken = sorted({int(np.argmax(force)), *spread.tolist()}), ""
     try:
         yield from contents.check_values(sequence, frames, fast, watch)
     except UserError as error:
@@ -173,13 +171,6 @@ def check_sequence(
             measures = [truth(False, f"attributes are missing or invalid ({error!r})")]
         yield from ((name, measure) for measure in measures)
     yield "readable", truth(not broken, broken)
-
-
-def _frames(sequence: Sequence, fast: bool) -> list[int]:
-    """The frames to check: that of the largest load, and some spread over the sequence."""
-    force = np.linalg.norm(sequence["force"][:], axis=1)
-    spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
-    return sorted({int(np.argmax(force)), *spread.tolist()})
 
 
 def _dataset(

@@ -148,38 +148,26 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
     return {side: positions for side, positions in groups.items() if positions}
 
 
-def write_index(folder: Folder) -> list[dict[str, Any]]:
+def write_index(folder: Folder, rule: DatasetSplit | None = None) -> list[dict[str, Any]]:
     """Updates the index from the folder, and creates it again if it can't be read. Returns all rows.
 
-    The split is stored next to it; new sequences are assigned a side, and the others keep theirs.
+    The split is stored next to it; new sequences are assigned a side, and the others keep theirs. `rule`, a
+    split without sides, replaces it; then UserError as `assign_sides`.
     """
-    rows, stored = _rows(folder), split.read_stored(folder.root)
-    sides = split.assign_if_possible(rows, stored)
-    for row, side in zip(rows, sides, strict=True):
-        row["split"] = side
-    if any(sides):
-        split.store(folder.root, _dealt(rows, sides, stored))
-    save_rows(folder.root, rows)
-    return rows
-
-
-def split_anew(folder: Folder, chosen: DatasetSplit) -> list[dict[str, Any]]:
-    """Replaces the split of a dataset by the rule of `chosen`, which has no sides yet. Returns all rows of
-    the index. UserError as `assign_sides`."""
-    rows = _rows(folder)
-    split.store(folder.root, _dealt(rows, split.assign_sides(rows, chosen), chosen))
-    return write_index(folder)
-
-
-def _rows(folder: Folder) -> list[dict[str, Any]]:
-    """Rows of all sequences; those of finished ones are taken from the index, if present."""
     known: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
         known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
     failures = folder.failures().items()
-    rows = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
-    rows |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
-    return [rows[key] for key in sorted(rows)]
+    each = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
+    each |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
+    rows, chosen = [each[key] for key in sorted(each)], rule or split.read_stored(folder.root)
+    sides = split.assign_sides(rows, rule) if rule else split.assign_if_possible(rows, chosen)
+    for row, side in zip(rows, sides, strict=True):
+        row["split"] = side
+    if any(sides):
+        split.store(folder.root, _dealt(rows, sides, chosen))
+    save_rows(folder.root, rows)
+    return rows
 
 
 def _dealt(

@@ -14,7 +14,7 @@ from synth.errors import UserError
 from synth.fields import FIELDS, STORED_WHEN, Field
 from synth.job.schema import Job
 from synth.system.checked_file import folder_bytes
-from synth.system.text_lines import hang
+from synth.system.terminal import hang
 
 _MARGIN = 1.25  # safety factor of estimates from the field table, so that a started run can finish
 # Memory of the program with its libraries, per pixel, per vertex and frame, per pixel and frame.

@@ -370,16 +370,12 @@ def field_hasher(name: str, stored: np.dtype[Any], shape: tuple[int, ...]) -> ha
 
 def content_hash(attrs: Mapping[str, Any]) -> str:
     """The identity of a sequence: hash of field hashes and attributes, without timings and versions."""
-    return _hash({key: value for key, value in attrs.items() if key not in _NOT_CONTENT})
+    return identity.digest({key: value for key, value in attrs.items() if key not in _NOT_CONTENT})
 
 
 def seal_hash(attrs: Mapping[str, Any]) -> str:
     """Hash of all root attributes except itself, timings included, to detect edits."""
-    return _hash({key: value for key, value in attrs.items() if key != "seal_hash"})
-
-
-def _hash(values: Mapping[str, Any]) -> str:
-    return hashlib.blake2b(identity.canonical(values), digest_size=16).hexdigest()
+    return identity.digest({key: value for key, value in attrs.items() if key != "seal_hash"})
 
 
 def _field(name: str) -> Field:

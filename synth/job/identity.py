@@ -23,6 +23,11 @@ def canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
+def digest(value: Any) -> str:
+    """Hash of a value's canonical JSON. ValueError for NaN."""
+    return hashlib.blake2b(canonical(value), digest_size=16).hexdigest()
+
+
 def identify_job(job: Job) -> str:
     """Hash of everything that a sequence of `job` depends on except its index.
 
@@ -32,8 +37,8 @@ def identify_job(job: Job) -> str:
     described = job.model_dump(mode="json")
     del described["sequences"], described["card"]
     for (block, name), largest in FILES.items():
-        described[block][name] = _digest(getattr(getattr(job, block), name), largest)
-    return hashlib.blake2b(canonical(described), digest_size=16).hexdigest()
+        described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
+    return digest(described)
 
 
 def identify_anatomy(job: Job, seed: int) -> str:
@@ -41,7 +46,7 @@ def identify_anatomy(job: Job, seed: int) -> str:
 
     A brain is one anatomy for all its craniotomies and for all vessels drawn on it.
     """
-    mesh = _digest(job.anatomy.mesh, FILES["anatomy", "mesh"])
+    mesh = _digest_file(job.anatomy.mesh, FILES["anatomy", "mesh"])
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
 
 
@@ -53,7 +58,7 @@ def identify_opening(job: Job, index: int) -> str | None:
     return f"{identify_anatomy(job, 0)} at " + ", ".join(f"{value:g}" for value in where.point)
 
 
-def _digest(path: Path | None, largest: int) -> str | None:
+def _digest_file(path: Path | None, largest: int) -> str | None:
     if path is None:
         return None
     with checked_file.open_file(path, largest) as file:

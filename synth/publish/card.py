@@ -17,7 +17,6 @@ from synth.dataset.folder import Folder, write_whole
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.fields import FIELDS
-from synth.job.schema import Job
 from synth.publish import picture, svg
 
 QUANTITIES = {column.name: column for column in index.COLUMNS if column.title}
@@ -77,10 +76,14 @@ def write_page(root: Path, target: Path) -> Path:
 def facts(folder: Folder) -> dict[str, Any]:
     """Values for the templates of all descriptions, from the dataset's job and index."""
     rows, job = index.read_index(folder.root).to_pylist(), folder.job()
+    described, stored = folder.described(), split.read_stored(folder.root)
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]
     reasons = Counter(row["reason"] for row in failed)
     first = {row["reason"]: row["index"] for row in reversed(failed)}
+    limits = template("limits.jinja").render(
+        job=job, versions=len(described["generators"]), shared=stored.share_anatomy
+    )
     return {
         "job": job,
         "card": job.card,
@@ -91,11 +94,11 @@ def facts(folder: Folder) -> dict[str, Any]:
         "families": share(done, "family"),
         "gestures": share(done, "gesture"),
         "splits": share(done, "split"),
-        "split_hash": split.read_stored(folder.root).hash,
+        "split_hash": stored.hash,
         "cpu_h": column(done, "cpu_s").sum() / 3600,
-        "identity": folder.described()["identity"],
+        "identity": described["identity"],
         "dataset_hash": index.dataset_hash(rows),
-        "limits": _limits(folder, job),
+        "limits": [line for line in limits.splitlines() if line],
     }
 
 
@@ -103,16 +106,6 @@ def _charts(rows: list[dict[str, Any]]) -> dict[str, str]:
     """Histograms of `QUANTITIES` by name, as SVG."""
     drawn = {name: (column(rows, name), one.title, one.unit) for name, one in QUANTITIES.items()}
     return {name: svg.histogram(*one) for name, one in drawn.items() if len(one[0]) >= _FEWEST_DRAWN}
-
-
-def _limits(folder: Folder, job: Job) -> list[str]:
-    """The known limits of the dataset, which depend on its job."""
-    text: str = template("limits.jinja").render(
-        job=job,
-        versions=len(folder.described()["generators"]),
-        shared=split.read_stored(folder.root).share_anatomy,
-    )
-    return [line for line in text.splitlines() if line]
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> Floats:
@@ -130,11 +123,12 @@ def template(name: str) -> Any:
     """A template of this package; values are escaped in HTML."""
     import jinja2
 
-    text = (Path(__file__).parent / name).read_text("utf-8")
-    escaped = name.endswith(".html.jinja")
     return jinja2.Environment(
-        trim_blocks=True, undefined=jinja2.StrictUndefined, autoescape=escaped
-    ).from_string(text)
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        trim_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        autoescape=name.endswith(".html.jinja"),
+    ).get_template(name)
 
 
 def _range(rows: list[dict[str, Any]], quantity: index.IndexColumn) -> list[str]:

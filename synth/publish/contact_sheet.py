@@ -6,13 +6,11 @@ import itertools
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from synth.arrays import Floats
-from synth.dataset import size_forecast
 from synth.dataset.store import open_sequence
 from synth.fem import tool_gesture
 from synth.fem.tool_gesture import Gesture, ToolMotion
@@ -23,28 +21,18 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.scene import SceneState
 from synth.sequence import pipeline, scenario
 from synth.sequence.scene import at_rest
+from synth.system.terminal import ProgressCallback
 
 _TILE_PX = 320
 _PROBES = 3  # sequences that are computed with few frames, after one for the compilation
 _SHORT, _LONG = 3, 9  # frames: their difference is the cost of further frames
 
 
-@dataclass(frozen=True)
-class ContactSheet:
-    """Scenarios of a job and the cost of the whole dataset."""
+def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dict[str, float]]:
+    """The picture (H, W, 3) of `count` scenarios spread over the job, and the job's CPU time by stage [s].
 
-    picture: Rgb
-    stages_cpu_s: dict[str, float]  # of the whole job by stage, without the start of workers
-    disk_bytes: float
-
-
-def draw_sheet(
-    job: Job, count: int, report: Callable[[int, int], None] = lambda done, of: None
-) -> ContactSheet:
-    """Draws `count` scenarios spread over the job, each just before its load. UserError: an impossible job.
-
-    Nothing is deformed: the sheet shows anatomy, appearance, light, view and instrument. The cost of the job
-    is measured on a few of its sequences with few frames. `report`: parts done and parts in all.
+    Each is drawn just before its load: nothing is deformed, the sheet shows anatomy, appearance, light, view
+    and instrument. The cost is measured on a few sequences with few frames. UserError: an impossible job.
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int))
     width, height = job.render.size
@@ -65,8 +53,7 @@ def draw_sheet(
     for index in chosen.tolist():
         tiles.append(_draw_scenario(quick, index))
         step()
-    cost = _measure_cost(job, step)
-    return ContactSheet(tile(tiles), cost, size_forecast.estimate(job) * job.sequences)
+    return tile(tiles), _measure_cost(job, step)
 
 
 def _draw_scenario(job: Job, index: int) -> Rgb:

@@ -24,7 +24,10 @@ _JPEG_QUALITY = 90
 
 def save_recording(sequence: Sequence, path: Path) -> None:
     """Writes a sequence as a rerun recording. UserError: no rerun installed, or the file can't be written."""
-    rerun = _rerun()
+    try:
+        import rerun
+    except ImportError:
+        raise UserError("viewing needs the extra `view`: pip install '.[view]' in the clone") from None
     try:
         with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
             part = Path(scratch) / "sequence.rrd"
@@ -65,9 +68,13 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         stream.log(name, rerun.Image(pixels).compress(jpeg_quality=_JPEG_QUALITY))
 
     try:
-        about, summary = _about(sequence), sequence.attrs["summary"]
-        longest, strongest = float(summary["peak_flow_px"]), float(summary["peak_traction_kpa"])
-        left = optics.camera_of(sequence)
+        attrs, left = sequence.attrs, optics.camera_of(sequence)
+        longest, strongest = (float(attrs["summary"][name]) for name in ("peak_flow_px", "peak_traction_kpa"))
+        about = (
+            f"# Sequence {sequence.index}\n\n{name_gestures(attrs.get('scenario') or {})}, "
+            f"E = {attrs['young_kpa']:.3g} kPa, {attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is "
+            f"direction; full colour is {longest:.3g} px\n\ntraction: brightest is {strongest:.3g} kPa\n"
+        )
     except (KeyError, TypeError) as error:
         raise UserError(f"{sequence.path}: has no attribute {error}, which the viewer needs") from error
     force, time, tissue = sequence["force"][:], sequence["time"][:], sequence["tissue"][:]
@@ -96,21 +103,3 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         load = np.linalg.norm(sequence["traction"][t], axis=-1)
         image("traction", picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue))
         stream.log("force", rerun.Scalars([*force[t], float(np.linalg.norm(force[t]))]))
-
-
-def _about(sequence: Sequence) -> str:
-    attrs = sequence.attrs
-    gestures, summary = name_gestures(attrs.get("scenario") or {}), attrs["summary"]
-    return (
-        f"# Sequence {sequence.index}\n\n{gestures}, E = {attrs['young_kpa']:.3g} kPa, "
-        f"{attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is direction; full colour is "
-        f"{summary['peak_flow_px']:.3g} px\n\ntraction: brightest is {summary['peak_traction_kpa']:.3g} kPa\n"
-    )
-
-
-def _rerun() -> Any:
-    try:
-        import rerun
-    except ImportError:
-        raise UserError("viewing needs the extra `view`: pip install '.[view]' in the clone") from None
-    return rerun

@@ -20,8 +20,6 @@ _MACHINE = {  # errors caused by the state of the machine, not by a bug
     errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EMFILE, errno.ENFILE,
 }  # fmt: skip
 
-_EXTRAS = {"sklearn": "bench"}  # imported packages that a plain installation lacks -> the extra with them
-
 
 def printable(text: str) -> str:
     """A message with control characters escaped: the name of a file must not control the terminal."""
@@ -46,11 +44,9 @@ class Commands(TyperGroup):
         except UserError as error:
             message = str(error)
         except ModuleNotFoundError as error:
-            package = (error.name or "").partition(".")[0]
-            if package not in _EXTRAS:
+            if (error.name or "").partition(".")[0] != "sklearn":  # the one that a plain installation lacks
                 raise
-            extra = _EXTRAS[package]
-            message = f"package {package} is missing: pip install '.[{extra}]' in the clone"
+            message = "package sklearn is missing: pip install '.[bench]' in the clone"
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
             raise typer.Exit(130) from None
@@ -61,9 +57,7 @@ class Commands(TyperGroup):
         except OSError as error:
             if error.errno not in _MACHINE:
                 raise
-            message = (
-                f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror)
-            )
+            message = ": ".join(str(one) for one in (error.filename, error.strerror) if one is not None)
         except MemoryError:
             message = "out of memory: use a smaller size or fewer workers"
         typer.echo(f"error: {printable(message)}", err=True)

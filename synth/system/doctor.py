@@ -12,7 +12,7 @@ from pathlib import Path
 
 from synth.system import cache, gpu, llvm, packages
 from synth.system.checked_file import folder_bytes
-from synth.system.text_lines import hang
+from synth.system.terminal import hang
 
 _LEAST_FREE_GB = 5.0
 _LEAST_MEMORY_GB = 4.0

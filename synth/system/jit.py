@@ -12,8 +12,8 @@ from synth.system import cache
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(function: F) -> F:
-    """Compiles with numba, once per machine rather than once per process.
+def compiled(function: F, **how: str) -> F:
+    """Compiles with numba and its options `how`, once per machine rather than once per process.
 
     The cache is in `NUMBA_CACHE_DIR`, else next to the package, else in the user's cache folder (numba's own
     order), else in ours (`synth.system.cache`); if none of these is writable there is no cache.
@@ -21,18 +21,6 @@ def compiled(function: F) -> F:
     numba detects changes only in the file of the function itself. Hence the rule of this package: a compiled
     function only calls compiled functions of its own file.
     """
-    return _compile(function)
-
-
-def vectorised(function: F) -> F:
-    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as in NumPy.
-
-    Python's rule, an exception, would add a branch to every division and prevent vectorisation.
-    """
-    return _compile(function, error_model="numpy")
-
-
-def _compile(function: F, **how: str) -> F:
     try:
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no writable folder: a read-only installation without a home
@@ -44,3 +32,11 @@ def _compile(function: F, **how: str) -> F:
         return numba.njit(nogil=True, **how)(function)  # type: ignore[no-any-return]
     finally:
         numba.config.CACHE_DIR = before
+
+
+def vectorised(function: F) -> F:
+    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as in NumPy.
+
+    Python's rule, an exception, would add a branch to every division and prevent vectorisation.
+    """
+    return compiled(function, error_model="numpy")

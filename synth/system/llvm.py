@@ -42,10 +42,12 @@ def find() -> str | None:
 
 def candidates() -> list[str]:
     """LLVM libraries of a usable version on this machine, newest first."""
+    folders = [*map(Path, _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
     found: dict[Path, int] = {}
-    for path in [*_linker(), *_installed()]:
-        version = _version(path.name)
-        if version is not None and version >= _OLDEST and path.exists():
+    for path in [*_linker(), *(path for folder in folders for path in folder.glob("libLLVM*"))]:
+        named = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+)|-(\d+)\.dylib)", path.name)
+        version = int(next(filter(None, named.groups()))) if named else 0
+        if version >= _OLDEST and path.exists():
             found.setdefault(path.resolve(), version)
     return [str(path) for path, _ in sorted(found.items(), key=lambda item: (-item[1], str(item[0])))]
 
@@ -64,19 +66,9 @@ def probe(path: str) -> bool:
     return done.returncode == 0
 
 
-def _version(name: str) -> int | None:
-    match = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+)|-(\d+)\.dylib)", name)
-    return int(next(group for group in match.groups() if group)) if match else None
-
-
 def _linker() -> list[Path]:
     try:
         cache = subprocess.run(["ldconfig", "-p"], capture_output=True, text=True, check=False).stdout
     except FileNotFoundError:  # not a glibc system
         return []
     return [Path(path) for path in re.findall(r"=> (\S*libLLVM\S*)", cache)]
-
-
-def _installed() -> list[Path]:
-    folders = [Path(folder) for folder in _FOLDERS] + list(Path("/usr/lib").glob("llvm-*/lib"))
-    return [path for folder in folders if folder.is_dir() for path in folder.glob("libLLVM*")]

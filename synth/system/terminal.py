@@ -1,13 +1,17 @@
-"""Progress bars, where they can be drawn."""
+"""Output to a terminal: progress bars where they can be drawn, and text wrapped at its width."""
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
 from rich import progress
 from rich.console import Console
+
+_LEAST_WIDTH = 16  # columns
 
 ProgressCallback = Callable[[int, int], None]  # called with the number done and the number in all
 
@@ -29,3 +33,10 @@ def counting(what: str, total: int | None = None) -> Iterator[Callable[..., None
     with ProgressBars(progress.TimeRemainingColumn(), transient=True) as bars:
         task = bars.add_task(what, total=total)
         yield lambda done, of=None: bars.update(task, completed=done, total=of)
+
+
+def hang(head: str, text: str) -> list[str]:
+    """`text` after `head`, wrapped to the terminal's width with a hanging indent."""
+    width = max(_LEAST_WIDTH, shutil.get_terminal_size().columns - len(head))
+    words = textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
+    return [f"{' ' * len(head) if k else head}{line}".rstrip() for k, line in enumerate(words)]

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 from zlib import crc32
 
@@ -25,8 +26,10 @@ from scipy import stats
 from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
+from synth.job import identity, reader
 from synth.job.schema import Job
 from synth.system import cache
+from synth.system.config_file import ConfigFile
 from synth.tune.grid import Settings, changed, differences, list_settings, show
 from synth.tune.probe import Probe
 
@@ -153,3 +156,38 @@ def tune(measurements: Measurements, budget: float, probes: int, checks: int) ->
                 best = found
     single = [one for one in alone.values() if one.settings != own.settings]
     return Tuned(budget, full, own, best, (*single, full, own, *tried))
+
+
+def lines(tuned: Tuned) -> list[str]:
+    """The budget, then a line for every setting by itself and for whole jobs."""
+    found = [
+        f"Written by synth tune: the force error may grow by {100 * tuned.budget:g}% of the force over full",
+        "fidelity's. Each change by itself, then whole jobs; ± is a 95% interval over sequences.",
+        "",
+        f"{'grows by':>16s}{'force error':>14s}{'CPU-s a frame':>16s}",
+    ]
+    for row in tuned.rows:
+        margin = f" ± {100 * row.margin:.2g}" if np.isfinite(row.margin) else ""
+        figures = f"{f'{100 * row.growth:.2g}{margin}%':>16s}{100 * row.errors.mean():13.2g}%"
+        figures += f"{row.stages.sum():16.3g}"
+        if not np.isfinite(row.growth):
+            figures = f"{'cannot be carried out':>46s}"
+        words = "full fidelity" if row is tuned.full else show(row.settings, tuned.own.settings)
+        found.append(f"{figures}   {words}{'  <- this job' if row is tuned.best else ''}")
+    return found
+
+
+def write_job(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) -> None:
+    """Writes the tuned job of the one that `reader.load_job` reads. FileExistsError if `out` exists."""
+    text, label, folder = reader.read_source(source)
+    config, keys = ConfigFile(text, label), dict[str, Any]()
+    config.change(overrides)
+    if folder != out.resolve().parent:  # from which relative paths will start
+        job = reader.load_job(source, overrides).model_dump(mode="json")
+        paths = {f"{section}.{name}": job[section][name] for section, name in identity.FILES}
+        keys = {key: path for key, path in paths.items() if path is not None}
+    changes = differences(tuned.best.settings, tuned.own.settings)
+    config.change(f"{key}={json.dumps(value)}" for key, value in (keys | dict(changes)).items())
+    head = "".join(f"# {line}".rstrip() + "\n" for line in lines(tuned))
+    with out.open("x", encoding="utf-8") as file:
+        file.write(f"{head}\n{config.dump()}")

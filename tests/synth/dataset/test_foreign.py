@@ -43,7 +43,7 @@ def dataset(pristine: Path, tmp_path: Path) -> Path:
 
 def bad(dataset: Path) -> set[str]:
     """Names of the checks that fail."""
-    return {check.name for check in verify.verify_dataset(dataset).checks if not check.good}
+    return {check.name for check in verify.verify_dataset(dataset).checks if check.bad}
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     render = {"size": (48, 36), "stereo_mm": 24.0}
     job = Job(sequences=6, frames=3, render=render, flow={"backend": "ideal"}, card=ABOUT)
     in_process(job, out, consistent)
-    index.split_anew(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
+    index.write_index(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
     croissant.write_croissant(Folder(out))
     return out

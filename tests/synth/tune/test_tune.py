@@ -10,7 +10,7 @@ from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
 from synth.system import cache
-from synth.tune import grid, search, table
+from synth.tune import grid, search
 from synth.tune.probe import Probe
 from synth.tune.search import Measurements, Tuned
 
@@ -61,7 +61,7 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def tune(probes: int = 2, checks: int = 1, budget: float = 0.03, job: Job = JOB) -> Tuned:
     """The answer, with what holds of every one asserted."""
     tuned = search.tune(Measurements(job), budget, probes, checks)
-    lines = table.table(tuned)
+    lines = search.lines(tuned)
     assert not any("nan" in line or "inf" in line for line in lines)
     assert any("this job" in line for line in lines)
     assert tuned.best.growth <= budget or tuned.best is tuned.own
@@ -90,11 +90,11 @@ def test_a_job_gets_dearer_only_if_it_surely_misses_the_budget() -> None:
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
-    first, calls = table.table(tune()), Fake.calls
+    first, calls = search.lines(tune()), Fake.calls
     missing, corrupted, *_ = tmp_path.glob("*.json")
     missing.unlink()
     corrupted.write_text(corrupted.read_text()[:-4])
-    assert table.table(tune()) == first
+    assert search.lines(tune()) == first
     assert Fake.calls == calls + 2
     tune(job=grid.changed(JOB, {"seed": 2}))
     assert Fake.calls >= 2 * calls  # of another job nothing is taken
@@ -105,7 +105,7 @@ def test_settings_that_cannot_be_carried_out_are_never_chosen(refused: int) -> N
     Fake.refused = refused
     tuned = tune()
     assert tuned.best.settings["fem.tets"] != refused
-    assert any("cannot be carried out" in line for line in table.table(tuned))
+    assert any("cannot be carried out" in line for line in search.lines(tuned))
     Fake.refused = 4000  # full fidelity
     with pytest.raises(UserError, match="inverted"):
         tune(job=grid.changed(JOB, {"seed": 2}))
@@ -126,12 +126,12 @@ def test_the_written_job_is_the_persons_own(tmp_path: Path) -> None:
     source.write_text("fem:\n  gestures: [pull]  # mine\nappearance:\n  photo: cortex.jpg\n")
     (tmp_path / "cortex.jpg").touch()
     before = reader.load_job(str(source), ["frames=12"])
-    table.write(tuned, str(source), ["frames=12"], out)
+    search.write_job(tuned, str(source), ["frames=12"], out)
     assert "gestures: [pull]  # mine" in out.read_text()
     changes = grid.differences(tuned.best.settings, tuned.own.settings)
     assert reader.load_job(str(out)) == grid.changed(before, changes)
     with pytest.raises(FileExistsError):
-        table.write(tuned, str(source), [], out)
+        search.write_job(tuned, str(source), [], out)
 
 
 @pytest.mark.parametrize("text", ["3", "force 0%", "force 100%", "flow 3%", "force 3"])
