@@ -194,7 +194,7 @@ def render(
 ) -> None:
     """Renders the dataset of a job. Exit code 1 if some of its sequences failed."""
     from synth.dataset.folder import Folder
-    from synth.engine.progress import RunBars
+    from synth.engine.journal import RunBars
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
 

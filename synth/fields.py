@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -154,16 +153,3 @@ EXTRA = tuple(name for name, field in FIELDS.items() if field.stored == "extra" 
 
 SPARED = ("depth", "flow_confidence", "flow_right", "visible_right", "depth_right")
 """Fields that a job's `store.without` may name; all others are needed."""
-
-
-def stored_fields(
-    extra: Iterable[str], without: Iterable[str], *, recovered: bool, stereo: bool = False
-) -> tuple[str, ...]:
-    """Names of the fields that a sequence holds, in the table's order.
-
-    `extra` and `without` are the job's keys of `store`; `recovered`: a flow estimator runs.
-    """
-    conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": stereo and recovered}
-    kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
-    chosen = {name for name, field in FIELDS.items() if field.stored in kinds} | set(extra)
-    return tuple(name for name in FIELDS if name in chosen - set(without))

@@ -17,7 +17,7 @@ from evidence import report
 from evidence.study import Study
 from synth.dataset.store import Dataset
 from synth.engine import machine, run
-from synth.engine.progress import RunBars
+from synth.engine.journal import RunBars
 from synth.job import reader
 from synth.job.schema import Job
 

@@ -12,7 +12,7 @@ from evidence.intervals import mean_of
 from evidence.study import Study
 from synth.job import reader
 from synth.tune import search
-from synth.tune.grid import differences
+from synth.tune.search import differences
 
 _JOBS = report.RESULTS / "tune"
 _WORDS = (

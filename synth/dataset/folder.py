@@ -151,13 +151,16 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
-        _refuse_links(folder)
+        own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
+        for place in (*own, *root.glob("*.zarr.part")):
+            if place.is_symlink():  # a run writes or deletes here
+                raise UserError(f"{place}: is a link; remove it")
         makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
         with _locked(folder.state / "lock") as folder.lock_fd:
             _refuse_foreign(folder, job, name)
-            for own in (folder.state / "failed", folder.logs, folder.scratch):
-                own.mkdir(exist_ok=True)
+            for place in (folder.state / "failed", folder.logs, folder.scratch):
+                place.mkdir(exist_ok=True)
             described = _Described(
                 format_version=FOLDER, identity=name, job=job.model_dump(mode="json"), generators=makers
             )
@@ -199,14 +202,6 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     count = folder.job().sequences
     if count > job.sequences:
         raise UserError(f"{root}: contains {count} sequences of this job; sequences={job.sequences} is fewer")
-
-
-def _refuse_links(folder: Folder) -> None:
-    """Raises UserError for a link in a place where a run writes or deletes."""
-    own = (folder.state, *folder.state.glob("*"), *folder.state.glob("*/*"))
-    for place in (*own, *folder.root.glob("*.zarr.part")):
-        if place.is_symlink():
-            raise UserError(f"{place}: is a link; remove it")
 
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:

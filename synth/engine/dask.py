@@ -132,12 +132,12 @@ def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Even
 @contextmanager
 def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
     """Yields the scheduler's address, the expected number of slots, and certificates if not configured."""
-    if engine.startswith(("dask://", "tls://")):
-        _note(open_to(engine))
-        yield engine.replace("dask://", "tcp://", 1), 0, None
+    described = engine if engine.startswith(("dask://", "tls://")) else read_slurm(Path(engine))
+    if who := open_to(described):
+        print(f"note: {who}: anyone in that network can run code there", file=sys.stderr)
+    if isinstance(described, str):
+        yield described.replace("dask://", "tcp://", 1), 0, None
         return
-    described = read_slurm(Path(engine))
-    _note(open_to(described))
     jobs = int(described.pop("jobs"))
     try:
         from dask_jobqueue import SLURMCluster
@@ -171,11 +171,6 @@ def open_to(cluster: str | dict[str, Any]) -> str:
         "it is reached unencrypted (`security: true`)": not cluster.get("security"),
     }
     return " and ".join(risk for risk, holds in risks.items() if holds)
-
-
-def _note(who: str) -> None:
-    if who:
-        print(f"note: {who}: anyone in that network can run code there", file=sys.stderr)
 
 
 def read_slurm(path: Path) -> dict[str, Any]:

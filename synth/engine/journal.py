@@ -1,4 +1,4 @@
-"""The state of a run: stored in a file for `synth status`, and reported to watchers."""
+"""The state of a run: stored in a file for `synth status`, reported to watchers, and drawn as bars."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from rich.progress import TaskID, TextColumn, TimeElapsedColumn
+
 from synth.dataset.folder import Folder, write_whole
 from synth.engine.child import Attempt
+from synth.system.terminal import ProgressBars, clock
 
 FILE = "progress.json"
 _EVERY_S = 2.0
 _LATEST = 32  # sequences that the rate is estimated from
+_QUIET_S = 10.0  # least time between two lines without a terminal
 
 
 @dataclass(frozen=True)
@@ -86,3 +90,52 @@ class Journal(Watcher):
         progress = RunProgress(self.left_s(), {str(k): at for k, at in sorted(self._in_flight.items())})
         write_whole(self._path, json.dumps(asdict(progress)), durable=False)
         self._report(progress)
+
+
+class RunBars(ProgressBars, Watcher):
+    """A bar for the dataset and one for every sequence in work; plain lines without a terminal.
+
+    The time left is the run's estimate: that of rich would include the compilation in first sequences.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(TimeElapsedColumn(), TextColumn("{task.fields[left]}", style="cyan"))
+        self._bars: dict[int, TaskID] = {}
+        self._dataset = self.add_task("sequences", total=None, left="")
+        self._printed = time.monotonic()
+
+    def begin(self, total: int, already: int, failed: int) -> None:
+        self.reset(self._dataset, total=total, completed=already + failed)
+        if already or failed:
+            hint = f", {failed} failed (`--retry` computes them again)" if failed else ""
+            self._print(f"{already} of {total} sequences are done already{hint}")
+
+    def stage(self, index: int, stage: str, done: int, of: int) -> None:
+        if index not in self._bars:
+            self._bars[index] = self.add_task("", left="")
+        self.update(self._bars[index], description=f"  {index:06d} {stage}", completed=done, total=max(of, 1))
+
+    def end(self, attempt: Attempt, again: bool) -> None:
+        if attempt.index in self._bars:
+            self.remove_task(self._bars.pop(attempt.index))
+        if attempt.kind == "stopped":
+            return
+        if attempt.kind != "done":
+            what = "is retried" if again else "failed"
+            self._print(f"sequence {attempt.index:06d} {what}: {attempt.reason}")
+        if again:
+            return
+        self.advance(self._dataset)
+        whole = next(task for task in self.tasks if task.id == self._dataset)
+        quiet = time.monotonic() - self._printed < _QUIET_S and not whole.finished
+        if self.disable and not quiet:
+            self._printed = time.monotonic()
+            spent = ", ".join(filter(None, (f"{clock(whole.elapsed or 0.0)} spent", whole.fields["left"])))
+            self._print(f"{whole.completed:.0f} of {whole.total:.0f} sequences, {spent}")
+
+    def account(self, progress: RunProgress) -> None:
+        left = "" if progress.left_s is None else f"{clock(progress.left_s)} left"
+        self.update(self._dataset, left=left)
+
+    def _print(self, text: str) -> None:
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)

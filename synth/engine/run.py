@@ -16,7 +16,7 @@ from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
 from synth.engine import machine
 from synth.engine.child import Attempt, Child, Setup, Slot
-from synth.engine.journal import Journal, Watcher
+from synth.engine.journal import Journal, RunBars, Watcher
 from synth.errors import UserError
 from synth.job.reader import as_job
 from synth.job.schema import Job
@@ -77,8 +77,6 @@ def render_job(
     """
     job = as_job(job)
     if progress is True:
-        from synth.engine.progress import RunBars
-
         with RunBars() as bars:
             return run_job(job, Path(out), Options(**options), bars)
     return run_job(job, Path(out), Options(**options), progress or Watcher())

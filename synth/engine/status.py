@@ -20,6 +20,7 @@ from synth.dataset.store import open_sequence
 from synth.engine.journal import FILE, RunProgress
 from synth.errors import UserError
 from synth.system import checked_file
+from synth.system.terminal import clock
 
 
 @dataclass(frozen=True)
@@ -104,18 +105,6 @@ def _progress(folder: Folder) -> RunProgress | None:
             return RunProgress()
     finally:
         os.close(descriptor)
-
-
-def clock(seconds: float) -> str:
-    """9 s, 2:05 min, 3:20 h, 4.2 days."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60}:{whole % 60:02d} min"
-    if whole < 86400:
-        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
-    return f"{seconds / 86400:.1f} days"
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

@@ -40,8 +40,7 @@ def main(pipe: int) -> None:
 
 
 def _serve(pipe: int, setup: dict[str, Any]) -> None:
-    folder, render = Path(setup["folder"]), None
-    settled = False
+    folder, render, settled = Path(setup["folder"]), None, False
     for line in sys.stdin:
         index = int(line)
         log = Path(setup["logs"]) / f"{index:06d}.log"

@@ -11,8 +11,7 @@ import numpy as np
 
 from synth.arrays import Map, Mask, Pixels
 from synth.fit.colours import fit_colours
-from synth.fit.photograph import Photograph
-from synth.fit.statistics import measure
+from synth.fit.photograph import Photograph, measure
 from synth.job.schema import Family, Job
 from synth.render.appearance.family import FAMILIES
 from synth.render.camera import camera_sensor

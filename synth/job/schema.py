@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from synth import fields
 from synth.errors import did_you_mean
+from synth.fields import EXTRA, FIELDS, SPARED
 from synth.job.mechanics import CLEAR_MM
 from synth.job.mechanics import FemSection as FemSection
 from synth.job.mechanics import MembraneSection as MembraneSection
@@ -135,9 +135,9 @@ def _among(known: tuple[str, ...]) -> AfterValidator:
 class StoreSection(Section):
     """The fields stored of every sequence. `synth schema --fields` lists them with their sizes."""
 
-    extra: Annotated[tuple[str, ...], _among(fields.EXTRA)] = ()
+    extra: Annotated[tuple[str, ...], _among(EXTRA)] = ()
     """Fields to store in addition to the usual ones."""
-    without: Annotated[tuple[str, ...], _among(fields.SPARED)] = ()
+    without: Annotated[tuple[str, ...], _among(SPARED)] = ()
     """Fields not to store: any of depth, flow_confidence, and of the right camera flow_right, visible_right,
     depth_right."""
     flow: Literal["float32", "float16"] = "float32"
@@ -214,10 +214,9 @@ class Job(Section):
 
     @property
     def stored_fields(self) -> tuple[str, ...]:
-        """Names of the fields in its sequences."""
-        return fields.stored_fields(
-            self.store.extra,
-            self.store.without,
-            recovered=self.flow.backend != "ideal",
-            stereo=self.render.stereo_mm > 0,
-        )
+        """Names of the fields in its sequences, in the order of the field table."""
+        recovered, stereo = self.flow.backend != "ideal", self.render.stereo_mm > 0
+        conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": stereo and recovered}
+        kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
+        found = [one for one in FIELDS.values() if one.stored in kinds or one.name in self.store.extra]
+        return tuple(one.name for one in found if one.name not in self.store.without)

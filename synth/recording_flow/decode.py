@@ -17,8 +17,7 @@ from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.stereo import DepthVideo, RightVideo
 from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS
-from synth.video.read import Picture
-from synth.video.shrink import shrink_mask, shrink_picture
+from synth.video.read import Picture, shrink_mask, shrink_picture
 
 LEAST_COLUMNS = 320  # least width with `shrink` 0: the grids of the networks are no finer
 

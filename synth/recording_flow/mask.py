@@ -12,7 +12,7 @@ from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
-from synth.video.shrink import shrink_mask
+from synth.video.read import shrink_mask
 
 
 class Mask:

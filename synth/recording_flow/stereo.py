@@ -19,8 +19,7 @@ from synth.flow.stereo.track import Moved, StereoTracker
 from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.mask import mask_right
-from synth.video.read import Picture
-from synth.video.shrink import shrink_picture
+from synth.video.read import Picture, shrink_picture
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class Diagnosis:
 def diagnose(folder: Path) -> list[Diagnosis]:
     """All lines of the report; `folder` is where datasets are to be written."""
     machine, library = packages.machine(), llvm.find()
-    found = [
+    return [
         Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
         Diagnosis("cores", str(machine["cores"])),
         Diagnosis(
@@ -50,8 +50,8 @@ def diagnose(folder: Path) -> list[Diagnosis]:
         _cuda(),
         *_lacking(),
         _kernels(),
+        *(Diagnosis(name, version) for name, version in packages.versions().items()),
     ]
-    return found + [Diagnosis(name, version) for name, version in packages.versions().items()]
 
 
 def lines(found: Sequence[Diagnosis]) -> list[str]:

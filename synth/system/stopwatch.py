@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,8 +14,7 @@ class Stopwatch:
     """Adds up CPU time (all threads of this process) and wall time under the name of a stage."""
 
     def __init__(self) -> None:
-        self._cpu: dict[str, float] = defaultdict(float)
-        self._wall: dict[str, float] = defaultdict(float)
+        self._spent_s: dict[str, tuple[float, float]] = {}  # CPU and wall time
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -25,24 +23,23 @@ class Stopwatch:
         try:
             yield
         finally:
-            self._cpu[name] += time.process_time() - cpu
-            self._wall[name] += time.perf_counter() - wall
+            self.add(name, time.process_time() - cpu, time.perf_counter() - wall)
 
     def add(self, name: str, cpu_s: float, wall_s: float) -> None:
-        """Adds the time that another process spent on a stage [s]."""
-        self._cpu[name] += cpu_s
-        self._wall[name] += wall_s
+        """Adds time that was spent on a stage [s], here or in another process."""
+        cpu, wall = self._spent_s.get(name, (0.0, 0.0))
+        self._spent_s[name] = cpu + cpu_s, wall + wall_s
 
     def cpu_s(self, name: str) -> float:
         """CPU time of one stage so far [s]; 0 for one that never ran."""
-        return self._cpu.get(name, 0.0)
+        return self._spent_s.get(name, (0.0, 0.0))[0]
 
     def report(self) -> dict[str, dict[str, float] | float]:
         """`{stage: {"cpu_s", "wall_s"}, ..., "peak_rss_mb"}`, seconds and MB (1e6 bytes)."""
         peak_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         stages: dict[str, dict[str, float] | float] = {
-            name: {"cpu_s": round(self._cpu[name], 3), "wall_s": round(self._wall[name], 3)}
-            for name in self._cpu
+            name: {"cpu_s": round(cpu, 3), "wall_s": round(wall, 3)}
+            for name, (cpu, wall) in self._spent_s.items()
         }
         stages["peak_rss_mb"] = round(peak_kib * 1024 / 1e6, 1)
         return stages

@@ -1,4 +1,4 @@
-"""Output to a terminal: progress bars where they can be drawn, and text wrapped at its width."""
+"""Output to a terminal: progress bars where they can be drawn, text wrapped at its width, durations."""
 
 from __future__ import annotations
 
@@ -40,3 +40,15 @@ def hang(head: str, text: str) -> list[str]:
     width = max(_LEAST_WIDTH, shutil.get_terminal_size().columns - len(head))
     words = textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
     return [f"{' ' * len(head) if k else head}{line}".rstrip() for k, line in enumerate(words)]
+
+
+def clock(seconds: float) -> str:
+    """9 s, 2:05 min, 3:20 h, 4.2 days."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60}:{whole % 60:02d} min"
+    if whole < 86400:
+        return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+    return f"{seconds / 86400:.1f} days"

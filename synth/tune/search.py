@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
@@ -27,16 +28,19 @@ from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
 from synth.job import identity, reader
+from synth.job.laws import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
 from synth.system import cache
-from synth.system.config_file import ConfigFile
-from synth.tune.grid import Settings, changed, differences, list_settings, show
+from synth.system.config_file import ConfigFile, override
 from synth.tune.probe import Probe
 
 _DRAWS = 5  # of a probe sequence, until full fidelity carries one out
 _TRIES, _CAREFUL = 6, 0.7  # of whole jobs; a miss is stepped back from to this part of the growth it adds
 _STORED = 5000  # measurements, in the user's cache
 _CHEAPER = 0.98  # costs that differ by less than 2%, to which they are known, count as equal
+
+Settings = Mapping[str, str | int | tuple[int, int]]
+"""Values by the dotted keys of the job."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +160,53 @@ def tune(measurements: Measurements, budget: float, probes: int, checks: int) ->
                 best = found
     single = [one for one in alone.values() if one.settings != own.settings]
     return Tuned(budget, full, own, best, (*single, full, own, *tried))
+
+
+def list_settings(job: Job) -> dict[str, list[Any]]:
+    """Settings by key, finest first and the job's own among them; only keys with more than one."""
+    fem, (width, height), vertices = job.fem, job.render.size, job.anatomy.vertices
+    law = fem.chosen_law[0]
+    grid: dict[str, list[Any]] = {
+        "fem.law": [law],
+        "fem.tets": _finest_first({fem.tets, 4000, 2500, 1600, 800}),
+    }
+    if law in CHEAPEST_FIRST:  # a plug-in's is another tissue, not a dearer way to the same one
+        linear = ["linear"] if fem.largest_load <= LARGEST_LOAD["linear"] else []
+        grid["fem.law"] = list(dict.fromkeys(["neo-hookean", *linear, law]))
+    if fem.time == "dynamic":
+        grid["fem.time"] = ["dynamic", "quasi-static"]
+    if job.flow.backend != "ideal":  # else no force is estimated from pictures, however good
+        if "vertices" in job.anatomy.model_fields_set:  # else they follow the picture's size
+            grid["anatomy.vertices"] = _finest_first({vertices, min(10_000, vertices)})
+        # In its exact proportions: contacts are drawn within what the camera shows. Even, for codecs.
+        wide, high = 2 * width // (unit := math.gcd(width, height)), 2 * height // unit
+        steps = [round(part * width / wide) for part in (0.75, 0.6, 0.5, 0.4)]
+        sizes = [(step * wide, step * high) for step in steps]
+        # Below 96 pixels, flow has no pyramid to speak of.
+        grid["render.size"] = _finest_first({(width, height), *(size for size in sizes if min(size) >= 96)})
+        grid["render.spp"] = _finest_first({job.render.spp, 8, 4, 2})
+    return {key: settings for key, settings in grid.items() if len(settings) > 1}
+
+
+def _finest_first(values: set[Any]) -> list[Any]:
+    return sorted(values, reverse=True)
+
+
+def changed(job: Job, changes: Mapping[str, Any]) -> Job:
+    """The job with the values of dotted keys changed. UserError where they don't go together."""
+    return override(job, [f"{key}={json.dumps(value)}" for key, value in changes.items()])
+
+
+def differences(settings: Settings, start: Settings) -> Settings:
+    """The settings that differ from a start."""
+    return {key: value for key, value in settings.items() if value != start[key]}
+
+
+def show(settings: Settings, start: Settings) -> str:
+    """The same in words."""
+    return (
+        ", ".join(f"{key} {one}" for key, one in differences(settings, start).items()) or "the job as given"
+    )
 
 
 def lines(tuned: Tuned) -> list[str]:

@@ -7,17 +7,21 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TypeVar
 
 import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from numpy.typing import NDArray
 
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
 from synth.video.file_numbers import number_files
+
+A = TypeVar("A", bound=np.generic)
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 
@@ -174,6 +178,21 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
             f"{path}: is {mask.shape[1]} x {mask.shape[0]}, but the video is {size[1]} x {size[0]}"
         )
     return np.asarray(mask, bool)
+
+
+def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:
+    """Downsamples an array (H, W[, C]) by `shrink`; a remainder at the right and bottom is cropped."""
+    if shrink == 1:
+        return picture
+    size = (max(1, picture.shape[1] // shrink), max(1, picture.shape[0] // shrink))
+    # Cropped to a multiple, so that a pixel of the small picture is shrink x shrink pixels of the large one.
+    cut = picture[: size[1] * shrink, : size[0] * shrink]
+    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), picture.dtype)
+
+
+def shrink_mask(mask: Mask, shrink: int, above: int) -> Mask:
+    """Downsamples a mask (H, W); True where more than `above` / 255 of a pixel is True."""
+    return np.asarray(shrink_picture(mask.astype(np.uint8) * 255, shrink) > above)
 
 
 def _reason(error: Exception) -> str:

@@ -7,7 +7,6 @@ from sources import PACKAGES, ROOT, imports, parsed, sources
 # For progress, time limits and timings, which are not content; the stopwatch is the clock of the timings.
 MAY_READ_CLOCKS = {
     "synth/system/stopwatch.py",
-    "synth/engine/progress.py",
     "synth/engine/child.py",
     "synth/engine/journal.py",
     "synth/dataset/folder.py",

@@ -81,7 +81,15 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
         )
         names = [column.name for column in about]
         _write(target / "sequences", side, each, (_sequence(dataset[k], frameless, names) for k in positions))
-    (target / "README.md").write_text(_card(dataset, list(sides), framed, frameless), "utf-8")
+    text = card.template("export/hugging_face.md.jinja").render(
+        **card.facts(Folder(dataset.root)),
+        sides=list(sides),
+        row_columns=_ROWS,
+        framed=[FIELDS[name] for name in framed],
+        still=[FIELDS[name] for name in frameless],
+        index=about,
+    )
+    (target / "README.md").write_text(text, "utf-8")
 
 
 def _plain(name: str, kind: str) -> ParquetColumn:
@@ -151,16 +159,3 @@ def _bytes(value: Any) -> int:
     if isinstance(value, np.ndarray):
         return value.nbytes
     return len(value["bytes"]) if isinstance(value, dict) else 8
-
-
-def _card(dataset: Dataset, sides: list[str], framed: list[str], frameless: list[str]) -> str:
-    """The text of README.md, with its header for the Hub and `datasets`."""
-    text: str = card.template("export/hugging_face.md.jinja").render(
-        **card.facts(Folder(dataset.root)),
-        sides=sides,
-        row_columns=_ROWS,
-        framed=[FIELDS[name] for name in framed],
-        still=[FIELDS[name] for name in frameless],
-        index=[column for column in index.COLUMNS if column.name not in _LEFT_OUT],
-    )
-    return text

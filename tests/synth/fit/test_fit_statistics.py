@@ -9,8 +9,7 @@ from PIL import Image
 
 from synth.fit import fitting
 from synth.fit.colours import fit_colours
-from synth.fit.photograph import Compression, Photograph
-from synth.fit.statistics import measure
+from synth.fit.photograph import Compression, Photograph, measure
 from synth.render.camera.camera_sensor import processed
 from synth.render.camera.colour_processing import CAMERAS, encoded
 

@@ -10,7 +10,7 @@ from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import Job
 from synth.system import cache
-from synth.tune import grid, search
+from synth.tune import search
 from synth.tune.probe import Probe
 from synth.tune.search import Measurements, Tuned
 
@@ -26,8 +26,8 @@ def test_a_tenth_more_load_is_an_error_of_a_tenth() -> None:
     label, *others = one.measure(job)
     assert label < 1e-4
     assert 0 < min(others) < max(others) < np.inf
-    assert one.measure(grid.changed(job, {"flow.backend": "dis"}))[0] == label
-    assert one.measure(grid.changed(job, {"fem.load": [0.11, 0.11]}))[0] == pytest.approx(0.1, rel=0.05)
+    assert one.measure(search.changed(job, {"flow.backend": "dis"}))[0] == label
+    assert one.measure(search.changed(job, {"fem.load": [0.11, 0.11]}))[0] == pytest.approx(0.1, rel=0.05)
 
 
 class Fake:
@@ -96,7 +96,7 @@ def test_a_stopped_run_goes_on(tmp_path: Path) -> None:
     corrupted.write_text(corrupted.read_text()[:-4])
     assert search.lines(tune()) == first
     assert Fake.calls == calls + 2
-    tune(job=grid.changed(JOB, {"seed": 2}))
+    tune(job=search.changed(JOB, {"seed": 2}))
     assert Fake.calls >= 2 * calls  # of another job nothing is taken
 
 
@@ -108,13 +108,13 @@ def test_settings_that_cannot_be_carried_out_are_never_chosen(refused: int) -> N
     assert any("cannot be carried out" in line for line in search.lines(tuned))
     Fake.refused = 4000  # full fidelity
     with pytest.raises(UserError, match="inverted"):
-        tune(job=grid.changed(JOB, {"seed": 2}))
+        tune(job=search.changed(JOB, {"seed": 2}))
 
 
 @pytest.mark.parametrize("scale", [0.0, 1.0])  # of errors: none at all, and some
 def test_nothing_to_choose(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
     Fake.scale = scale
-    tune(job=grid.changed(JOB, {"flow.backend": "ideal"}))
+    tune(job=search.changed(JOB, {"flow.backend": "ideal"}))
     monkeypatch.setattr(search, "list_settings", lambda _: {})  # a single setting of everything
     assert tune(probes=1, checks=0).best.settings == {}
 
@@ -128,8 +128,8 @@ def test_the_written_job_is_the_persons_own(tmp_path: Path) -> None:
     before = reader.load_job(str(source), ["frames=12"])
     search.write_job(tuned, str(source), ["frames=12"], out)
     assert "gestures: [pull]  # mine" in out.read_text()
-    changes = grid.differences(tuned.best.settings, tuned.own.settings)
-    assert reader.load_job(str(out)) == grid.changed(before, changes)
+    changes = search.differences(tuned.best.settings, tuned.own.settings)
+    assert reader.load_job(str(out)) == search.changed(before, changes)
     with pytest.raises(FileExistsError):
         search.write_job(tuned, str(source), [], out)
 
@@ -142,19 +142,19 @@ def test_a_budget_that_is_none(text: str) -> None:
 
 def test_the_grid_follows_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
     def keys(**sections: Any) -> set[str]:
-        return set(grid.list_settings(Job.model_validate(sections)))
+        return set(search.list_settings(Job.model_validate(sections)))
 
     light, flow = {"load": [0.05, 0.1]}, {"render.size", "render.spp"}
     assert keys(fem={**light, "time": "dynamic"}) == {"fem.law", "fem.tets", "fem.time", *flow}
     assert "anatomy.vertices" in keys(anatomy={"vertices": 20_000})
     assert keys(flow={"backend": "ideal"}) == {"fem.tets"}
-    monkeypatch.setattr(grid, "CHEAPEST_FIRST", ("linear",))  # another's law is another tissue
+    monkeypatch.setattr(search, "CHEAPEST_FIRST", ("linear",))  # another's law is another tissue
     assert "fem.law" not in keys(fem={**light, "law": "neo-hookean"})
 
 
 @pytest.mark.parametrize("name", ["paper", "in-vivo"])
 def test_every_setting_is_a_job(name: str) -> None:
     own = Measurements(job := reader.load_job(name)).own
-    for key, settings in grid.list_settings(job).items():
+    for key, settings in search.list_settings(job).items():
         assert own[key] in settings
-        assert [grid.changed(job, {key: setting}) for setting in settings]
+        assert [search.changed(job, {key: setting}) for setting in settings]
