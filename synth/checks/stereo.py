@@ -33,12 +33,12 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     baseline, shift = left.translation[0] - right.translation[0], right.K[0, 2] - left.K[0, 2]
     expected = left.K[0, 0] * baseline / points[:, 2] - shift
     found = sequence["disparity"][:][rows, columns]
-    yield Measure(_worst(found - expected), 1e-3, "rest disparity from depth", "px")
+    yield Measure(float(np.abs(found - expected).max(initial=0)), 1e-3, "rest disparity from depth", "px")
     half = _HALF_PX if sequence["flow"].stored == np.float16 else 0.0
     for t in frames:
         moved = points + sequence["motion"][t][rows, columns]
         flow = cameras.to_pixels(left, moved) - pixels
-        off = _worst(sequence["flow"][t][rows, columns] - flow)
+        off = float(np.abs(sequence["flow"][t][rows, columns] - flow).max(initial=0))
         yield Measure(off, 1e-3 + half, f"frame {t}: left flow from motion", "px")
         # Medians, as interpolation is wrong at edges.
         visible = sequence["visible"][t][rows, columns]
@@ -75,7 +75,3 @@ def _sampled(field: NDArray[np.floating], pixels: Floats) -> Map:
     x, y = np.ascontiguousarray(pixels.T, np.float32)
     found = cv2.remap(field.astype(np.float32), x[None], y[None], cv2.INTER_LINEAR, borderValue=0)
     return np.asarray(found[0], np.float32)
-
-
-def _worst(off: NDArray[np.floating]) -> float:
-    return float(np.abs(off).max()) if off.size else 0.0

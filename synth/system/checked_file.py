@@ -8,7 +8,7 @@ import shutil
 import stat
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -191,9 +191,7 @@ def part_of(path: Path) -> Iterator[Path]:
 
     It is created exclusively, so no existing link is followed. A link at `path` is replaced.
     """
-    part = _part_name(path)
-    part.touch(exist_ok=False)
-    with _replacing(path, part):
+    with _replacing(path, lambda part: part.touch(exist_ok=False)) as part:
         yield part
 
 
@@ -203,16 +201,16 @@ def folder_of(path: Path) -> Iterator[Path]:
     if os.path.lexists(path):
         raise UserError(f"{path}: exists already")
     make_folder(path.absolute().parent)
-    part = _part_name(path)
-    part.mkdir()
-    with _replacing(path, part):
+    with _replacing(path, Path.mkdir) as part:
         yield part
 
 
 @contextmanager
-def _replacing(path: Path, part: Path) -> Iterator[None]:
+def _replacing(path: Path, create: Callable[[Path], None]) -> Iterator[Path]:
+    part = path.with_name(f".{path.name}.{os.urandom(4).hex()}{PART}")
+    create(part)
     try:
-        yield
+        yield part
         part.replace(path)
     except BaseException:
         if part.is_dir():
@@ -245,7 +243,3 @@ def made_folder(path: Path, space_bytes: int = 0) -> Iterator[None]:
             for one in fresh:
                 one.rmdir()
         raise
-
-
-def _part_name(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.urandom(4).hex()}{PART}")
