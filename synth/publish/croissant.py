@@ -42,7 +42,17 @@ def describe(folder: Folder) -> dict[str, Any]:
         "contentSize": f"{len(table)} B",
         "sha256": hashlib.sha256(table).hexdigest(),
     }
-    base["recordSet"][0]["field"] = _columns()
+    base["recordSet"][0]["field"] = [
+        {
+            "@type": "cr:Field",
+            "@id": f"sequences/{column.name}",
+            "name": column.name,
+            "description": column.meaning + (f" [{column.unit}]" if column.unit != "-" else ""),
+            "dataType": _TYPES[column.type],
+            "source": {"fileObject": {"@id": "index"}, "extract": {"column": column.name}},
+        }
+        for column in index.COLUMNS
+    ]
     creators = [{"@type": "sc:Person", "name": name} for name in about.authors]
     stated = {"creator": creators, "license": about.licence}
     fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
@@ -59,18 +69,3 @@ def describe(folder: Folder) -> dict[str, Any]:
             f"Anatomies: {facts['anatomies']}."
         ],
     }
-
-
-def _columns() -> list[dict[str, Any]]:
-    """The columns of the index."""
-    return [
-        {
-            "@type": "cr:Field",
-            "@id": f"sequences/{column.name}",
-            "name": column.name,
-            "description": column.meaning + (f" [{column.unit}]" if column.unit != "-" else ""),
-            "dataType": _TYPES[column.type],
-            "source": {"fileObject": {"@id": "index"}, "extract": {"column": column.name}},
-        }
-        for column in index.COLUMNS
-    ]

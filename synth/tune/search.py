@@ -168,7 +168,7 @@ def list_settings(job: Job) -> dict[str, list[Any]]:
     law = fem.chosen_law[0]
     grid: dict[str, list[Any]] = {
         "fem.law": [law],
-        "fem.tets": _finest_first({fem.tets, 4000, 2500, 1600, 800}),
+        "fem.tets": sorted({fem.tets, 4000, 2500, 1600, 800}, reverse=True),
     }
     if law in CHEAPEST_FIRST:  # a plug-in's is another tissue, not a dearer way to the same one
         linear = ["linear"] if fem.largest_load <= LARGEST_LOAD["linear"] else []
@@ -177,19 +177,15 @@ def list_settings(job: Job) -> dict[str, list[Any]]:
         grid["fem.time"] = ["dynamic", "quasi-static"]
     if job.flow.backend != "ideal":  # else no force is estimated from pictures, however good
         if "vertices" in job.anatomy.model_fields_set:  # else they follow the picture's size
-            grid["anatomy.vertices"] = _finest_first({vertices, min(10_000, vertices)})
+            grid["anatomy.vertices"] = sorted({vertices, min(10_000, vertices)}, reverse=True)
         # In its exact proportions: contacts are drawn within what the camera shows. Even, for codecs.
         wide, high = 2 * width // (unit := math.gcd(width, height)), 2 * height // unit
         steps = [round(part * width / wide) for part in (0.75, 0.6, 0.5, 0.4)]
-        sizes = [(step * wide, step * high) for step in steps]
         # Below 96 pixels, flow has no pyramid to speak of.
-        grid["render.size"] = _finest_first({(width, height), *(size for size in sizes if min(size) >= 96)})
-        grid["render.spp"] = _finest_first({job.render.spp, 8, 4, 2})
+        sizes = {(step * wide, step * high) for step in steps if step * min(wide, high) >= 96}
+        grid["render.size"] = sorted({(width, height), *sizes}, reverse=True)
+        grid["render.spp"] = sorted({job.render.spp, 8, 4, 2}, reverse=True)
     return {key: settings for key, settings in grid.items() if len(settings) > 1}
-
-
-def _finest_first(values: set[Any]) -> list[Any]:
-    return sorted(values, reverse=True)
 
 
 def changed(job: Job, changes: Mapping[str, Any]) -> Job:

@@ -23,12 +23,10 @@ def write_shards(dataset: Dataset, target: Path) -> None:
     Pictures of a right camera are `.rgb_right.png`; `.json` contains the attributes.
     """
     for side, positions in group_by_side(dataset).items():
-        samples = _samples(dataset, positions)
+        samples, shards = _samples(dataset, positions), itertools.count()
         pending = next(samples, None)
-        for shard in itertools.count():
-            if pending is None:
-                break
-            with tarfile.open(target / f"{side}-{shard:05d}.tar", "w") as archive:
+        while pending is not None:
+            with tarfile.open(target / f"{side}-{next(shards):05d}.tar", "w") as archive:
                 used = 0
                 while pending is not None and used <= _SHARD_BYTES:
                     for name, data in pending.items():
