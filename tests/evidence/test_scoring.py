@@ -13,7 +13,7 @@ from evidence.end_to_end import models
 from evidence.scoring import exvivo
 from evidence.scoring import pulse as experiment
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.tune.grid import changed
+from synth.tune.search import changed
 
 
 @pytest.mark.slow
