@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from synth.arrays import Floats, Indices
-from synth.fem.mesh.element import Quadrature, scatter
+from synth.fem.mesh.element import Quadrature, degrees_of_freedom, scatter
 from synth.system.jit import compiled
 
 
@@ -82,20 +82,14 @@ def _local(slope: Floats, weight: Floats, moduli: Floats, out: Floats) -> None:
 
 
 def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> sp.csr_array:
-    """Tangent stiffness.
+    """Tangent stiffness (3N, 3N) mN/mm of a mesh, degrees of freedom node by node.
 
-    Args:
-        mesh: the elements.
-        moduli: (M * Q, 3, 3, 3, 3) kPa, dP/dF at every point; or (1, 3, 3, 3, 3), one for all.
-        along: (M, n, 3) sqrt(mN/mm): its outer products with itself are added to the elements' stiffness.
-
-    Returns:
-        (3N, 3N) mN/mm, degrees of freedom node by node.
+    `moduli` (M * Q, 3, 3, 3, 3) kPa: dP/dF at every point; or (1, 3, 3, 3, 3), one for all. `along` (M, n, 3)
+    sqrt(mN/mm): its outer products with itself are added to the elements' stiffness.
     """
     elements, n = mesh.cells.shape
     local = np.empty((elements, n, 3, n, 3))
     _local(mesh.slope, mesh.weight, moduli, local)
     if along is not None:
         local += along[:, :, :, None, None] * along[:, None, None]
-    dof = (3 * mesh.cells[:, :, None] + np.arange(3, dtype=np.int32)).reshape(elements, 3 * n)
-    return scatter(local, dof, 3 * mesh.nodes)
+    return scatter(local, degrees_of_freedom(mesh.cells), 3 * mesh.nodes)

@@ -41,9 +41,9 @@ class LoadPath:
     residual: Floats  # (T,) out-of-balance force over the load, in the inverse stiffness's norm; 0 unloaded
 
 
-Step = Callable[[int, Floats, Floats], tuple[Floats, State, float]]
-"""From a step's number, its load (N, 3) mN and the displacement (N, 3) mm before it: the
-displacement under it, its state, and the force out of balance as a part of the largest load."""
+Step = Callable[[Floats, Floats], tuple[Floats, State, float]]
+"""From a load (N, 3) mN and the displacement (N, 3) mm before it: the displacement under it, its state, and
+the force out of balance as a part of the largest load."""
 
 
 def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPath:
@@ -59,7 +59,23 @@ def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPat
         NoEquilibrium: the iteration stalled; names frame and load.
         NotFinite: a displacement or an energy is not finite.
     """
-    return follow_loads(system, loads, load_parameter, _QuasiStatic(system, loads))
+    linear = _LinearResponse(system)
+    peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
+    largest = float(np.sqrt(np.vdot(peak, peak))) or 1.0
+    scale = float(np.sqrt(np.vdot(peak, linear(peak)))) or 1.0
+    extrapolation = _NonlinearExtrapolation(linear)
+
+    def step(load: Floats, last: Floats) -> tuple[Floats, State, float]:
+        if system.law == "linear":
+            u = linear(load)
+            state = system.state(u)
+            return u, state, float(np.linalg.norm(on_free(system, load - state.force)) / largest)
+        start = extrapolation.predict(load)
+        u, state, norm = minimise_energy(system, load, start, TOLERANCE * scale, last)
+        extrapolation.add(load, u)
+        return u, state, norm / scale
+
+    return follow_loads(system, loads, load_parameter, step)
 
 
 def follow_loads(
@@ -88,7 +104,7 @@ def follow_loads(
     for number, load in enumerate(loads):
         frame = -(-number // substeps)
         parameter = float(load_parameter[frame])
-        u, state, residual = step(number, load, u)
+        u, state, residual = step(load, u)
         least = check_state(system, u, state, frame, parameter)
         if residual > tolerance:
             raise NoEquilibrium(
@@ -98,28 +114,6 @@ def follow_loads(
         path.append((u, least, state.energy, residual))
     displacement, least_jacobian, energy, residuals = zip(*path[::substeps], strict=True)
     return LoadPath(np.stack(displacement), np.array(least_jacobian), np.array(energy), np.array(residuals))
-
-
-class _QuasiStatic:
-    """Equilibrium under a load: one solve for the linear law; else L-BFGS from an extrapolated start."""
-
-    def __init__(self, system: System, loads: Floats) -> None:
-        self._system, self._linear = system, _LinearResponse(system)
-        peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
-        self._peak = float(np.sqrt(np.vdot(peak, peak))) or 1.0
-        self._scale = float(np.sqrt(np.vdot(peak, self._linear(peak)))) or 1.0
-        self._nonlinear = _NonlinearExtrapolation(self._linear)
-
-    def __call__(self, number: int, load: Floats, last: Floats) -> tuple[Floats, State, float]:
-        system = self._system
-        if system.law == "linear":
-            u = self._linear(load)
-            state = system.state(u)
-            return u, state, float(np.linalg.norm(on_free(system, load - state.force)) / self._peak)
-        start = self._nonlinear.predict(load)
-        u, state, norm = minimise_energy(system, load, start, TOLERANCE * self._scale, last)
-        self._nonlinear.add(load, u)
-        return u, state, norm / self._scale
 
 
 class _LinearResponse:
@@ -162,9 +156,8 @@ class _NonlinearExtrapolation:
 
     def add(self, load: Floats, u: Floats) -> None:
         """Stores the state u (N, 3) mm under a load (N, 3) mN."""
-        straight = self._linear(load)
+        self._added.append(u - self._linear(load))
         self._shares.append(self._linear.shares(load))
-        self._added.append(u - straight)
 
     def predict(self, load: Floats) -> Floats:
         u = self._linear(load)
@@ -176,25 +169,16 @@ class _NonlinearExtrapolation:
         if not 0 < known.shape[1] <= _DIRECTIONS:
             return u + (self._added[-1] if self._added else 0.0)
         known /= np.abs(known).max(axis=0)
-        terms = np.stack(
-            [
-                known[:, list(which)].prod(axis=1)
-                for degree in (2, 3)
-                for which in combinations_with_replacement(range(known.shape[1]), degree)
-            ],
-            axis=1,
-        )
+        of = range(known.shape[1])
+        factors = [*combinations_with_replacement(of, 2), *combinations_with_replacement(of, 3)]
+        terms = np.stack([known[:, list(which)].prod(axis=1) for which in factors], axis=1)
         for part, added in zip(terms[-1] @ np.linalg.pinv(terms[:-1], 1e-6), self._added, strict=True):
             u = u + part * added
         return u
 
 
 def check_state(system: System, u: Floats, state: State, frame: int, load: float) -> float:
-    """Smallest det F of displacements u (N, 3) mm.
-
-    Raises:
-        NotFinite, InvertedElement
-    """
+    """Smallest det F of displacements u (N, 3) mm. Raises NotFinite or InvertedElement."""
     if not np.isfinite(u).all() or not np.isfinite(state.energy):
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
     least, element = system.least_jacobian(u)

@@ -26,7 +26,7 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
 
 
 @compiled
-def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy: Floats) -> float:
+def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy: Floats) -> None:
     """Energy density and stress, in place.
 
     Args:
@@ -35,50 +35,40 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
         mu, lam: kPa.
         out: (n, 3, 3) kPa, overwritten by P = d(energy)/dF.
         energy: (n,) kPa, overwritten; infinite where the law is undefined.
-
-    Returns:
-        The smallest J.
     """
-    least = np.inf
     f, r = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(strain)):
-        for i in range(3):
-            for j in range(3):
-                f[i, j] = strain[n, i, j]
-            f[i, i] += 1
-        det = _det(f)
-        least = min(least, det)
+        _deformation(strain[n], f)
         if law == 0:
             energy[n] = _linear(strain[n], mu, lam, out[n])
         elif law == 1:
             energy[n] = _corotational(f, r, mu, lam, out[n])
         else:
-            energy[n] = _neo_hookean(f, det, r, mu, lam, out[n])
-    return least
+            energy[n] = _neo_hookean(f, r, mu, lam, out[n])
 
 
 @compiled
 def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: Floats) -> float:
-    """Adds lam/2 times the square of each element's mean swelling, in place.
+    """Addition of lam/2 times the square of each element's mean swelling to the stress, in place; its energy,
+    mN mm.
 
-    Swelling is the quantity that a law's lambda term squares: tr e, tr(R'F - I) or log J.
+    Swelling is the quantity that a law's lambda term squares: tr e, tr(R'F - I) or log J. The energy is
+    infinite where the law is undefined.
 
     Args:
         law, strain: as in `stress`, Q points an element in turn.
         weight: (M, Q) mm^3.
         lam: kPa.
         out: (M * Q, 3, 3) kPa, added to.
-
-    Returns:
-        Energy, mN mm; infinite where the law is undefined.
     """
     elements, points = weight.shape
-    slope = np.empty((points, 3, 3))
+    f, slope = np.empty((3, 3)), np.empty((points, 3, 3))
     energy = 0.0
     for e in range(elements):
         whole, volume = 0.0, 0.0
         for q in range(points):
-            swelling = _swelling(law, strain[e * points + q], slope[q])
+            _deformation(strain[e * points + q], f)
+            swelling = _swelling(law, f, slope[q])
             whole += weight[e, q] * swelling
             volume += weight[e, q]
         mean = whole / volume
@@ -89,15 +79,18 @@ def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: F
 
 
 @compiled
-def _swelling(law: int, h: Floats, slope: Floats) -> float:
-    """Swelling at one displacement gradient; `slope` receives its derivative. Infinite where undefined."""
-    f = h.copy()
+def _deformation(strain: Floats, f: Floats) -> None:
     for i in range(3):
+        for j in range(3):
+            f[i, j] = strain[i, j]
         f[i, i] += 1
+
+
+@compiled
+def _swelling(law: int, f: Floats, slope: Floats) -> float:
+    """Swelling at F; `slope` receives its derivative. Infinite where undefined."""
     if law == 0:
-        for i in range(3):
-            for j in range(3):
-                slope[i, j] = i == j
+        slope[:] = np.eye(3)
         return f[0, 0] + f[1, 1] + f[2, 2] - 3  # type: ignore[no-any-return]
     if law == 1:
         _rotation(f, slope)
@@ -121,10 +114,7 @@ def least_determinant(strain: Floats) -> tuple[float, int]:
     least, where = np.inf, 0
     f = np.empty((3, 3))
     for n in range(len(strain)):
-        for i in range(3):
-            for j in range(3):
-                f[i, j] = strain[n, i, j]
-            f[i, i] += 1
+        _deformation(strain[n], f)
         det = _det(f)
         if det < least:
             least, where = det, n
@@ -158,26 +148,19 @@ def _corotational(f: Floats, r: Floats, mu: float, lam: float, p: Floats) -> flo
 
 
 @compiled
-def _neo_hookean(f: Floats, det: float, c: Floats, mu: float, lam: float, p: Floats) -> float:
+def _neo_hookean(f: Floats, c: Floats, mu: float, lam: float, p: Floats) -> float:
+    det = _det(f)
     if not det > 0:
         p[:] = 0.0
         return np.inf
     _cofactor(f, c)
     log = np.log(det)
-    out = (lam * log - mu) / det
+    out, squares = (lam * log - mu) / det, 0.0
     for i in range(3):
         for j in range(3):
+            squares += f[i, j] * f[i, j]
             p[i, j] = mu * f[i, j] + out * c[i, j]
-    return 0.5 * mu * (_squares(f) - 3) - mu * log + 0.5 * lam * log * log  # type: ignore[no-any-return]
-
-
-@compiled
-def _squares(f: Floats) -> float:
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += f[i, j] * f[i, j]
-    return total
+    return 0.5 * mu * (squares - 3) - mu * log + 0.5 * lam * log * log  # type: ignore[no-any-return]
 
 
 @compiled

@@ -29,14 +29,9 @@ class Tissue:
     membrane: Pia | None = None  # on the surface; None where it is removed
     skull: str = "bonded"  # `bonded` or `slip`
 
-    def equations(self, tets: Tets, law: str | None = None) -> System:
-        """The equations of a volume of this tissue, by its own law or another."""
-        return assemble(tets, law or self.law, self.poisson, self.sheet)
-
-    @property
-    def sheet(self) -> MembraneSheet | None:
-        """The membrane on tissue of E = 1 kPa."""
-        pia = self.membrane
-        if pia is None:
-            return None
-        return MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
+    def equations(self, tets: Tets) -> System:
+        """The equations of a volume of this tissue."""
+        pia, sheet = self.membrane, None
+        if pia is not None:
+            sheet = MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
+        return assemble(tets, self.law, self.poisson, sheet)

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from synth.arrays import Floats, Indices
-from synth.fem.mesh.element import face_shape_slope, scatter
+from synth.fem.mesh.element import degrees_of_freedom, scatter, shape_slope
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.system.jit import compiled
 
@@ -54,24 +54,10 @@ class Membrane:
 
     def pull(self, u: Floats, out: Floats) -> float:
         """Adds its forces at (N, 3) mm to (N, 3) mN, and returns its energy, mN mm; both are 0 at rest."""
-        energy = self._pull(u, out)
+        mesh = self.faces, self.slope, self.tangent, self.weight
+        energy = float(_pull(*mesh, u, self.stiffness, self.linear, self.square, out))
         out -= self.balance
         return energy - self.stored - float(np.vdot(self.balance, u))
-
-    def _pull(self, u: Floats, out: Floats) -> float:
-        return float(
-            _pull(
-                self.faces,
-                self.slope,
-                self.tangent,
-                self.weight,
-                u,
-                self.stiffness,
-                self.linear,
-                self.square,
-                out,
-            )
-        )
 
     def rest_stiffness(self) -> sp.csr_array:
         """(3N, 3N) mN/mm at rest, exact; being stretched, it has no wrinkles."""
@@ -82,22 +68,17 @@ class Membrane:
         local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
         held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
         local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
-        faces, n = len(self.faces), 3 * self.faces.shape[1]
-        dof = (3 * self.faces[:, :, None] + np.arange(3, dtype=np.int32)).reshape(faces, n)
-        return scatter(local, dof, self.balance.size)
+        return scatter(local, degrees_of_freedom(self.faces), self.balance.size)
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     """A membrane over all of a volume's surface but the walls that it is cut out at.
 
-    Args:
-        tets: the volume.
-        sheet: its stiffness and stretch.
-        linear: small strain, without the pre-stretch.
+    `linear`: small strain, without the pre-stretch.
     """
     faces = boundary(tets.cells)
     faces = faces[~tets.fixed[faces].all(axis=1)]
-    local = face_shape_slope(_POINTS)
+    local = shape_slope(_POINTS)
     side = np.einsum("qnk,fni->fqik", local, tets.points[faces])
     first = side[..., 0] / np.linalg.norm(side[..., 0], axis=-1, keepdims=True)
     normal = np.cross(side[..., 0], side[..., 1])
@@ -116,7 +97,7 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
         0.0,
     )
     balance = np.zeros_like(tets.points)
-    stored = found._pull(balance.copy(), balance)
+    stored = found.pull(balance.copy(), balance)
     return replace(found, balance=balance, stored=stored)
 
 

@@ -114,7 +114,7 @@ def march_in_time(
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm or 1.0
     past, before = _PronyHistory(clock), np.zeros_like(peak)
 
-    def step(number: int, load: Floats, u: Floats) -> tuple[Floats, State, float]:
+    def step(load: Floats, u: Floats) -> tuple[Floats, State, float]:
         nonlocal before
         load = past.add_to(load)
         if spring:

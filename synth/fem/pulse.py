@@ -51,11 +51,8 @@ class Pulse:
 def lift(system: System, embedding: Embedding, surface: Shape, opening_mm: float) -> Floats:
     """The load that raises the middle of the opening by 1 mm under the linear law, (N, 3) mN for E = 1 kPa.
 
-    Args:
-        system: the volume.
-        embedding: the surface on it.
-        surface: faces counter-clockwise from outside.
-        opening_mm: radius of the craniotomy; beyond it the pressure falls to 0 over the rim.
+    `surface` is embedded in the volume, its faces counter-clockwise from outside; beyond the radius
+    `opening_mm` of the craniotomy the pressure falls to 0 over the rim.
     """
     vertices, faces = surface
     corner = vertices[faces]

@@ -41,14 +41,14 @@ class Embedding:
         moved = (self.value @ u.reshape(len(u), -1)).reshape(-1, *u.shape[1:])
         spin = self.spin @ u.reshape(3 * len(u), -1)
         turned = self.corner @ (self.mean @ spin.reshape(len(self.mean), -1))
-        return np.asarray(moved + _cross(turned.reshape(moved.shape), self._arm(moved)))
+        return np.asarray(moved + np.cross(turned.reshape(moved.shape), self._arm(moved), axis=1))
 
     def gather(self, force: Floats) -> Floats:
         """Nodal forces (N, 3, ...) mN, from those at the points, (V, 3, ...) mN."""
         loaded = np.flatnonzero(force.reshape(len(force), -1).any(axis=1))  # few of them, as a rule
         width = int(np.prod(force.shape[1:]))
         flat = force[loaded].reshape(len(loaded), width)
-        moment = _cross(self._arm(force)[loaded], force[loaded]).reshape(flat.shape)
+        moment = np.cross(self._arm(force)[loaded], force[loaded], axis=1).reshape(flat.shape)
         nodal = (self.value[loaded].T @ flat).reshape(-1, *force.shape[1:])
         couple = self.mean.T @ (self.corner[loaded].T @ moment)
         couple = self.spin.T @ couple.reshape(self.spin.shape[0], width // 3)
@@ -89,18 +89,11 @@ def _sparse(values: Floats, columns: Ints, width: int) -> sp.csr_array:
 
 
 def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]:
-    """A filter that averages values at corners of faces over `_EVEN_MM`, however small the faces.
+    """A filter (K, K) that averages values at K corners of faces over `_EVEN_MM`, however small the faces,
+    and each face's part (F, 3) in the area of its corners.
 
     Helmholtz' filter (1 - l^2 Laplacian)^-1 (Lazarov & Sigmund, Int. J. Numer. Meth. Eng. 86, 2011): rows sum
-    to 1.
-
-    Args:
-        corner: (F, 3, 3) mm.
-        local: (F, 3) their indices among the K corners.
-        count: K.
-
-    Returns:
-        (K, K), and the area (F, 3) mm^2 of each face's part in its corner's as a share of the latter.
+    to 1. `corner`: (F, 3, 3) mm; `local`: (F, 3) their indices among the K corners.
     """
     sides = np.roll(corner, -1, axis=1) - np.roll(corner, 1, axis=1)  # each opposite its corner
     area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
@@ -115,12 +108,8 @@ def _averaging(corner: Floats, local: Ints, count: int) -> tuple[Floats, Floats]
 def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats) -> sp.csr_array:
     """Half the curl at K corners of faces, (3 K, 3 N) 1/mm: the mean over the faces' elements there.
 
-    Args:
-        tets: the volume.
-        owner: (F,) the faces' elements.
-        faces: (F, 3) indices of their corners in the element.
-        local: (F, 3) indices of their corners among the K.
-        share: (F, 3) weight of each element in its corner's mean.
+    For each face (F,) `owner` is its element; `faces` (F, 3) are its corners in the element, `local` (F, 3)
+    among the K, and `share` (F, 3) the weight of the element in their means.
     """
     gradient = gradients(tets.points[tets.cells[owner]], np.eye(4))[0]  # (F, 4, n, 3)
     gradient = 0.5 * share[:, :, None, None] * np.take_along_axis(gradient, faces[:, :, None, None], axis=1)
@@ -134,11 +123,6 @@ def _half_curl(tets: Tets, owner: Ints, faces: Ints, local: Ints, share: Floats)
     values = np.concatenate([value.ravel() for _, _, value in parts])
     size = (3 * (int(local.max()) + 1), 3 * len(tets.points))
     return sp.coo_array((values, (rows, columns)), shape=size).tocsr()
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross product of vectors along axis 1."""
-    return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:

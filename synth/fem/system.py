@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,11 +29,10 @@ docs/results/fem checks it on a block that was not used for this choice."""
 
 @dataclass(frozen=True)
 class State:
-    """Energy, forces and smallest Jacobian of a displacement, for E = 1 kPa."""
+    """Energy and forces of a displacement, for E = 1 kPa."""
 
     energy: float  # mN mm, stored in tissue, membrane and springs
     force: Floats  # (N, 3) mN of resistance by tissue, membrane and springs
-    jacobian: float  # smallest det F at the quadrature points
 
 
 @dataclass(frozen=True)
@@ -61,34 +59,26 @@ class System:
         return u.reshape(force.shape)
 
     def state(self, u: Floats) -> State:
-        """Energy, forces and smallest Jacobian at (N, 3) mm."""
-        strain = self._strain(u)
+        """Energy and forces at (N, 3) mm."""
+        (mu, lam), weight = lame(1.0, self.poisson), self.mesh.weight
+        strain = _strain(self.mesh, u)
         answer, density = np.empty_like(strain), np.empty(len(strain))
-        least = self._law(strain, answer, density)
-        energy = float(density @ self.mesh.weight.ravel())
+        if self.law in NUMBER:
+            stress(NUMBER[self.law], strain, mu, lam - self.averaged, answer, density)
+        else:
+            foreign_law.stress(self.law, strain, mu, lam - self.averaged, answer, density)
+        energy = float(density @ weight.ravel())
         if self.averaged:
-            energy += resist_swelling(_swelling(self.law), strain, self.mesh.weight, self.averaged, answer)
+            swelling = NUMBER.get(self.law, NUMBER["neo-hookean"])  # of a plug-in: log J
+            energy += resist_swelling(swelling, strain, weight, self.averaged, answer)
         force = np.empty_like(u)
-        divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
+        divergence(self.mesh.cells, self.mesh.slope, weight, answer, force)
         spring = self.springs(u)
         energy += 0.5 * float(np.vdot(u, spring))
         force += spring
         if self.membrane is not None:
             energy += self.membrane.pull(u, force)
-        return State(energy, force, least)
-
-    def _strain(self, u: Floats) -> Floats:
-        """(M * Q, 3, 3) displacement gradients at the quadrature points."""
-        strain = np.empty((self.mesh.weight.size, 3, 3))
-        gradient(self.mesh.cells, self.mesh.slope, u, strain)
-        return strain
-
-    def _law(self, strain: Floats, stress_kpa: Floats, density: Floats) -> float:
-        """The law without its part on elements' means, in place; returns the smallest det F."""
-        mu, lam = lame(1.0, self.poisson)
-        own = self.law in NUMBER
-        law = partial(stress, NUMBER[self.law]) if own else partial(foreign_law.stress, self.law)
-        return float(law(strain, mu, lam - self.averaged, stress_kpa, density))
+        return State(energy, force)
 
     def springs(self, u: Floats) -> Floats:
         """Force (N, 3) mN of the springs at (N, 3) mm."""
@@ -102,9 +92,7 @@ class System:
         """
         found = []
         for mesh in (self.mesh, self.corners):
-            strain = np.empty((mesh.weight.size, 3, 3))
-            gradient(mesh.cells, mesh.slope, u, strain)
-            least, at = least_determinant(strain)
+            least, at = least_determinant(_strain(mesh, u))
             found.append((float(least), int(at) // mesh.weight.shape[1]))
         return min(found)
 
@@ -136,7 +124,10 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
         along *= np.sqrt(mean / mesh.weight.sum(axis=1))[:, None, None]
     moduli = hooke(1.0, poisson)
     moduli -= mean * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
-    whole = (stiffness(mesh, moduli, along) + _springs(tets.hold, tets.slip)).tocsr()
+    springs = sp.kron(tets.hold, np.eye(3), format="csr")
+    if tets.slip is not None:
+        springs = springs + tets.slip
+    whole = (stiffness(mesh, moduli, along) + springs).tocsr()
     membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
     if membrane is not None:
         whole = (whole + membrane.rest_stiffness()).tocsr()
@@ -159,12 +150,8 @@ def hooke(young: float, poisson: float) -> Floats:
     return np.asarray(mu * alike + lam * np.einsum("ij,km->ijkm", one, one))[None]
 
 
-def _swelling(law: str) -> int:
-    """Number of the law that defines the swelling; of a plug-in it is log J, as of neo-Hookean tissue."""
-    return NUMBER.get(law, NUMBER["neo-hookean"])
-
-
-def _springs(hold: sp.csr_array, slip: sp.csr_array | None) -> sp.csr_array:
-    """Stiffness of springs in all three directions plus those along the normal."""
-    whole = sp.kron(hold, np.eye(3), format="csr")
-    return whole if slip is None else whole + slip
+def _strain(mesh: Quadrature, u: Floats) -> Floats:
+    """Displacement gradients (M * Q, 3, 3) of a mesh at (N, 3) mm."""
+    strain = np.empty((mesh.weight.size, 3, 3))
+    gradient(mesh.cells, mesh.slope, u, strain)
+    return strain

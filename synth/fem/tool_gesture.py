@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Floats, Ints
+from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
-from synth.geometry.triangles import Shape
+from synth.geometry.triangles import Shape, side_areas
 
 _PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
 FRICTION = 0.4  # drag of a sliding tip, as a part of its push
@@ -82,16 +81,10 @@ class ToolMotion:
 def grip(
     kind: str, point: Floats, direction: Floats, spread_mm: float, azimuth_deg: float
 ) -> tuple[Floats, Floats]:
-    """Contact points and load directions of an instrument's tips: one, or two of a grasp.
+    """Centres (C, 2) mm and load directions (C, 3), unit vectors, of an instrument's tips: one, or two of a
+    grasp.
 
-    Args:
-        kind: of the gesture.
-        point: (2,) mm, middle of the contacts.
-        direction: (3,) unit vector.
-        spread_mm, azimuth_deg: as in `Gesture`.
-
-    Returns:
-        Centres (C, 2) mm and unit vectors (C, 3).
+    `point`: (2,) mm, middle of the contacts; `direction`: (3,) unit vector; else as in `Gesture`.
     """
     if kind != "grasp":
         return point[None], direction[None]
@@ -135,15 +128,10 @@ def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
 
 
 def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floats) -> Floats:
-    """Load (T, V, 3) kPa on the surface at rest: sum(area * result) is the force.
+    """Load (T, V, 3) kPa on the surface at rest, (V, 3) mm: sum(area * result) is the force; `area`: (V,)
+    mm^2.
 
-    Args:
-        gesture, motion: contacts and forces, and when they act.
-        vertices: (V, 3) mm at rest.
-        area: (V,) mm^2.
-
-    Raises:
-        UserError: as `footprint`.
+    Raises UserError as `footprint`.
     """
     out = np.zeros((len(motion.load), len(vertices), 3))
     for contact in gesture.contacts:
@@ -158,16 +146,13 @@ def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floa
 
 
 def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) -> Floats:
-    """Pressure of a unit force: the kernel (1 - (r/a)^2)^2 on the surface at rest.
+    """Pressure (V,) 1/mm^2 of a unit force: the kernel (1 - (r/a)^2)^2 on the surface, sum(area * result) =
+    1.
 
     Args:
         centre: (2,) world x, y, mm.
         radius_mm: a.
-        vertices: (V, 3) mm at rest.
-        area: (V,) mm^2.
-
-    Returns:
-        (V,) 1/mm^2, with sum(area * result) = 1.
+        vertices, area: (V, 3) mm at rest, and (V,) mm^2.
 
     Raises:
         UserError: fewer than 3 vertices lie under the contact.
@@ -188,8 +173,7 @@ def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) 
 def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
     """Points where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
 
-    Raises:
-        UserError: beyond the edge of the surface.
+    Raises UserError beyond the edge of the surface.
     """
     aside = _aside(gesture.spread_mm, gesture.azimuth_deg)
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
@@ -205,18 +189,10 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
 
 
 def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) -> tuple[Floats, Floats]:
-    """Pose of the instrument: its tips rest on the tissue while they load it.
+    """Tips (T, 2, 3) mm of the instrument, which rest on the tissue while they load it, and unit vectors (T,
+    2, 3) from tip to hand.
 
-    Args:
-        gesture, motion: of the instrument.
-        surface: at rest.
-        moved: (T, V, 3) mm, its vertices over time.
-
-    Returns:
-        Tips (T, 2, 3) mm and unit vectors from tip to hand (T, 2, 3).
-
-    Raises:
-        UserError: it touches beyond the edge of the surface.
+    `surface` is at rest; `moved` (T, V, 3) mm are its vertices over time. Raises UserError as `anchors`.
     """
     corners, weights = anchors(gesture, motion, surface)
     touched = np.stack(
@@ -232,10 +208,9 @@ def _aside(spread_mm: float, azimuth_deg: float) -> Floats:
     return np.asarray(0.5 * spread_mm * np.array([np.cos(across), np.sin(across)]))
 
 
-def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[Ints, Floats]:
+def _under(xy: Floats, vertices: Floats, faces: Array) -> tuple[Ints, Floats]:
     """The highest face above or below a point of the plane, and the point's barycentrics in it."""
-    a, b, c = (vertices[faces[:, i], :2] - xy for i in range(3))
-    parts = np.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+    parts = side_areas(xy, vertices, faces)
     total = parts.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         bary = parts / total[:, None]
@@ -245,10 +220,6 @@ def _under(xy: Floats, vertices: Floats, faces: NDArray[np.integer]) -> tuple[In
     height = np.einsum("fc,fc->f", bary[hit], vertices[faces[hit], 2])
     best = hit[height.argmax()]
     return faces[best].astype(np.int64), bary[best]
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _smooth(s: Floats) -> Floats:

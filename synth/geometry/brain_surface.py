@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, first_line
-from synth.geometry.triangles import Shape
+from synth.geometry.triangles import Shape, side_areas
 from synth.geometry.vtk import read_vtk
 from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
@@ -108,8 +108,7 @@ def axes(out: Floats) -> Floats:
 
 def _heights(vertices: Floats, faces: Ints) -> Floats:
     """Heights at which the z axis intersects the faces [mm]."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    parts = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    parts = side_areas(np.zeros(2), vertices, faces)
     whole = parts.sum(axis=1)
     hit = (np.abs(whole) > 1e-12) & ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1))
     return np.asarray((parts[hit] * vertices[faces[hit], 2]).sum(axis=1) / whole[hit])

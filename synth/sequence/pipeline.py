@@ -174,8 +174,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     """Recovers motion in three dimensions from the left camera's flow and both videos, and writes it."""
     job, writer, scene = task.job, task.writer, task.scene
     lens = scene.renderer.right
-    if lens is None:
-        raise ValueError("the job is monocular")
+    assert lens is not None
     blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(

@@ -26,15 +26,8 @@ _LOW = 30  # percentile of force below which a point may be disturbed
 
 
 def intensity(traction: NDArray[np.floating], force_mn: float) -> Floats:
-    """The published label: the load scaled so that its largest value is the total force.
-
-    Args:
-        traction: (H, W, 3) kPa.
-        force_mn: size of the total force.
-
-    Returns:
-        (H, W, 3) mN, in the axes of `traction`.
-    """
+    """The published label (H, W, 3) mN of a traction (H, W, 3) kPa, in its axes: scaled so that its largest
+    value is the size of the total force, `force_mn`."""
     peak = float(lengths(traction).max(initial=0.0))
     return np.asarray(traction, np.float64) * (force_mn / peak if peak > 0 else 0.0)
 
@@ -46,16 +39,6 @@ def with_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generat
     rng.random((len(mine), 1))  # the published code draws outliers too, of which its example has none
     out[tissue] = mine + share * lengths(mine)[:, None] * rng.normal(size=mine.shape)
     return out
-
-
-def noisy_frames(frames: int, rng: np.random.Generator) -> Mask:
-    """Mask (T,) of the frames that the second stage disturbs."""
-    ends = min(_MOST_FRAMES, frames // _ENDS)
-    candidates = np.arange(ends, frames - ends)
-    count = min(int(frames * _FRAMES), len(candidates))
-    chosen = np.zeros(frames, bool)
-    chosen[rng.choice(candidates, count, replace=False)] = True
-    return chosen
 
 
 def disturbed(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Floats]:
@@ -91,8 +74,11 @@ class Published:
     @classmethod
     def begin(cls, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
         """Draws the frames to disturb; `labels` is the job's key, `tissue` (H, W)."""
-        share = _FORCE_SHARE if labels == "published" else 0.0
-        return cls(share, tissue, noisy_frames(frames, rng), rng)
+        ends = min(_MOST_FRAMES, frames // _ENDS)
+        candidates, chosen = np.arange(ends, frames - ends), np.zeros(frames, bool)
+        count = min(int(frames * _FRAMES), len(candidates))
+        chosen[rng.choice(candidates, count, replace=False)] = True
+        return cls(_FORCE_SHARE if labels == "published" else 0.0, tissue, chosen, rng)
 
     def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Floats) -> dict[str, Map]:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,10 +74,7 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     """Draws sequence `index` of `job`, independently of the others' number and order."""
     job = as_job(job)
     family = job.appearance.families[index % len(job.appearance.families)]
-
-    def generator(part: int) -> Random:
-        return _generator(job, _SEQUENCE, index, part)
-
+    generator = partial(_generator, job, _SEQUENCE, index)
     relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
     tissue = draw_tissue(job.fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
@@ -92,8 +90,8 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
 
 def frame_seeds(job: Job, index: int) -> list[int]:
     """One seed per frame for light paths and sensor noise, so that noise differs between frames."""
-    state = _sequence(job, _SEQUENCE, index, _NOISE).generate_state(job.frames)
-    return [int(seed) for seed in state]
+    sequence = np.random.SeedSequence(job.seed, spawn_key=(_SEQUENCE, index, _NOISE))
+    return [int(seed) for seed in sequence.generate_state(job.frames)]
 
 
 def label_rng(job: Job, index: int) -> Random:
@@ -367,9 +365,5 @@ def _vector(value: Floats) -> tuple[float, float, float]:
     return float(value[0]), float(value[1]), float(value[2])
 
 
-def _sequence(job: Job, *key: int) -> np.random.SeedSequence:
-    return np.random.SeedSequence(job.seed, spawn_key=key)
-
-
 def _generator(job: Job, *key: int) -> Random:
-    return np.random.default_rng(_sequence(job, *key))
+    return np.random.default_rng(np.random.SeedSequence(job.seed, spawn_key=key))

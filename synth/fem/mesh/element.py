@@ -22,35 +22,34 @@ TRI_POINTS = np.array(
 """(6, 3) barycentric points of degree 4 on a triangle (Dunavant, Int. J. Numer. Meth. Eng. 21, 1985)."""
 TRI_WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 """(6,) their weights, summing to 1."""
-_SIDES = ((0, 1), (0, 2), (1, 2))  # of a face, in the order of its midsides
+
+
+def _ends(bary: Floats) -> Ints:
+    """First and second corner (2, ...) of each side of a tetrahedron or, of three coordinates, a face."""
+    return np.asarray(EDGES[(bary.shape[-1] > EDGES).all(axis=1)].T)
 
 
 def shape(bary: Floats) -> Floats:
-    """Shape functions (..., 10) at (..., 4) barycentric coordinates: corners, then midsides as in `EDGES`."""
-    corners = bary * (2 * bary - 1)
-    return np.concatenate([corners, 4 * bary[..., EDGES[:, 0]] * bary[..., EDGES[:, 1]]], axis=-1)
+    """Shape functions of a tetrahedron, (..., 10) at (..., 4) barycentric coordinates, or of a face, (..., 6)
+    at (..., 3): of the corners, then of the midsides in the order of `EDGES`."""
+    first, second = _ends(bary)
+    return np.concatenate([bary * (2 * bary - 1), 4 * bary[..., first] * bary[..., second]], axis=-1)
 
 
 def shape_slope(bary: Floats) -> Floats:
-    """Derivatives of the shape functions by the barycentric coordinates, (..., 10, 4)."""
-    corners = np.broadcast_to(np.eye(4), (*bary.shape[:-1], 4, 4)) * (4 * bary - 1)[..., None, :]
-    left, right = EDGES[:, 0], EDGES[:, 1]
-    sides = 4 * (bary[..., left, None] * np.eye(4)[right] + bary[..., right, None] * np.eye(4)[left])
-    return np.concatenate([corners, sides], axis=-2)
+    """Derivatives (..., 10, 3) or (..., 6, 2) of `shape` by all barycentric coordinates but the first.
 
-
-def face_shape(bary: Floats) -> Floats:
-    """Shape functions on a face, (..., 6): corners, then midsides 01, 02, 12."""
-    sides = np.stack([4 * bary[..., i] * bary[..., j] for i, j in _SIDES], axis=-1)
-    return np.concatenate([bary * (2 * bary - 1), sides], axis=-1)
-
-
-def face_shape_slope(bary: Floats) -> Floats:
-    """Derivatives of `face_shape` by the second and third barycentric coordinate, (Q, 6, 2)."""
-    corners = np.broadcast_to(np.eye(3), (len(bary), 3, 3)) * (4 * bary - 1)[:, None, :]
-    sides = [bary[:, [i], None] * np.eye(3)[j] + bary[:, [j], None] * np.eye(3)[i] for i, j in _SIDES]
-    slope = np.concatenate([corners, 4 * np.concatenate(sides, axis=1)], axis=1)
+    The first is 1 less the others.
+    """
+    one, (first, second) = np.eye(bary.shape[-1]), _ends(bary)
+    sides = 4 * (bary[..., first, None] * one[second] + bary[..., second, None] * one[first])
+    slope = np.concatenate([one * (4 * bary - 1)[..., None, :], sides], axis=-2)
     return np.asarray(slope[..., 1:] - slope[..., :1])
+
+
+def degrees_of_freedom(nodes: Indices) -> Indices:
+    """Degrees of freedom (E, 3 n) of nodes (E, n), node by node."""
+    return np.asarray((3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1), np.int32)
 
 
 def scatter(local: Floats, nodes: Array, size: int) -> sp.csr_array:
@@ -61,14 +60,8 @@ def scatter(local: Floats, nodes: Array, size: int) -> sp.csr_array:
 
 
 def bary_slope(corners: Floats) -> tuple[Floats, Floats]:
-    """Gradients of the barycentric coordinates and volumes of straight tetrahedra.
-
-    Args:
-        corners: (M, 4, 3) mm.
-
-    Returns:
-        (M, 4, 3) 1/mm, and (M,) mm^3, negative where a tetrahedron is inside out.
-    """
+    """Gradients (M, 4, 3) 1/mm of the barycentric coordinates of straight tetrahedra (M, 4, 3) mm, and their
+    volumes (M,) mm^3, negative where a tetrahedron is inside out."""
     sides = corners[:, 1:] - corners[:, :1]
     inverse = np.linalg.inv(sides)  # rows: directions in space; columns: barycentrics 1..3
     slope = np.empty_like(corners)
@@ -112,15 +105,8 @@ def quadrature(points: Floats, cells: Ints, at: Floats = TET_POINTS) -> Quadratu
 
 
 def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
-    """Gradients of the shape functions of isoparametric elements.
-
-    Args:
-        nodes: (M, 10, 3) mm.
-        bary: (Q, 4).
-
-    Returns:
-        (M, Q, 10, 3) 1/mm, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out.
-    """
+    """Gradients (M, Q, 10, 3) 1/mm of the shape functions of isoparametric elements (M, 10, 3) mm at (Q, 4)
+    barycentric points, and (M, Q) mm^3: 6 times the volume of a straight element, negative inside out."""
     local, jacobian = _mapping(nodes, bary)
     return np.einsum("qnk,mqdk->mqnd", local, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
 
@@ -128,7 +114,6 @@ def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
 def _mapping(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:
     """Derivatives by three local coordinates: of shape functions (Q, 10, 3) and of position (M, Q, 3, 3)."""
     local = shape_slope(bary)
-    local = local[..., 1:] - local[..., :1]  # the first coordinate is 1 less the others
     flat = np.ascontiguousarray(local.transpose(0, 2, 1).reshape(-1, local.shape[1]))
     return local, (flat @ nodes).reshape(len(nodes), len(bary), 3, 3)
 

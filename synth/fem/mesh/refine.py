@@ -45,11 +45,8 @@ def longest(points: Floats, cells: Ints) -> Floats:
 
 
 def edges_of(cells: Ints) -> tuple[Ints, Ints]:
-    """The mesh's edges, once each.
-
-    Returns:
-        (E, 2) sorted corner pairs, and (M, 6) each tetrahedron's indices into them, in the order of `EDGES`.
-    """
+    """Edges (E, 2) of a mesh as sorted corner pairs, once each, and (M, 6) each tetrahedron's indices into
+    them, in the order of `EDGES`."""
     pairs = np.sort(cells[:, EDGES].reshape(-1, 2), axis=1)
     key = pairs[:, 0] * (int(cells.max()) + 1) + pairs[:, 1]
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
@@ -57,13 +54,8 @@ def edges_of(cells: Ints) -> tuple[Ints, Ints]:
 
 
 def bisect(points: Floats, cells: Ints, chosen: Ints) -> tuple[Floats, Ints]:
-    """Halves chosen tetrahedra at their longest edges, and as many others as conformity requires.
-
-    Args:
-        points: (N, 3) mm.
-        cells: (M, 4).
-        chosen: (K,) indices of cells.
-    """
+    """Bisection of a mesh of points (N, 3) mm and cells (M, 4): the chosen cells (K,) are halved at their
+    longest edges, and as many others as conformity requires."""
     pairs, of = edges_of(cells)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     # One order of all edges: ties must fall alike in neighbours, or their face would be cut in two ways.

@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 from scipy.sparse.linalg import spsolve
 
 from synth.arrays import Floats, Ints
-from synth.fem.mesh.element import face_shape, jacobians, quality, scatter
+from synth.fem.mesh.element import jacobians, quality, scatter, shape
 from synth.fem.mesh.refine import EDGES
 
 Field = Callable[[Floats], Floats]
@@ -98,7 +98,7 @@ def _fit_heights(points: Floats, faces: Ints, wanted: Floats) -> tuple[Ints, Flo
     corner = points[faces[:, :3], :2]
     side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = 0.5 * np.abs(side[:, 0] * other[:, 1] - side[:, 1] * other[:, 0])
-    value = face_shape(_PLACES)
+    value = shape(_PLACES)
     local = np.einsum("f,qi,qj->fij", area, value, value)
     used, at = np.unique(faces, return_inverse=True)
     at = at.reshape(faces.shape)

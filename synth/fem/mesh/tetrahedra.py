@@ -13,7 +13,7 @@ from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
 from synth.fem.mesh import attachments, winding
 from synth.fem.mesh.attachments import FIRM_PER_MM
-from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, face_shape, scatter
+from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, scatter, shape
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
 from synth.fem.mesh.refine import edges_of, refine
@@ -260,7 +260,7 @@ def _springs(
     # Deep below lies the far side of the brain, which no opening exposes.
     deep = place[..., 2] < -2 * at.radius_mm
     firm[deep] = 1
-    value = face_shape(TRI_POINTS)
+    value = shape(TRI_POINTS)
     pressed = FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
 
     def gathered(part: Floats) -> sp.csr_array:

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Floats, Ints
+from synth.arrays import Array, Floats, Ints
 from synth.system.jit import compiled
 
 _LEAF = 24
@@ -32,13 +31,11 @@ class Winding:
 
     def __call__(self, at: Floats) -> Floats:
         """Winding number at (n, 3) mm, (n,)."""
-        number = _number(
-            np.ascontiguousarray(at), self.corner, self.start, self.centre, self.radius, self.moment, _FAR
-        )
-        return np.asarray(self.sign * number)
+        clusters = self.corner, self.start, self.centre, self.radius, self.moment
+        return np.asarray(self.sign * _number(np.ascontiguousarray(at), *clusters))
 
 
-def prepare(vertices: Floats, faces: NDArray[np.integer]) -> Winding:
+def prepare(vertices: Floats, faces: Array) -> Winding:
     """The winding number of a surface, (V, 3) mm and (F, 3): sorts its faces into clusters."""
     corner = vertices[faces]
     middle = corner.mean(axis=1)
@@ -69,13 +66,7 @@ def prepare(vertices: Floats, faces: NDArray[np.integer]) -> Winding:
 
 @compiled
 def _number(
-    at: Floats,
-    corner: Floats,
-    start: Ints,
-    centre: Floats,
-    radius: Floats,
-    moment: Floats,
-    far: float,
+    at: Floats, corner: Floats, start: Ints, centre: Floats, radius: Floats, moment: Floats
 ) -> Floats:
     out = np.zeros(len(at))
     for p in range(len(at)):
@@ -84,7 +75,7 @@ def _number(
         for c in range(len(centre)):
             a, b, d = centre[c, 0] - x, centre[c, 1] - y, centre[c, 2] - z
             distance = np.sqrt(a * a + b * b + d * d)
-            if distance > far * radius[c]:
+            if distance > _FAR * radius[c]:
                 total += (a * moment[c, 0] + b * moment[c, 1] + d * moment[c, 2]) / distance**3
             else:
                 for f in range(start[c], start[c + 1]):

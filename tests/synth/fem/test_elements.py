@@ -67,10 +67,11 @@ def test_rigid_rotation_gives_no_force(law: str) -> None:
     points = cube().points
     turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
-    state = system.state(points @ turn.T - points + 3.0)
+    moved = points @ turn.T - points + 3.0
+    state = system.state(moved)
     assert np.abs(state.force).max() <= 1e-13
     assert abs(state.energy) <= 1e-13
-    assert state.jacobian == pytest.approx(1.0, abs=1e-12)
+    assert system.least_jacobian(moved)[0] == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("poisson", [0.2, 0.47])
@@ -130,7 +131,6 @@ def test_the_same_law_gives_the_same_equations(own: str) -> None:
     u = 0.2 * np.random.default_rng(0).normal(size=tets.points.shape)
     one, other = theirs.state(u), ours.state(u)
     assert one.energy == pytest.approx(other.energy, rel=1e-10)
-    assert one.jacobian == pytest.approx(other.jacobian, rel=1e-10)
     np.testing.assert_allclose(one.force, other.force, atol=1e-9 * np.abs(other.force).max())
 
 

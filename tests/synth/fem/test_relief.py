@@ -5,7 +5,7 @@ import pytest
 from dome import ANATOMY
 
 from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.element import face_shape, jacobians, quality
+from synth.fem.mesh.element import jacobians, quality, shape
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 
@@ -27,7 +27,7 @@ def gap(tets: Tets, height: HeightMap) -> float:
     middle = tets.points[faces[:, :3]].mean(axis=1)
     near = faces[np.hypot(middle[:, 0] - 1.0, middle[:, 1] - 2.0) < 4.0]
     bary = np.random.default_rng(0).dirichlet(np.ones(3), 40)
-    at = np.einsum("qn,fnd->fqd", face_shape(bary), tets.points[near]).reshape(-1, 3)
+    at = np.einsum("qn,fnd->fqd", shape(bary), tets.points[near]).reshape(-1, 3)
     wanted = height.over(lambda xy: tetrahedra.dome(xy, ANATOMY.dome_mm))(at[:, :2])
     return float(np.sqrt(np.mean((at[:, 2] - wanted) ** 2)))
 
