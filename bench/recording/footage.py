@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 
 from bench.recording.folder import Recording
-from synth.arrays import Floats
+from synth.arrays import Floats, Map
 from synth.errors import UserError
-from synth.flow.estimator import Map
 from synth.flow.stereo import calibration
 from synth.flow.stereo.rig import StereoRig
 from synth.recording_flow.decode import Footage

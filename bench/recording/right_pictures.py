@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from bench.recording.stereo_timing import StereoTiming
+from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow import image, mask_detection
-from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
 from synth.recording_flow import stereo
@@ -48,9 +48,9 @@ class RightPictures:
     def __init__(self, video: VideoPass) -> None:
         self._video = video
         self._timing: StereoTiming | None = None
-        self._last: tuple[Rgb, Rgb] | None = None
+        self._last: tuple[Pixels, Pixels] | None = None
         self._copied, self._frozen, self._largest = True, 0, 0
-        self._tool: tuple[Flags, Rgb, Rgb] | None = None  # the largest tool mask, and its frame's pictures
+        self._tool: tuple[Mask, Pixels, Pixels] | None = None  # largest tool mask, and its frame's pictures
 
     def add(self, frame: FrameMotion) -> None:
         """Adds a frame; one without a right picture is ignored."""
@@ -110,6 +110,6 @@ class RightPictures:
         return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
 
 
-def _change(one: Rgb, other: Rgb) -> float:
+def _change(one: Pixels, other: Pixels) -> float:
     """Mean difference of two pictures [grey levels]."""
     return float(cv2.absdiff(np.ascontiguousarray(one), np.ascontiguousarray(other)).mean())

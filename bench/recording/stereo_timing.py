@@ -11,9 +11,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from synth.arrays import Floats, Map, Pixels
+from synth.arrays import Floats, Map, Mask, Pixels
 from synth.flow import image
-from synth.flow.estimator import Flags, Rgb
 from synth.flow.stereo.track import StereoTracker
 
 Motion = Floats  # (T, P, 2) px of P points since the rest frame, the first; NaN: not tracked
@@ -31,7 +30,7 @@ _LEAST_FRAMES = 4  # from the end of the video
 class StereoTiming:
     """Tracks the tissue's corners in both cameras."""
 
-    def __init__(self, stereo: StereoTracker, left: Rgb, right: Rgb, usable: Flags) -> None:
+    def __init__(self, stereo: StereoTracker, left: Pixels, right: Pixels, usable: Mask) -> None:
         """The rest pictures (H, W, 3); `usable`: (H, W) tissue in the left picture."""
         self._rectified = r = stereo.rectified
         self._rest = [self._picture(rgb, camera) for camera, rgb in enumerate((left, right))]
@@ -47,7 +46,7 @@ class StereoTiming:
         self._moved: list[list[Map]] = [[np.zeros_like(at)] for _ in range(2)]
         self._time_s = [0.0]
 
-    def add(self, left: Rgb, right: Rgb, time_s: float) -> None:
+    def add(self, left: Pixels, right: Pixels, time_s: float) -> None:
         """Adds the next frame's pictures (H, W, 3)."""
         if len(self._at[0]) < _LEAST_POINTS:
             return
@@ -69,7 +68,7 @@ class StereoTiming:
         step_s = float(np.median(np.diff(self._time_s)))
         return lag * step_s, self._time_s[since] if since > _LEAST_FRAMES else None
 
-    def _picture(self, rgb: Rgb, camera: int) -> Pixels:
+    def _picture(self, rgb: Pixels, camera: int) -> Pixels:
         """Local contrast of the rectified picture, (H, W)."""
         grey = cv2.GaussianBlur(self._rectified.picture(rgb @ image.GREY, camera), (0, 0), 1)
         return image.local_contrast(grey, _WINDOW)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from synth.arrays import Mask
 from synth.flow.confidence import LOW_CONFIDENCE
-from synth.flow.estimator import Flags
 from synth.publish.picture import Rgb, arrow_gain, arrows, framed, legible, overlay, tile
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -17,7 +17,7 @@ _TISSUE, _MASKED = (60, 230, 90), (230, 40, 220)
 _LEGEND = "green: tissue; magenta: masked; arrows: trusted motion"
 
 
-def draw_tracking(frames: Sequence[FrameMotion], tissue: Flags, shrink: int) -> Rgb:
+def draw_tracking(frames: Sequence[FrameMotion], tissue: Mask, shrink: int) -> Rgb:
     """The rest frame, the frame with the largest motion and three others, in order: (H, W, 3).
 
     Args:

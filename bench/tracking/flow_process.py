@@ -16,7 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
 
-from synth.flow.estimator import Flags, Rgb
+from synth.arrays import Mask, Pixels
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
@@ -36,11 +36,11 @@ class FlowProcess(LocalFlow):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
         """See `LocalFlow`."""
         self._pool.submit(_begin, backend, rest, proposal, tissue).result()
 
-    def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
+    def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
         """See `LocalFlow`."""
         return self._pool.submit(_step, rgb, proposal)
 
@@ -77,10 +77,10 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
+def _begin(backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
     _flow.begin(backend, rest, proposal, tissue)
 
 
-def _step(rgb: Rgb, proposal: Proposal) -> FrameMotion:
+def _step(rgb: Pixels, proposal: Proposal) -> FrameMotion:
     frame = _flow.submit(rgb, proposal).result()
     return replace(frame, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)

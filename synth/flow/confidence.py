@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from synth.arrays import Map
 from synth.flow import image
-from synth.flow.estimator import Map
 
 LOW_CONFIDENCE = 0.3  # a visible pixel below it counts as lost: its standard deviation is above 0.76 px
 _WINDOW = 4.0  # px, standard deviation of the window over which pictures are correlated
@@ -35,14 +35,10 @@ def add_deviation(confidence: Map, deviation_px: float) -> Map:
 
 
 def agreement(pictures: image.Level, warped: Tensor, visible: Tensor) -> Tensor:
-    """Local correlation of the rest frame with the warped frame; 0 where either is masked or blank.
+    """Local correlation (B, 1, H, W) in 0..1 of the rest frame with the warped frame; 0 where either is
+    masked or blank.
 
-    Args:
-        pictures: the finest level.
-        warped, visible: (B, 1, H, W), see `image.warp`.
-
-    Returns:
-        (B, 1, H, W) in 0..1.
+    `pictures`: the finest level; `warped`, `visible`: (B, 1, H, W), see `image.warp`.
     """
     mask = pictures.rest_usable * visible
     first, second = pictures.rest * mask, warped * mask

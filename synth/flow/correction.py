@@ -16,17 +16,15 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from synth.arrays import Array, Map, Mask, Pixels
 from synth.flow import kernels
-from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import GREY
 from synth.system.jit import vectorised
 
@@ -98,13 +96,10 @@ def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> Corr
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
-def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tuple[Flow, Map]:
-    """Corrects a flow; returns it (H, W, 2) px and the standard deviation of a component (H, W) px.
+def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
+    """The corrected flow (H, W, 2) px, and the standard deviation (H, W) px of a component.
 
-    Args:
-        net: the network.
-        features: (CHANNELS, h, w), see `describe`.
-        flow: (H, W, 2) px, the flow that the features describe.
+    `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px.
     """
     height, width = flow.shape[:2]
     small = predict(net, features).transpose(1, 2, 0)
@@ -115,22 +110,22 @@ def correct(net: CorrectionNet, features: NDArray[np.float32], flow: Flow) -> tu
     return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
 
 
-def predict(net: CorrectionNet, features: NDArray[np.float32]) -> NDArray[np.float32]:
+def predict(net: CorrectionNet, features: Map) -> Map:
     """Output (2 parts, h', w') of the network for features (channels, h, w), with its padding."""
     with torch.inference_mode():
         cells = torch.from_numpy(padded(features))[None]
         return np.asarray(net(cells.to(memory_format=torch.channels_last))[0])
 
 
-def padded(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+def padded(cells: Map) -> Map:
     """Pads (..., h, w) with zeros to the right and below to multiples of 8 cells."""
     spare = [(0, 0)] * (cells.ndim - 2) + [(0, -n % _MULTIPLE) for n in cells.shape[-2:]]
     return np.pad(cells, spare)
 
 
 def describe(
-    rest: Rgb, now: Rgb, rest_usable: Flags, greys: tuple[Map, Map], visible: Map, flow: Flow, agreed: Map
-) -> NDArray[np.float32]:
+    rest: Pixels, now: Pixels, rest_usable: Mask, greys: tuple[Map, Map], visible: Map, flow: Map, agreed: Map
+) -> Map:
     """`FEATURES` (CHANNELS, h, w) float32 of a frame and its flow on cells of 4 x 4 px.
 
     Args:
@@ -166,7 +161,7 @@ def describe(
     return np.stack(rows).astype(np.float32)
 
 
-def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
+def means(*planes: Array) -> Map:
     """Means (C, h, w) over cells of planes (H, W); at the border the last row or column is repeated."""
     height, width = planes[0].shape
     spare, size = (0, -height % CELL, 0, -width % CELL), (-(-width // CELL), -(-height // CELL))
@@ -177,7 +172,7 @@ def means(*planes: NDArray[Any]) -> NDArray[np.float32]:
     return np.stack(small)
 
 
-def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+def _steps(products: Map, side: int) -> Map:
     """Lucas and Kanade's steps over windows of `side` cells, from `PRODUCTS` (20, h, w) of `sum_cells`.
 
     Returns (2, 3, h, w), from greys and from colours: x and y [px], and a measure of their certainty.
@@ -198,7 +193,7 @@ def _steps(products: NDArray[np.float32], side: int) -> NDArray[np.float32]:
 
 
 @vectorised
-def sum_cells(colours: NDArray[np.uint8], greys: Map, mask: Map, sums: NDArray[np.float32]) -> None:
+def sum_cells(colours: Pixels, greys: Map, mask: Map, sums: Map) -> None:
     """Sums products of two aligned pictures (2, 3, H, W) and their greys (2, H, W) over cells.
 
     Writes to `sums` (28, h, w): `PRODUCTS` of the greys and of the ratio of green to red, which is free of

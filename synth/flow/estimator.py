@@ -4,24 +4,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from synth.arrays import Map, Mask, Pixels
 from synth.errors import as_user_error
 from synth.plugins import ESTIMATORS, check_answer
-
-Rgb = NDArray[np.uint8]  # (H, W, 3), sRGB
-Flags = NDArray[np.bool_]  # (H, W)
-Flow = NDArray[np.float32]  # (H, W, 2) px: x right, y down
-Map = NDArray[np.float32]  # (H, W)
 
 
 class Estimator(Protocol):
     """Displacement of material points between two pictures."""
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
+    ) -> tuple[Map, Map]:
         """Flow from `rest` to `now` at the pixel centres of `rest`.
 
         Args:
@@ -44,8 +37,8 @@ class CheckedEstimator:
         self._estimator, self._label = estimator, label
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
+    ) -> tuple[Map, Map]:
         """See `Estimator`."""
         with as_user_error(self._label):
             flow, confidence = self._estimator.flow(rest, now, rest_usable, now_usable, initial)
@@ -55,10 +48,9 @@ class CheckedEstimator:
 
 
 def create(backend: str | Estimator) -> Estimator:
-    """Returns an estimator: built in, from the entry-point group `sulcus.flow`, or the object passed.
+    """An estimator: built in, from the entry-point group `sulcus.flow`, or the object passed.
 
-    Raises:
-        UserError: no estimator has that name, or the package of a plug-in does not load.
+    Raises UserError if no estimator has that name, or the package of a plug-in does not load.
     """
     if not isinstance(backend, str):
         kind = type(backend)

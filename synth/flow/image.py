@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
+from synth.arrays import Map, Mask, Pixels
 from synth.flow import kernels
 
 # Luminance from red, green and blue: vessels have most contrast in green, averaging reduces noise.
@@ -23,7 +23,7 @@ _WINDOW = 6.5  # px, standard deviation of the window of `normalise`
 _FLOOR = 3.0  # grey levels added to the local deviation, so that noise is not amplified to full contrast
 
 
-def local_contrast(grey: NDArray[np.float32], window: tuple[int, int]) -> NDArray[np.uint8]:
+def local_contrast(grey: Map, window: tuple[int, int]) -> Pixels:
     """Local contrast (H, W), centred at 128, of a picture (H, W) in grey levels: no gain, no offset."""
     detail = grey - cv2.blur(grey, window)
     # Rounding in the running sums of a blur can make the variance of a blank picture negative.
@@ -41,14 +41,14 @@ class Level:
     now_usable: Tensor
 
 
-def tensor(picture: NDArray[np.uint8]) -> Tensor:
+def tensor(picture: Pixels) -> Tensor:
     """Luminance of (H, W, 3) or (B, H, W, 3) uint8 RGB in grey levels: (B, 1, H, W)."""
     rgb = torch.from_numpy(np.ascontiguousarray(picture)).float()
     grey = rgb @ torch.from_numpy(GREY)
     return grey.reshape(-1, 1, *grey.shape[-2:])
 
 
-def flags(mask: NDArray[np.bool_]) -> Tensor:
+def flags(mask: Mask) -> Tensor:
     """(H, W) or (B, H, W) bool as (B, 1, H, W)."""
     wide = torch.from_numpy(np.ascontiguousarray(mask)).float()
     return wide.reshape(-1, 1, *wide.shape[-2:])
@@ -87,16 +87,10 @@ def doubled(field: Tensor, like: Tensor) -> Tensor:
 
 
 def normalise(grey: Tensor, usable: Tensor) -> Tensor:
-    """Local contrast normalisation: (I - mean) / (deviation + floor) over usable neighbours only.
+    """Local contrast normalisation (I - mean) / (deviation + floor) of grey levels (B, 1, H, W) over usable
+    neighbours only: local standard deviations, 0 at masked pixels.
 
     It removes gains and offsets that vary more slowly than the window, such as drifting illumination.
-
-    Args:
-        grey: (B, 1, H, W), grey levels.
-        usable: (B, 1, H, W) in 0..1.
-
-    Returns:
-        (B, 1, H, W), in local standard deviations; 0 at masked pixels.
     """
     # Centring at 128 avoids cancellation in the difference of squares.
     centred = (grey - 128.0) * usable
@@ -108,14 +102,9 @@ def normalise(grey: Tensor, usable: Tensor) -> Tensor:
 
 
 def fill(field: Tensor, usable: Tensor) -> Tensor:
-    """Fills masked pixels from around by push-pull (Gortler et al., The Lumigraph, 1996, sec. 3.5).
+    """A field (B, C, H, W) whose masked pixels are filled from around; zeros if no pixel is usable.
 
-    Args:
-        field: (B, C, H, W).
-        usable: (B, 1, H, W) in 0..1; where it is 1 the field stays as it is.
-
-    Returns:
-        (B, C, H, W); zeros if no pixel is usable.
+    Push-pull (Gortler et al., The Lumigraph, 1996, sec. 3.5). Where `usable` is 1 the field stays as it is.
     """
     known = field * usable
     if min(field.shape[-2:]) <= 2:
@@ -129,13 +118,8 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
 
 
 def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples `now` at x + w (bicubic). Also returns 1 where all pixels read are usable and inside, else 0.
-
-    Args:
-        now: (1, 1, H, W).
-        usable: (1, 1, H, W) in 0..1.
-        flow: w, (1, 2, H, W) px.
-    """
+    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and 1 where all pixels
+    read are usable and inside, else 0."""
     out = np.empty((2, 1, 1, *now.shape[-2:]), np.float32)
     one, known, by = (field.contiguous().numpy() for field in (now[0, 0], usable[0, 0], flow[0]))
     kernels.warp_into(one, known, by, out[0, 0, 0], out[1, 0, 0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from synth.flow.estimator import Map
+from synth.arrays import Map
 from synth.system.jit import vectorised
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Mask, Pixels
 from synth.flow import toolnet
 
 # Chosen by hand on renders and photographs of cortex; `mask_selection` rejects false positives.
@@ -20,7 +20,7 @@ _INSET_PX = 5  # px of the downsampled picture, kernel by which the outline is e
 _SHRINK = 4  # factor of downsampling for the local median
 
 
-def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
+def glare(rgb: Pixels, dilate_px: int = 1) -> Mask:
     """Mask (H, W) of the specular highlights of `rgb` (H, W, 3) uint8, grown by `dilate_px`.
 
     A highlight is much brighter than the local median. Brightness is that of the darkest channel, because a
@@ -40,7 +40,7 @@ def glare(rgb: NDArray[np.uint8], dilate_px: int = 1) -> NDArray[np.bool_]:
     return _grow(bright, dilate_px)
 
 
-def tool(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def tool(rgb: Pixels) -> Mask:
     """Instrument mask (H, W) of `rgb` (H, W, 3) uint8, grown by 2 px.
 
     It joins the output of the U-Net of `toolnet`, trained on rendered instruments, with grey bodies (steel)
@@ -49,7 +49,7 @@ def tool(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return _grow(both(rgb, toolnet.load()), 2)
 
 
-def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
+def both(rgb: Pixels, net: toolnet.ToolNet) -> Mask:
     """Instrument mask (H, W): pixels of high probability, and whole grey bodies of some probability."""
     probable = toolnet.probability(net, rgb)
     count, label = cv2.connectedComponents(grey_bodies(rgb).astype(np.uint8))
@@ -60,12 +60,12 @@ def both(rgb: NDArray[np.uint8], net: toolnet.ToolNet) -> NDArray[np.bool_]:
     return np.asarray((probable > 0.5) | keep[label], bool)
 
 
-def blocked(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def blocked(rgb: Pixels) -> Mask:
     """Mask (H, W) of the specular highlights and instruments found in `rgb` (H, W, 3) uint8."""
     return np.asarray(glare(rgb) | tool(rgb), bool)
 
 
-def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
+def cortex(rgb: Pixels, mm_per_px: float) -> Mask:
     """Mask (H, W) of the exposed cortex in a picture (H, W, 3) sRGB.
 
     Pixels that resemble the middle of the picture more than its edge (C. Rother et al., "GrabCut", 2004),
@@ -90,12 +90,12 @@ def cortex(rgb: NDArray[np.uint8], mm_per_px: float) -> NDArray[np.bool_]:
     return np.asarray(cv2.resize(found, rgb.shape[1::-1]) > 0)
 
 
-def hidden(video: NDArray[np.uint8], tools: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def hidden(video: Pixels, tools: Mask) -> Mask:
     """Masks (T, H, W) of a video (T, H, W, 3): given instrument masks joined with the detected glare."""
     return np.asarray(tools | np.stack([glare(picture) for picture in video]), bool)
 
 
-def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def grey_bodies(rgb: Pixels) -> Mask:
     """Mask (H, W) of connected pixels of little colour that touch the border and cover 0.3% of it."""
     red, green, blue = cv2.split(rgb)
     top = np.maximum(np.maximum(red, green), blue)
@@ -112,7 +112,7 @@ def grey_bodies(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return np.asarray(keep[label], bool)
 
 
-def _grow(found: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+def _grow(found: Mask, by_px: int) -> Mask:
     wide = 2 * by_px + 1
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide))
     return np.asarray(cv2.dilate(found.astype(np.uint8), element), bool)

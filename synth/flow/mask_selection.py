@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from synth.arrays import Floats, Map, Mask, Pixels
 from synth.flow import image
-from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb
+from synth.flow.estimator import Estimator
 from synth.flow.track import Solution, Tracker
 
 
@@ -45,11 +46,11 @@ SELECTION = SelectionConstants()
 class Proposal:
     """Masks (H, W) of what may not be tissue in a picture, and of what is certainly not."""
 
-    glare: Flags
-    tool: Flags
-    known: Flags  # always masked
+    glare: Mask
+    tool: Mask
+    known: Mask  # always masked
 
-    def within(self, tissue: Flags) -> Proposal:
+    def within(self, tissue: Mask) -> Proposal:
         """The same without a kind that covers an implausible share of the tissue."""
         most = SELECTION.largest * np.count_nonzero(tissue)
         glare, tool = (
@@ -59,7 +60,7 @@ class Proposal:
         return replace(self, glare=glare, tool=tool)
 
     @property
-    def either(self) -> Flags:
+    def either(self) -> Mask:
         """(H, W) glare or tool."""
         return self.glare | self.tool
 
@@ -78,7 +79,7 @@ class SelectingTracker:
     Masks are selected at the first motion, when motion grows, at new proposals, and when a frame is lost.
     """
 
-    def __init__(self, backend: str | Estimator, rest: Rgb, found: Proposal, tissue: Flags) -> None:
+    def __init__(self, backend: str | Estimator, rest: Pixels, found: Proposal, tissue: Mask) -> None:
         """Starts at the rest frame with proposals `found`, none of them masked; otherwise as `Tracker`."""
         self.tracker = Tracker(backend, rest, found.known, tissue)
         self.rest_found = found.within(tissue)
@@ -97,7 +98,7 @@ class SelectingTracker:
         """Whether the last frame could be tracked."""
         return self.tracker.trusted
 
-    def step(self, frame: Rgb, found: Proposal) -> tuple[Flow, Map]:
+    def step(self, frame: Pixels, found: Proposal) -> tuple[Map, Map]:
         """As `Tracker.step`, with the proposals `found` in the frame."""
         tracker = self.tracker
         found = found.within(tracker.tissue)
@@ -124,13 +125,13 @@ class SelectingTracker:
         stay = self.rest_found.glare & found.glare
         return flow, np.where(stay, np.minimum(confidence, np.float32(tracker.last.level)), confidence)
 
-    def _select(self, frame: Rgb, found: Proposal, first: Solution) -> Solution:
+    def _select(self, frame: Pixels, found: Proposal, first: Solution) -> Solution:
         """Selects masks and returns the solution; the masks are stored unless the frame is lost."""
         tracker, at_rest = self.tracker, self.rest_found
         initial = first.flow if tracker.trusted and self._tested_px > 0 else None
         solved = [(self.rest_blocked, self.blocked, first)]
 
-        def solve(rest: Flags, now: Flags) -> Solution:
+        def solve(rest: Mask, now: Mask) -> Solution:
             for *masks, solution in solved:
                 if np.array_equal([rest, now], masks):
                     return solution
@@ -159,11 +160,11 @@ class SelectingTracker:
         tracker.usable = tracker.tissue & ~self.rest_blocked
         return chosen
 
-    def _motion(self, flow: Flow) -> float:
+    def _motion(self, flow: Map) -> float:
         """90th percentile of the motion over the tissue [px]."""
         return float(np.quantile(np.hypot(*flow.reshape(-1, 2)[self._some].T), 0.9))
 
-    def _judge(self, frame: Rgb, found: Proposal, bare: Flow, full: Flow) -> tuple[Flags, Flags]:
+    def _judge(self, frame: Pixels, found: Proposal, bare: Map, full: Map) -> tuple[Mask, Mask]:
         """Whether to mask each block at rest and in the frame, (number of blocks + 1,) each, by the residuals
         of the flow without masks (`bare`) and with all of them (`full`)."""
         picture = _normalised(frame)
@@ -175,7 +176,7 @@ class SelectingTracker:
         usual = float(residual[common].mean() if common.any() else np.median(residual))
         count = self._verdict.size
 
-        def mean(field: Map, number: NDArray[np.int16], where: Flags) -> NDArray[np.float64]:
+        def mean(field: Map, number: NDArray[np.int16], where: Mask) -> Floats:
             """(2, count): mean of each block and its standard error, which is infinite below two pixels."""
             many = np.bincount(number[where], minlength=count)
             first, second = (np.bincount(number[where], field[where] ** k, count) for k in (1, 2))
@@ -183,7 +184,7 @@ class SelectingTracker:
             variance = np.maximum(second / np.maximum(many, 1) - average**2, 0) / np.maximum(many - 1, 1)
             return np.stack([average, np.where(many > 1, np.sqrt(variance), np.inf)])
 
-        def selected(layers: NDArray[np.int16], local: bool) -> Flags:
+        def selected(layers: NDArray[np.int16], local: bool) -> Mask:
             chosen = np.zeros(count, bool)
             for layer in layers:
                 near = _widened(np.maximum(layer, 0))
@@ -201,14 +202,14 @@ class SelectingTracker:
         return selected(blocks, local=True), selected(moved, local=False)
 
 
-def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Flow) -> Map:
+def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Map) -> Map:
     """(H, W) absolute difference of the aligned pictures [local deviations]."""
     planes = torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))[None]
     warped, _ = image.warp(now, torch.ones_like(now), planes)
     return np.asarray((warped - rest).abs()[0, 0].numpy(), np.float32)
 
 
-def _at_rest(blocks: NDArray[np.int16], flow: Flow) -> NDArray[np.int16]:
+def _at_rest(blocks: NDArray[np.int16], flow: Map) -> NDArray[np.int16]:
     """Block numbers (2, H, W) of the frame now on the pixels of the rest frame; -1 outside the picture."""
     height, width = flow.shape[:2]
     x = np.arange(width, dtype=np.float32) + flow[..., 0]
@@ -223,6 +224,6 @@ def _widened(number: NDArray[np.int16]) -> NDArray[np.int16]:
     return np.asarray(cv2.dilate(number, np.ones((wide, wide), np.uint8)), np.int16)
 
 
-def _normalised(picture: Rgb) -> torch.Tensor:
+def _normalised(picture: Pixels) -> torch.Tensor:
     grey = image.tensor(picture)
     return image.normalise(grey, torch.ones_like(grey))

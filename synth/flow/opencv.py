@@ -7,8 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from synth.arrays import Map, Mask, Pixels
 from synth.flow import image
-from synth.flow.estimator import Flags, Flow, Map, Rgb
 
 _RESIDUAL = 0.6  # local deviations between aligned pictures at which the confidence is 1/e
 _SMALLEST = 16  # px a side that the pyramids of OpenCV's estimators need
@@ -26,8 +26,8 @@ class OpenCvTvl1:
         self.weight, self.warps = weight, warps
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
+    ) -> tuple[Map, Map]:
         """See `Estimator.flow`."""
         solver = _cv2.optflow.DualTVL1OpticalFlow_create(
             tau=0.25,
@@ -50,16 +50,16 @@ class Dis:
     """Dense inverse search, Kroeger et al. (2016), OpenCV's medium preset: fast, less sharp."""
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
+    ) -> tuple[Map, Map]:
         """See `Estimator.flow`."""
         solver = _cv2.DISOpticalFlow_create(_cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         return _solve(solver, rest, now, rest_usable, now_usable, initial)
 
 
 def _solve(
-    solver: Any, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None
-) -> tuple[Flow, Map]:
+    solver: Any, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None
+) -> tuple[Map, Map]:
     height, width = rest_usable.shape
     before, after = _prepare(rest, rest_usable), _prepare(now, now_usable)
     start = np.zeros((height, width, 2), np.float32) if initial is None else initial.astype(np.float32)
@@ -73,7 +73,7 @@ def _solve(
     return flow, _confidence(flow, before[:height, :width], after[:height, :width], rest_usable, now_usable)
 
 
-def _prepare(picture: Rgb, usable: Flags) -> Rgb:
+def _prepare(picture: Pixels, usable: Mask) -> Pixels:
     """Contrast-normalised picture (H, W) uint8 centred at 128, with masked pixels filled."""
     known = image.flags(usable)
     contrast = image.normalise(image.tensor(picture), known)
@@ -81,7 +81,7 @@ def _prepare(picture: Rgb, usable: Flags) -> Rgb:
     return np.clip(np.round(128 + image.GREY_PER_DEVIATION * filled), 0, 255).astype(np.uint8)
 
 
-def _confidence(flow: Flow, before: Rgb, after: Rgb, rest_usable: Flags, now_usable: Flags) -> Map:
+def _confidence(flow: Map, before: Pixels, after: Pixels, rest_usable: Mask, now_usable: Mask) -> Map:
     """(H, W) in 0..1: agreement of the aligned pictures; 0 where a point is masked in either."""
     height, width = rest_usable.shape
     x = np.arange(width, dtype=np.float32) + flow[..., 0]

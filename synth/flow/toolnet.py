@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from synth.arrays import Map, Pixels
 
 WEIGHTS = Path(__file__).with_name("toolnet.pt")
 SIDE = 160  # px, longer side of the input
@@ -46,7 +47,7 @@ class ToolNet(nn.Module):
         return logits
 
 
-def prepare(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def prepare(rgb: Pixels) -> Map:
     """Network input (3, h, w) float32 of (H, W, 3) uint8: longer side 160 px, mean 0, deviation 1."""
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)
@@ -65,7 +66,7 @@ def load() -> ToolNet:
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 
-def probability(net: ToolNet, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def probability(net: ToolNet, rgb: Pixels) -> Map:
     """Probability (H, W) float32 that a pixel of `rgb` (H, W, 3) uint8 shows an instrument."""
     height, width = rgb.shape[:2]
     share = SIDE / max(height, width)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import mask_detection
 from synth.flow.confidence import LOW_CONFIDENCE
-from synth.flow.estimator import Estimator, Flags, Flow, Map, Rgb, create
+from synth.flow.estimator import Estimator, create
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ TRACKING = TrackingConstants()
 class Track:
     """Recovered displacement of a sequence."""
 
-    flow: NDArray[np.float32]
+    flow: Map
     """(T, H, W, 2) px, rest frame to frame t, on the rest frame's pixels; 0 outside the tissue."""
-    confidence: NDArray[np.float32]
+    confidence: Map
     """(T, H, W) in 0..1; 0 outside the tissue, under the tool and in glare."""
-    trusted: NDArray[np.bool_]
+    trusted: Mask
     """(T,), False where a frame could not be tracked."""
 
 
@@ -44,7 +44,7 @@ class Track:
 class Solution:
     """One flow of a frame."""
 
-    flow: Flow  # (H, W, 2) px
+    flow: Map  # (H, W, 2) px
     confidence: Map  # (H, W) in 0..1; 0 outside the tissue and where it is masked
     level: float  # mean confidence over the unmasked tissue
     is_matched: bool  # whether enough of the unmasked tissue is above `LOW_CONFIDENCE`
@@ -59,7 +59,7 @@ class Tracker:
     and the better flow is used, so that tracking recovers after a lost frame.
     """
 
-    def __init__(self, backend: str | Estimator, rest: Rgb, rest_blocked: Flags, tissue: Flags) -> None:
+    def __init__(self, backend: str | Estimator, rest: Pixels, rest_blocked: Mask, tissue: Mask) -> None:
         """Starts at the rest frame.
 
         Args:
@@ -77,21 +77,17 @@ class Tracker:
         self.trusted = True  # whether the last frame could be tracked
         self.resets = 0  # frames whose flow from zero was the better one
         self.last: Solution | None = None  # of the last frame
-        self.initial: Flow | None = None  # (H, W, 2) px from which the next frame starts; None: zero
-        self.unsure: Flags = np.zeros_like(tissue)  # (H, W) left out of the mean confidence
+        self.initial: Map | None = None  # (H, W, 2) px from which the next frame starts; None: zero
+        self.unsure: Mask = np.zeros_like(tissue)  # (H, W) left out of the mean confidence
         self._level = 1.0  # mean confidence of the last trusted frame
         self._around, self._tries = ~tissue & ~rest_blocked, 0
         self.widened = False  # whether the surroundings are tracked together with the tissue
 
-    def step(self, frame: Rgb, blocked: Flags) -> tuple[Flow, Map]:
-        """Returns flow (H, W, 2) px and confidence (H, W) of the next frame; sets `trusted`.
+    def step(self, frame: Pixels, blocked: Mask) -> tuple[Map, Map]:
+        """Flow (H, W, 2) px and confidence (H, W) of the next frame (H, W, 3) uint8; sets `trusted`.
 
-        Args:
-            frame: (H, W, 3) uint8.
-            blocked: (H, W), its instrument and glare masks.
-
-        Raises:
-            UserError: the shapes differ from those of the rest frame.
+        `blocked`: (H, W), its instrument and glare masks. Raises UserError if shapes differ from the rest
+        frame's.
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
@@ -104,7 +100,7 @@ class Tracker:
             found = self._wider(frame, blocked, found)
         return self.accept(found)
 
-    def _wider(self, frame: Rgb, blocked: Flags, found: Solution) -> Solution:
+    def _wider(self, frame: Pixels, blocked: Mask, found: Solution) -> Solution:
         """Includes the surroundings, here and in all later frames, if confidence in the tissue rises enough.
 
         Still surroundings stabilise the flow of tissue with little texture; otherwise they bias its rim.
@@ -116,7 +112,7 @@ class Tracker:
         self.widened = wider.level > found.level + TRACKING.wider
         return wider if self.widened else found
 
-    def solve(self, frame: Rgb, blocked: Flags, initial: Flow | None) -> Solution:
+    def solve(self, frame: Pixels, blocked: Mask, initial: Map | None) -> Solution:
         """Solves a frame from a flow `initial` (None: zero) without changing the state; see `step`."""
         domain = self.usable | self._around if self.widened else self.usable
         flow, confidence = self.estimator.flow(self.rest, frame, domain, ~blocked, initial)
@@ -138,7 +134,7 @@ class Tracker:
         """Whether the confidence of a flow is low, alone or relative to the last trusted frame."""
         return found.level < max(TRACKING.low, TRACKING.drop * self._level)
 
-    def accept(self, found: Solution) -> tuple[Flow, Map]:
+    def accept(self, found: Solution) -> tuple[Map, Map]:
         """Makes a solution that of the frame; the next frame starts from it if it is trusted."""
         self.last, self.trusted = found, found.is_visible and found.is_matched
         if self.trusted:
@@ -147,12 +143,7 @@ class Tracker:
         return found.flow * self.tissue[..., None], sure
 
 
-def recover_flow(
-    frames: NDArray[np.uint8],
-    tool: NDArray[np.bool_],
-    tissue: Flags,
-    backend: str | Estimator = "tvl1",
-) -> Track:
+def recover_flow(frames: Pixels, tool: Mask, tissue: Mask, backend: str | Estimator = "tvl1") -> Track:
     """Displacement through a video with known instrument masks; specular highlights are detected.
 
     Args:
@@ -173,9 +164,7 @@ def recover_flow(
     return track(backend, frames, mask_detection.hidden(frames, tool), tissue)
 
 
-def track(
-    backend: str | Estimator, frames: NDArray[np.uint8], blocked: NDArray[np.bool_], tissue: Flags
-) -> Track:
+def track(backend: str | Estimator, frames: Pixels, blocked: Mask, tissue: Mask) -> Track:
     """As `recover_flow`, with masks (T, H, W) of everything that is not tissue."""
     tracker = Tracker(backend, frames[0], blocked[0], tissue)
     flow = np.zeros((*frames.shape[:3], 2), np.float32)

@@ -27,8 +27,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from synth.arrays import Map, Mask, Pixels
 from synth.flow import confidence, correction, image, kernels
-from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.image import Level
 from synth.system.jit import vectorised
 
@@ -89,8 +89,8 @@ class Tvl1:
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
 
     def flow(
-        self, rest: Rgb, now: Rgb, rest_usable: Flags, now_usable: Flags, initial: Flow | None = None
-    ) -> tuple[Flow, Map]:
+        self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
+    ) -> tuple[Map, Map]:
         """See `Estimator.flow`."""
         with torch.inference_mode(), one_thread():
             start = None
@@ -175,13 +175,8 @@ def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
 
 
 def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tensor:
-    """Solves for the flow (B, 2, H, W) px of the finest level.
-
-    Args:
-        levels: fine to coarse.
-        initial: (B, 2, H, W) px at the finest level, or None.
-        s: settings.
-    """
+    """Flow (B, 2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result, or
+    None."""
     coarsest = levels[-1].now
     flow = coarsest.new_zeros(coarsest.shape[0], 2, *coarsest.shape[-2:])
     weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
@@ -313,16 +308,11 @@ def new_state(height: int, width: int) -> Map:
 
 @vectorised
 def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
-    """`steps` of Chambolle and Pock's algorithm 1, in place.
+    """`steps` of Chambolle and Pock's algorithm 1 on a flow (2, H, W) px, in place.
 
     A row of step k depends only on this row and the next of step k - 1. All steps therefore go down the
-    picture together, each one row behind the previous one, so that shared rows stay in the cache.
-
-    Args:
-        flow: (2, H, W) px.
-        state: see `new_state`.
-        tau: primal step; the dual step sigma is 1 / (8 tau).
-        steps: number of steps.
+    picture together, each one row behind the previous one, so that shared rows stay in the cache. `state`:
+    see `new_state`; `tau`: primal step; the dual step sigma is 1 / (8 tau).
     """
     height, width = flow.shape[1:]
     wide = state.shape[2] - _LANES

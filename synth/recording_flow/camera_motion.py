@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Map, Mask, Pixels
 from synth.flow import image
-from synth.flow.estimator import Flags, Rgb
 
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
 
@@ -54,23 +52,23 @@ class Similarity:
     deviation_px: float = 0.0  # standard deviation of the shift over the tissue
     length_px: float = 0.0  # root mean square of the shift over the tissue
 
-    def undo(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def undo(self, picture: Pixels) -> Pixels:
         """Resamples a picture (H, W[, C]) uint8 to the view of the camera at rest."""
         x, y = map(_unbiased, self._places(picture.shape))
         return np.asarray(
             cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8
         )
 
-    def outside(self, size: tuple[int, ...]) -> Flags:
+    def outside(self, size: tuple[int, ...]) -> Mask:
         """Mask (H, W) of the pixels of the rest frame that are outside the moved picture."""
         x, y = self._places(size)
         return (x < 0) | (y < 0) | (x > size[1] - 1) | (y > size[0] - 1)
 
-    def _places(self, size: tuple[int, ...]) -> list[NDArray[np.float32]]:
+    def _places(self, size: tuple[int, ...]) -> list[Map]:
         x, y = np.arange(size[1]), np.arange(size[0])[:, None]
         return [(a * x + b * y + c).astype(np.float32) for a, b, c in self.matrix]
 
-    def steady(self, flow: NDArray[np.float32]) -> NDArray[np.float32]:
+    def steady(self, flow: Map) -> Map:
         """Removes the camera motion from a flow (H, W, 2) px from the rest frame."""
         y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
         back = cv2.invertAffineTransform(self.matrix).astype(np.float32)
@@ -137,7 +135,7 @@ def describe_course(course: Course, shrink: int) -> str:
 class CameraTracker:
     """Estimates the camera motion since the rest frame, frame by frame."""
 
-    def __init__(self, rest: Rgb, tissue: Flags, blocked: Flags) -> None:
+    def __init__(self, rest: Pixels, tissue: Mask, blocked: Mask) -> None:
         """Starts at the rest frame (H, W, 3); masks (H, W): `tissue` may deform; `blocked`: tool, glare."""
         self._basis = SimilarityBasis(tissue.shape)
         self._rest = _contrast(rest)
@@ -152,7 +150,7 @@ class CameraTracker:
         self._unknown_s: list[float] = []
         self._course: Course = []
 
-    def find(self, rgb: Rgb, time_s: float | None) -> Similarity | None:
+    def find(self, rgb: Pixels, time_s: float | None) -> Similarity | None:
         """Camera motion in a frame (H, W, 3) uint8; None: none since the rest frame.
 
         Where it cannot be estimated, that of the previous frame.
@@ -191,13 +189,13 @@ class CameraTracker:
         """Median step from frame to frame [px]."""
         return float(np.median([step for *_, step in self._course]))
 
-    def _jump(self, now: NDArray[np.uint8]) -> Floats:
+    def _jump(self, now: Pixels) -> Floats:
         """Shift (2, 3) of the whole picture, of any length, by phase correlation."""
         first, second = (one.astype(np.float32) for one in (self._rest, now))
         shift, _ = cv2.phaseCorrelate(first, second, cv2.createHanningWindow(now.shape[::-1], cv2.CV_32F))
         return np.column_stack([np.eye(2), shift])
 
-    def _find(self, now: NDArray[np.uint8], near: Similarity) -> Similarity | None:
+    def _find(self, now: Pixels, near: Similarity) -> Similarity | None:
         """Similarity of the surroundings, started at `near`; None: too few corners, or they deform."""
         points = self._points
         if self.is_blind:
@@ -250,20 +248,20 @@ def weigh_outliers(off: Floats, typical: Floats) -> tuple[Floats, float]:
     return np.maximum(1 - (off / (CORNERS.outlier * spread)) ** 2, 0) ** 2, spread
 
 
-def _contrast(rgb: Rgb) -> NDArray[np.uint8]:
+def _contrast(rgb: Pixels) -> Pixels:
     """Local contrast (H, W) of a frame."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return image.local_contrast(cv2.GaussianBlur(grey, (0, 0), CORNERS.smooth_px), CORNERS.window)
 
 
-def _corners(picture: NDArray[np.uint8], where: Flags) -> NDArray[np.float32]:
+def _corners(picture: Pixels, where: Mask) -> Map:
     """Corners (N, 2) px of a picture inside a mask."""
     mask = where.astype(np.uint8) * 255
     found = cv2.goodFeaturesToTrack(picture, CORNERS.corners, 0.01, CORNERS.apart_px, mask=mask, blockSize=7)
     return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
 
 
-def _unbiased(place: NDArray[np.float32]) -> NDArray[np.float32]:
+def _unbiased(place: Map) -> Map:
     """Sampling position at which OpenCV's cubic kernel (a = -3/4) reproduces a ramp at `place` [px].
 
     At a fraction t of a pixel it returns the ramp at t + (a + 1/2) 2 t (1 - t) (2t - 1), up to 0.05 px off.

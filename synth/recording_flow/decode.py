@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from synth.arrays import Mask
 from synth.errors import UserError, as_positive
-from synth.flow.estimator import Flags
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_faults import VideoFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
@@ -47,7 +47,7 @@ class RecordingFlowSettings:
             raise UserError(f"masks: no kind {self.masks!r}; there are {', '.join(MASKS)}")
 
 
-def everywhere(size: Size) -> Flags:
+def everywhere(size: Size) -> Mask:
     """Tissue mask (H, W) that covers the whole picture."""
     return np.ones(size, bool)
 
@@ -58,9 +58,9 @@ class Footage:
 
     pictures: Callable[[], Iterable[Picture]]  # all frames in order, the same in every pass
     name: str  # for messages
-    tissue: Callable[[Size], Flags] = everywhere  # (H, W) tissue mask of the rest frame
+    tissue: Callable[[Size], Mask] = everywhere  # (H, W) tissue mask of the rest frame
     # (H, W) instrument mask of a frame, None: empty; if the function is None, instruments are detected.
-    tool: Callable[[int, Size], Flags | None] | None = None
+    tool: Callable[[int, Size], Mask | None] | None = None
     rest_frame: int = 0
     only: Container[int] | None = None  # numbers of the frames to track, with the rest frame; None: all
     depth: RightVideo | DepthVideo | None = None  # right camera or depth camera, if any
@@ -119,8 +119,9 @@ class Decoder:
         rgb = shrink_picture(picture.rgb, self.rest.shrink)
         if picture.time_s is not None:
             self.faults.add_tracked(picture.time_s, picture.rgb, rgb)
-        none = FrameMotion.none(self.rest.tissue.shape, trusted=not self.rest.fault)
-        return replace(none, index=picture.index, time_s=picture.time_s, rgb=rgb)
+        size = self.rest.tissue.shape
+        none, trusted = (np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)), not self.rest.fault
+        return FrameMotion(*none, trusted, index=picture.index, time_s=picture.time_s, rgb=rgb)
 
     def _decode(self) -> Iterator[Picture]:
         pictures = iter(self._footage.pictures())

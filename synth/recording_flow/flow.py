@@ -6,8 +6,8 @@ import time
 from concurrent.futures import Future
 from dataclasses import replace
 
+from synth.arrays import Mask, Pixels
 from synth.flow.confidence import add_deviation
-from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal, SelectingTracker
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -17,11 +17,11 @@ class LocalFlow:
 
     ahead = 0  # number of frames that may be submitted before the first result is awaited
 
-    def begin(self, backend: str, rest: Rgb, proposal: Proposal, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
         """Starts with the rest frame; arguments and errors as for `SelectingTracker`."""
         self._tracker = SelectingTracker(backend, rest, proposal, tissue)
 
-    def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
+    def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
         """Computes the motion of a frame (h, w, 3); errors as for `SelectingTracker.step`."""
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self._tracker
         flow, confidence = tracker.step(rgb, proposal)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Map, Mask, Pixels
 from synth.flow.confidence import LOW_CONFIDENCE
-from synth.flow.estimator import Flags, Flow, Map
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -38,11 +37,11 @@ LIMITS = Thresholds()
 class ForegroundSearch:
     """Searches frames of a video, in order from the rest frame on."""
 
-    def __init__(self, tissue: Flags, shrink: int) -> None:
+    def __init__(self, tissue: Mask, shrink: int) -> None:
         """`tissue`: (h, w) on the pixels of the frames; `shrink`: their factor of downsampling."""
         self._tissue, self._shrink = tissue, shrink
         self._surface: tuple[Map, float] | None = None
-        self._found: dict[str, list[tuple[float, str, Flags]]] = {}
+        self._found: dict[str, list[tuple[float, str, Mask]]] = {}
         self._masked = ~tissue  # in any frame: masks are often selected only once something moves
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
@@ -79,7 +78,7 @@ class ForegroundSearch:
                 found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
 
-    def _note(self, why: str, where: Flags, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
+    def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
         """Stores the largest component if it has this share of tissue and this extent in picture widths."""
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
@@ -94,14 +93,12 @@ class ForegroundSearch:
             self._found.setdefault(why, []).append((found, text, label == k))
 
 
-def fit_surface(depth_mm: Map, tissue: Flags) -> tuple[Map, float]:
-    """Fits a smooth surface (h, w) mm to the tissue; also returns its deviation from the surface [mm].
+def fit_surface(depth_mm: Map, tissue: Mask) -> tuple[Map, float]:
+    """A smooth surface (h, w) mm fitted to the tissue, a mask (h, w), and the tissue's deviation from it
+    [mm].
 
-    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front.
-
-    Args:
-        depth_mm: (h, w) along the optical axis; NaN: unknown.
-        tissue: (h, w), where the surface is fitted.
+    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front. `depth_mm`:
+    (h, w) along the optical axis; NaN: unknown.
     """
     height, width = depth_mm.shape
     y, x = np.mgrid[:height, :width] / max(height, width) - 0.5
@@ -119,13 +116,13 @@ def fit_surface(depth_mm: Map, tissue: Flags) -> tuple[Map, float]:
     return np.asarray(surface, np.float32), deviation
 
 
-def flow_jump(flow: Flow) -> Map:
+def flow_jump(flow: Map) -> Map:
     """Excess (h, w) px of the change of a flow (h, w, 2) across a place over that on both sides of it.
 
     It is 0 for a linear flow and small for a smooth one, as on elastic tissue; it is large at edges.
     """
 
-    def shifted(dx: float, dy: float) -> Flow:
+    def shifted(dx: float, dy: float) -> Map:
         shift, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), (flow.shape[1], flow.shape[0])
         return np.asarray(cv2.warpAffine(flow, shift, size, borderMode=cv2.BORDER_REPLICATE))
 
@@ -138,5 +135,5 @@ def flow_jump(flow: Flow) -> Map:
     return most
 
 
-def _square(around_px: int) -> NDArray[np.uint8]:
+def _square(around_px: int) -> Pixels:
     return np.ones((2 * around_px + 1, 2 * around_px + 1), np.uint8)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Map, Mask, Pixels
 from synth.recording_flow.finding import Finding
 
 
@@ -39,13 +39,8 @@ _SOME = 5  # most times that a message lists
 _STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise distinguishes two pictures
 
 
-def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
-    """Reason why a picture cannot be tracked; empty if it can.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        tissue: (H, W).
-    """
+def find_fault(rgb: Pixels, tissue: Mask) -> str:
+    """Reason why a picture (H, W, 3) uint8 with a tissue mask (H, W) cannot be tracked; empty if it can."""
     height, width = tissue.shape
     if min(height, width) < LIMITS.side:
         return f"only {width} x {height} px"
@@ -61,7 +56,7 @@ def find_fault(rgb: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> str:
     return ""
 
 
-def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def find_bars(rgb: Pixels) -> Mask:
     """Mask (H, W) of black bars along the borders of a picture (H, W, 3)."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     bars, least = np.zeros(grey.shape, bool), LIMITS.bar * float(np.percentile(grey, 95))
@@ -71,7 +66,7 @@ def find_bars(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return bars & ~bars.all()
 
 
-def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
+def is_inside_out(tissue: Mask) -> bool:
     """Whether a tissue mask (H, W) covers the border of the picture but not its middle."""
     height, width = tissue.shape
     border = np.concatenate([tissue[0], tissue[-1], tissue[:, 0], tissue[:, -1]])
@@ -82,7 +77,7 @@ def is_inside_out(tissue: NDArray[np.bool_]) -> bool:
 class VideoFaults:
     """Faults of the pictures of a video, collected frame by frame."""
 
-    def __init__(self, rgb: NDArray[np.uint8], small: NDArray[np.uint8], tissue: NDArray[np.bool_]) -> None:
+    def __init__(self, rgb: Pixels, small: Pixels, tissue: Mask) -> None:
         """Starts with the rest frame (H, W, 3), also downsampled (h, w, 3), and its tissue mask (h, w)."""
         self._tissue, self._rest_rgb, self._last = tissue, small, rgb[::_STRIDE, ::_STRIDE]
         self.changes = False  # whether a tracked picture differs from the rest frame
@@ -109,7 +104,7 @@ class VideoFaults:
         )
         self._rest = [message for wrong, message in rest if wrong]
 
-    def add_decoded(self, index: int, time_s: float, rgb: NDArray[np.uint8]) -> None:
+    def add_decoded(self, index: int, time_s: float, rgb: Pixels) -> None:
         """Adds a picture (H, W, 3) of the video; every picture in order."""
         one = rgb[::_STRIDE, ::_STRIDE]
         if one.shape == self._last.shape:
@@ -120,7 +115,7 @@ class VideoFaults:
             self._changes.append((float(change.mean()), float(parts.min()), float(np.median(parts))))
         self._last = one
 
-    def add_tracked(self, time_s: float, rgb: NDArray[np.uint8], small: NDArray[np.uint8]) -> None:
+    def add_tracked(self, time_s: float, rgb: Pixels, small: Pixels) -> None:
         """Adds a picture that is tracked, and the same downsampled."""
         self.changes = self.changes or not np.array_equal(small, self._rest_rgb)
         fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
@@ -170,13 +165,13 @@ class VideoFaults:
         return found
 
 
-def _detail(grey: NDArray[np.float32], finer: float, coarser: float) -> NDArray[np.float32]:
+def _detail(grey: Map, finer: float, coarser: float) -> Map:
     """Difference (H, W) of a picture blurred by two Gaussians [px]; a width of 0 means no blur."""
     top = cv2.GaussianBlur(grey, (0, 0), finer) if finer else grey
     return np.asarray(top - cv2.GaussianBlur(grey, (0, 0), coarser), np.float32)
 
 
-def _grid(lines: NDArray[np.float32]) -> float:
+def _grid(lines: Map) -> float:
     """Mean step between columns (H, W) on a grid of 8 px, over the median of the eight possible grids."""
     steps = np.abs(np.diff(lines, axis=1)).mean(axis=0)
     each = [float(steps[k::8].mean()) for k in range(8)]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.flow.estimator import Flags, Rgb
+from synth.arrays import Map, Mask, Pixels
 from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import Similarity
@@ -20,8 +19,8 @@ Size = tuple[int, int]  # height, width [px]
 class RestFrame:
     """The frame to which all motion refers; with it every later stage starts."""
 
-    rgb: Rgb  # (h, w, 3), downsampled
-    tissue: Flags  # (h, w)
+    rgb: Pixels  # (h, w, 3), downsampled
+    tissue: Mask  # (h, w)
     size: Size  # of the video's own pictures
     shrink: int  # factor of downsampling
     time_s: float | None  # on the clock of the video, if known
@@ -37,30 +36,25 @@ class FrameMotion:
     three dimensions; the last one subtracts pulsation.
     """
 
-    flow: NDArray[np.float32]  # (h, w, 2) px
-    confidence: NDArray[np.float32]  # (h, w) in 0..1
+    flow: Map  # (h, w, 2) px
+    confidence: Map  # (h, w) in 0..1
     trusted: bool = True  # whether the frame could be tracked
     reinitialised: bool = False  # tracked only after a start from zero or with other masks
     is_rest: bool = False  # whether this is the rest frame
-    masked: Flags | None = None  # (h, w) mask of the picture; None: empty
-    rest_masked: Flags | None = None  # (h, w) mask of the rest frame used for it; None: empty
+    masked: Mask | None = None  # (h, w) mask of the picture; None: empty
+    rest_masked: Mask | None = None  # (h, w) mask of the rest frame used for it; None: empty
     camera: Similarity | None = None  # camera motion, which is removed from the flow; None: none
     motion: Moved | None = None  # in three dimensions; None: monocular
     index: int = 0  # number in the video
     time_s: float | None = None  # on the clock of the video; only that of the rest frame may be unknown
     # (h, w, 3) the downsampled picture without camera motion.
-    rgb: Rgb = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
-    right: Rgb | None = None  # (h, w, 3) the right camera's picture, likewise; None: no such camera
+    rgb: Pixels = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
+    right: Pixels | None = None  # (h, w, 3) the right camera's picture, likewise; None: no such camera
     proposal: Proposal | None = None  # masks proposed for the picture; None: not yet
     cpu_s: float = 0.0  # of the flow
     wall_s: float = 0.0  # of the flow
     masking_s: float = 0.0  # wall time of downsampling, masking and the estimate of camera motion
     peak_bytes: int = 0  # memory of the flow process, if there is one
-
-    @classmethod
-    def none(cls, size: tuple[int, ...], *, trusted: bool) -> FrameMotion:
-        """Zero motion with zero confidence on (h, w) pixels."""
-        return cls(np.zeros((*size, 2), np.float32), np.zeros(size, np.float32), trusted)
 
 
 @dataclass(eq=False)
@@ -71,10 +65,10 @@ class TrackingSummary:
     lost: int = 0
     reinitialised: int = 0
     masked: float = 0.0  # sum over frames of the masked share of the tissue
-    masked_count: NDArray[np.float32] | None = None  # (h, w) number of frames in which a pixel is masked
-    rest_masked: Flags | None = None  # (h, w) last mask of the rest frame
+    masked_count: Map | None = None  # (h, w) number of frames in which a pixel is masked
+    rest_masked: Mask | None = None  # (h, w) last mask of the rest frame
 
-    def add(self, frame: FrameMotion, tissue: Flags) -> None:
+    def add(self, frame: FrameMotion, tissue: Mask) -> None:
         """Adds a frame other than the rest frame."""
         if self.masked_count is None:
             self.masked_count = np.zeros(tissue.shape, np.float32)

@@ -72,16 +72,16 @@ class Rhythm:
 def find_rhythms(
     t: Floats, coefficients: Floats, basis: Floats
 ) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...]]:
-    """Finds the rhythms of a motion, the strongest first, each in the residual of the previous ones.
+    """Accepted and rejected rhythms of a motion, the strongest first, each in the residual of the previous
+    ones.
+
+    Accepted ones are periodic, predict held-out frames and move the surface evenly; rejected ones are
+    stronger than the last accepted one and must be fitted with it.
 
     Args:
         t: (T,) s.
         coefficients: (T, B, C) of the motion.
         basis: (P, B) polynomials at places of the surface.
-
-    Returns:
-        Accepted rhythms, which are periodic, predict held-out frames and move the surface evenly; and
-        rejected ones that are stronger than the last accepted one and must be fitted with it.
     """
     # In these coordinates the norm is the root mean square of the motion over the places.
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
@@ -108,13 +108,10 @@ def find_rhythms(
 
 
 def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[Rhythm]:
-    """Fits the modes of rhythms of known phase, together with a constant and a drift, by least squares.
+    """Rhythms of known phase with their modes, fitted together with a constant and a drift by least squares.
 
-    Args:
-        t: (T,) s.
-        y: (T, B C) coefficients of the motion, possibly in other coordinates.
-        rhythms: with their phases.
-        back: (B, B) transform from those coordinates.
+    `t`: (T,) s; `y`: (T, B C) coefficients of the motion, possibly in other coordinates, from which `back`
+    (B, B) transforms.
     """
     weights = np.linalg.lstsq(_design(t, rhythms), y, rcond=None)[0]
     modes = np.einsum("ab,kbc->kac", back, weights.reshape(len(weights), len(back), -1))

@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from synth.arrays import Mask, Pixels
 from synth.flow import mask_detection
-from synth.flow.estimator import Flags, Rgb
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.video.read import shrink_mask
 
 
-class Mask:
+class ProposeMasks:
     """Proposes masks, from pictures or from given masks; flow selects among them."""
 
-    def __init__(self, rest: RestFrame, kind: str, tool: Callable[[int, Size], Flags | None] | None) -> None:
+    def __init__(self, rest: RestFrame, kind: str, tool: Callable[[int, Size], Mask | None] | None) -> None:
         """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected."""
         self._rest, self._kind, self._tool = rest, kind, tool
 
@@ -45,7 +45,7 @@ class Mask:
         return Proposal(nothing, nothing, glare | tool | known)
 
 
-def mask_right(rgb: Rgb, kind: str, left: Flags) -> Flags:
+def mask_right(rgb: Pixels, kind: str, left: Mask) -> Mask:
     """Mask (H, W) of tool and specular highlights, detected in the right picture.
 
     `kind`: one of `MASKS`; with `auto` nothing is masked unless something is masked in the left picture.

@@ -30,9 +30,10 @@ from synth.recording_flow.flow import LocalFlow, with_flow
 from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
-from synth.recording_flow.mask import Mask
+from synth.recording_flow.mask import ProposeMasks
 from synth.recording_flow.pulse import PulseEstimate, PulseSearch
 from synth.recording_flow.register_camera import RegisterCamera, RegisterOnTissue
+from synth.recording_flow.stereo import open_camera
 from synth.system.stopwatch import Stopwatch
 from synth.video.read import Picture
 
@@ -121,11 +122,11 @@ class VideoPass:
         self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
-        self._mask = Mask(rest, settings.masks, footage.tool)
+        self._mask = ProposeMasks(rest, settings.masks, footage.tool)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
         path, pulse = (None, None) if known is None else (known.camera, known.pulse)
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
-        self.stereo = None if footage.depth is None else footage.depth.open(rest, settings.masks)
+        self.stereo = None if footage.depth is None else open_camera(footage.depth, rest, settings.masks)
         self._foreground: ForegroundSearch | None = None
         if pace is None and not rest.fault:
             self._foreground = ForegroundSearch(rest.tissue, rest.shrink)

@@ -18,10 +18,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Floats
-from synth.flow.estimator import Flags
+from synth.arrays import Floats, Map, Mask
 from synth.recording_flow.camera_motion import CameraPath
 from synth.recording_flow.harmonic_fit import Rhythm, Span, find_rhythms, fit, visible_rates
 
@@ -52,13 +50,13 @@ class SurfaceMotion:
     dimensions, first along the optical axis, then lateral.
     """
 
-    tissue: Flags  # (h, w)
+    tissue: Mask  # (h, w)
     time_s: list[float] = field(default_factory=list)
-    motion: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c, C) each
-    visible: list[NDArray[np.float32]] = field(default_factory=list)  # (r, c) visible share of each cell
+    motion: list[Map] = field(default_factory=list)  # (r, c, C) each
+    visible: list[Map] = field(default_factory=list)  # (r, c) visible share of each cell
     depth_weight: float = 1.0  # of motion along the axis in the search for rhythms, by its precision
 
-    def add(self, time_s: float, motion: NDArray[np.float32], confidence: NDArray[np.float32]) -> None:
+    def add(self, time_s: float, motion: Map, confidence: Map) -> None:
         """Adds the motion (h, w, C) and confidence (h, w) of a trusted frame."""
         mean, share = in_cells(motion, confidence * self.tissue)
         self.time_s.append(time_s)
@@ -66,9 +64,7 @@ class SurfaceMotion:
         self.visible.append(share)
 
 
-def in_cells(
-    motion: NDArray[np.float32], weight: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def in_cells(motion: Map, weight: Map) -> tuple[Map, Map]:
     """Weighted mean (r, c, C) over cells of a motion (h, w, C), and mean (r, c) of the weight (h, w)."""
     height, width = weight.shape
     size = (CELLS.columns, max(2, round(CELLS.columns * height / width)))
@@ -84,12 +80,12 @@ class PulseEstimate:
     """The rhythms of a recording, in the components of its surface motion."""
 
     rhythms: tuple[Rhythm, ...]
-    basis: NDArray[np.float32]  # (h, w, B) polynomials at the pixels; 0 outside the tissue
+    basis: Map  # (h, w, B) polynomials at the pixels; 0 outside the tissue
     offset: Floats  # (B, C) coefficients that make the motion zero at the time of the rest frame
-    rest_noise: NDArray[np.float32]  # (h, w, C) constant residual of frames without contact
+    rest_noise: Map  # (h, w, C) constant residual of frames without contact
     amplitudes_px: tuple[float, ...]  # of each rhythm, in 3D if known: median over the tissue
 
-    def at(self, time_s: float) -> NDArray[np.float32]:
+    def at(self, time_s: float) -> Map:
         """Pulsation (h, w, C) since the rest frame, with the noise of the rest frame."""
         now = sum((rhythm.at(np.array([time_s]))[0] for rhythm in self.rhythms), self.offset)
         return np.asarray(self.basis @ now.astype(np.float32) + self.rest_noise, np.float32)
@@ -206,7 +202,7 @@ class _Cells:
         total = (np.square(left).sum(axis=2) * self.weight).sum(axis=1)
         return np.asarray(np.sqrt(total / np.maximum(self.weight.sum(axis=1), 1e-9)), np.float64)
 
-    def rest_noise(self, free: Flags) -> Floats:
+    def rest_noise(self, free: Mask) -> Floats:
         """Median residual (P, C) over the frames `free` (T,), limited to the size of noise: noise of the rest
         frame displaces a cell equally in all frames."""
         left = self.motion[free] - np.einsum("pa,tac->tpc", self.basis, self.coefficients[free])
@@ -221,8 +217,8 @@ class _Cells:
 
 
 def _least_trimmed(
-    cells: _Cells, usable: Flags, smooth: Flags, rounds: int
-) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...], Flags]:
+    cells: _Cells, usable: Mask, smooth: Mask, rounds: int
+) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...], Mask]:
     """Alternates `find_rhythms` and the selection of the frames (T,) that it explains."""
     free = fitted = smooth
     rhythms: tuple[Rhythm, ...] = ()
@@ -244,7 +240,7 @@ def _least_trimmed(
 
 
 def _estimate(
-    surface: SurfaceMotion, rhythms: Sequence[Rhythm], others: Sequence[Rhythm], free: Flags, rest_s: float
+    surface: SurfaceMotion, rhythms: Sequence[Rhythm], others: Sequence[Rhythm], free: Mask, rest_s: float
 ) -> PulseEstimate:
     """Fits rhythms of known phase to all components in the frames `free` (T,), with offset and rest noise."""
     cells = _Cells(surface)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from synth.flow.confidence import add_deviation
-from synth.recording_flow.camera_motion import CameraPath, CameraTracker, Course, Similarity, describe_course
+from synth.recording_flow.camera_motion import CameraPath, CameraTracker, Course, describe_course
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame
 from synth.recording_flow.pulse import in_cells
 from synth.recording_flow.shared_motion import SharedMotion
-
-_ON_TISSUE = "it is estimated on tissue alone, which contacts and pulsation move too"
 
 
 class RegisterCamera:
@@ -33,21 +31,15 @@ class RegisterCamera:
         """The frame with its picture as of the camera at rest."""
         if self._path is None:
             camera = self._tracker.find(frame.rgb, frame.time_s)
-        else:
-            camera = self._follow(self._path, frame.time_s or 0.0)
+        elif (camera := self._path.at(time_s := frame.time_s or 0.0)) is not None:
+            last = self._course[-1][1] if self._course else None
+            self._course.append((time_s, camera, camera.distance_px(last, self._rest.tissue.shape)))
         return frame if camera is None else replace(frame, rgb=camera.undo(frame.rgb), camera=camera)
 
     def describe(self) -> list[str]:
         """Sentences on the camera's motion, after the last frame."""
         found = self._tracker.describe(self._rest.shrink)
         return found + _describe_on_tissue(self._course, self._rest)
-
-    def _follow(self, path: CameraPath, time_s: float) -> Similarity | None:
-        camera = path.at(time_s)
-        if camera is not None:
-            last = self._course[-1][1] if self._course else None
-            self._course.append((time_s, camera, camera.distance_px(last, self._rest.tissue.shape)))
-        return camera
 
 
 class RegisterOnTissue:
@@ -77,4 +69,5 @@ class RegisterOnTissue:
 
 
 def _describe_on_tissue(course: Course, rest: RestFrame) -> list[str]:
-    return [f"{describe_course(course, rest.shrink)}; {_ON_TISSUE}"] if course else []
+    why = "it is estimated on tissue alone, which contacts and pulsation move too"
+    return [f"{describe_course(course, rest.shrink)}; {why}"] if course else []

@@ -14,17 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Floats
-from synth.flow.estimator import Flags
-from synth.recording_flow.camera_motion import (
-    CameraPath,
-    Course,
-    Similarity,
-    SimilarityBasis,
-    weigh_outliers,
-)
+from synth.arrays import Floats, Map, Mask
+from synth.recording_flow.camera_motion import CameraPath, Course, Similarity, SimilarityBasis, weigh_outliers
 from synth.recording_flow.pulse import CELLS, PulseEstimate, SurfaceMotion, in_cells
 
 
@@ -57,7 +49,7 @@ MODEL = MotionModel()
 class SharedMotion:
     """Estimates camera motion from the motion of tissue, frame by frame."""
 
-    def __init__(self, tissue: Flags, shapes: Floats | None = None) -> None:
+    def __init__(self, tissue: Mask, shapes: Floats | None = None) -> None:
         """Starts at rest with a tissue mask (h, w) and the known shapes (2 P, S) of contacts, if any."""
         self._basis = SimilarityBasis(tissue.shape)
         inside = in_cells(np.zeros((*tissue.shape, 2), np.float32), tissue.astype(np.float32))[1]
@@ -80,15 +72,10 @@ class SharedMotion:
         for shape in np.zeros((0, 0)) if shapes is None else shapes.T:
             self._learn(shape)
 
-    def add(
-        self, time_s: float, motion: NDArray[np.float32], visible: NDArray[np.float32]
-    ) -> Similarity | None:
-        """Adds a frame and returns the camera motion; None: none since the rest frame.
+    def add(self, time_s: float, motion: Map, visible: Map) -> Similarity | None:
+        """Camera motion in a frame; None: none since the rest frame.
 
-        Args:
-            time_s: of the frame.
-            motion: (r, c, 2) px, of the cells, see `in_cells`.
-            visible: (r, c) visible share of each cell.
+        `motion` (r, c, 2) px and the visible share (r, c) of its cells are those of `in_cells`.
         """
         weight = np.where(visible > CELLS.visible, visible * self._inside, 0.0).ravel().astype(np.float64)
         now = motion.reshape(-1).astype(np.float64)

@@ -8,10 +8,9 @@ from itertools import chain
 
 import numpy as np
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import image, mask_detection
-from synth.flow.estimator import Flags, Map, Rgb
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Intrinsics, StereoRig
@@ -30,10 +29,6 @@ class RightVideo:
     rig: Callable[[Size], StereoRig]  # of pictures of that size
     name: str  # for messages
 
-    def open(self, rest: RestFrame, kind: str) -> RightCamera:
-        """The stage for a video with this rest frame; `kind`: of masks."""
-        return RightCamera(self, rest, kind)
-
 
 @dataclass(frozen=True)
 class DepthVideo:
@@ -41,10 +36,6 @@ class DepthVideo:
 
     read: Callable[[FrameMotion, Size], Map | None]  # depth (H, W) mm of a frame, 0: unknown; None: missing
     K: Callable[[Size], Floats]  # (3, 3) of pictures of that size
-
-    def open(self, rest: RestFrame, kind: str) -> DepthCamera:
-        """The stage for a video with this rest frame; depth needs no masks of any `kind`."""
-        return DepthCamera(self, rest)
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ class RightCamera:
         self.stereo: StereoTracker | None = None  # from the rest frame on
         self._camera: CameraTracker | None = None  # motion of the right camera
         self._noise: list[float] = []
-        self._pair: tuple[Rgb, Rgb] | None = None  # of the last tracked frame
+        self._pair: tuple[Pixels, Pixels] | None = None  # of the last tracked frame
 
     @property
     def quality(self) -> StereoQuality | None:
@@ -117,7 +108,7 @@ class RightCamera:
             return None
         return r.back(np.where(found.found, r.depth(found.disparity), np.nan).astype(np.float32))
 
-    def _begin(self, left: Rgb, right: Rgb, masked: Flags, hidden: Flags) -> StereoTracker:
+    def _begin(self, left: Pixels, right: Pixels, masked: Mask, hidden: Mask) -> StereoTracker:
         """Starts tracking from the rest pictures; UserError if they don't match, naming a flip that would."""
         rig, tissue = _smaller_rig(self._source.rig(self._rest.size), self._rest), self._rest.tissue
         try:
@@ -131,7 +122,7 @@ class RightCamera:
                 raise UserError(f"{self._name}: the right camera's pictures are {how}") from None
             raise error
 
-    def _right(self, frame: FrameMotion) -> Rgb | None:
+    def _right(self, frame: FrameMotion) -> Pixels | None:
         """The right camera's picture of a frame, downsampled as the video is; None: missing."""
         for picture in self._pictures:
             if picture.index > frame.index and not frame.is_rest:
@@ -181,6 +172,11 @@ class DepthCamera:
         return self._last
 
 
+def open_camera(source: RightVideo | DepthVideo, rest: RestFrame, kind: str) -> RightCamera | DepthCamera:
+    """The stage for a video with this rest frame; `kind`: of masks, which depth does not need."""
+    return RightCamera(source, rest, kind) if isinstance(source, RightVideo) else DepthCamera(source, rest)
+
+
 def smaller_K(K: Floats, shrink: int) -> Floats:
     """K after averaging shrink x shrink pixels; a picture starts half a pixel before its first centre."""
     out = K / shrink
@@ -208,7 +204,7 @@ def _lost(frame: FrameMotion) -> FrameMotion:
     return replace(frame, trusted=False, motion=Moved.nothing(frame.confidence.shape))
 
 
-def _noise(moved: Moved, tissue: Flags) -> float:
+def _noise(moved: Moved, tissue: Mask) -> float:
     return float(np.median(moved.deviation[..., 2][tissue]))
 
 

@@ -20,15 +20,11 @@ _ORTHOGONAL = 1e-3
 
 
 def read_rig(path: Path, size: tuple[int, int], mm_per_unit: float = 1.0) -> StereoRig:
-    """Reads a pair of cameras: K1, D1, K2, D2, R and T, or the names of these in OpenCV's samples.
+    """A pair of cameras from K1, D1, K2, D2, R and T, or the names of these in OpenCV's samples.
 
-    Args:
-        path: of the file.
-        size: width, height of the pictures used for calibration [px].
-        mm_per_unit: unit of T, given by the squares of the chessboard.
-
-    Raises:
-        UserError: the file cannot be read, or does not contain two valid cameras.
+    `size`: width, height of the pictures used for calibration [px]; `mm_per_unit`: unit of T, given by the
+    squares of the chessboard. Raises UserError if the file cannot be read or does not contain two valid
+    cameras.
     """
     held = checked_file.read_storage(path)
 

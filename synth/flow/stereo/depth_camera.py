@@ -5,10 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.confidence import deviation
-from synth.flow.estimator import Flags, Flow, Map
 from synth.flow.stereo.depth_motion import Solver, fine
 from synth.flow.stereo.track import Moved
 
@@ -22,7 +21,7 @@ class DepthTracker:
     that is softer where the tissue is strained, Student's weights, noise from the median residual.
     """
 
-    def __init__(self, K: Floats, rest: Map, blocked: Flags, tissue: Flags) -> None:
+    def __init__(self, K: Floats, rest: Map, blocked: Mask, tissue: Mask) -> None:
         """Starts at the rest frame.
 
         Args:
@@ -44,14 +43,13 @@ class DepthTracker:
         self.distance_mm = float(np.median(rest[self._known]))  # median depth of the tissue at rest
         self.solver = Solver((tissue.shape[0], tissue.shape[1]))
 
-    def step(self, depth: Map, blocked: Flags, flow: Flow, confidence: Map) -> Moved:
-        """Returns the motion from rest to the next frame.
+    def step(self, depth: Map, blocked: Mask, flow: Map, confidence: Map) -> Moved:
+        """The motion from rest to the next frame.
 
         Args:
             depth: (H, W) mm, along the optical axis.
             blocked: (H, W), instrument and glare masks.
-            flow: (H, W, 2) px.
-            confidence: (H, W) in 0..1, of the flow.
+            flow, confidence: (H, W, 2) px, and (H, W) in 0..1.
         """
         if depth.shape != self.tissue.shape:
             raise UserError(f"depth: a picture of {depth.shape}, but the rest frame is {self.tissue.shape}")
@@ -83,5 +81,5 @@ class DepthTracker:
         )
 
 
-def _known(depth: Map) -> Flags:
+def _known(depth: Map) -> Mask:
     return np.asarray(np.isfinite(depth) & (depth > 0))

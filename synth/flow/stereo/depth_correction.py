@@ -14,10 +14,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Map
 from synth.flow import correction
-from synth.flow.estimator import Map
 from synth.flow.stereo.depth_motion import Change, Solver
 
 WEIGHTS = Path(__file__).with_name("depth_correction.pt")
@@ -36,7 +35,7 @@ _FARTHEST_MM = 0.5  # limit of a linearised step
 
 def describe(
     change: Change, solver: Solver, flow: Map, visible: Map, spread: Map, px_per_mm: float, mm_per_px: float
-) -> NDArray[np.float32]:
+) -> Map:
     """`FEATURES` (CHANNELS, h, w) float32 of a frame on the cells of the solver.
 
     Args:
@@ -64,7 +63,7 @@ def describe(
     return np.stack(rows).astype(np.float32)
 
 
-def correct(features: NDArray[np.float32]) -> tuple[Map, Map]:
+def correct(features: Map) -> tuple[Map, Map]:
     """Correction of the depth motion and its deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w)."""
     height, width = features.shape[1:]
     found = correction.predict(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]

@@ -23,17 +23,14 @@ system is small. The solver is Gauss-Newton on warped pictures with renewed weig
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import scipy.sparse as sparse
-from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
-from synth.arrays import Floats
+from synth.arrays import Array, Floats, Map
 from synth.flow import kernels
-from synth.flow.estimator import Map
 from synth.system.jit import vectorised
 
 _FREEDOM = np.float32(4.0)  # degrees of freedom of Student's distribution
@@ -144,13 +141,9 @@ class Solver:
         return Change(change, precision, pull, stiffness, misfit.astype(np.float32), both, lag)
 
     def smooth(self, samples: Map, weight: Map, flow: Map, px_per_mm: float) -> Change:
-        """Smooths given changes of disparity with the same prior and Student's weights.
+        """The change of disparity of given samples (H, W) px, by the same prior and Student's weights.
 
-        Args:
-            samples: (H, W) px.
-            weight: (H, W) >= 0; 0 where there is no sample.
-            flow: (2, H, W) px, of the left camera.
-            px_per_mm: as in `solve`.
+        `weight` (H, W) >= 0 is 0 where there is no sample; `flow` and `px_per_mm` are those of `solve`.
         """
         stiffness, prior = self._prior(flow, px_per_mm)
         change = np.zeros_like(samples)
@@ -171,7 +164,7 @@ class Solver:
         visible = (weight > 0).astype(np.float32)
         return Change(change, information, pull, stiffness, misfit.astype(np.float32), visible)
 
-    def _settled(self, prior: sparse.csr_matrix, information: NDArray[Any], pull: NDArray[Any]) -> Map:
+    def _settled(self, prior: sparse.csr_matrix, information: Array, pull: Array) -> Map:
         """Changes (h, w) px of the cells that minimise data and prior terms."""
         system = (prior + sparse.diags(information.ravel() + 1e-9)).tocsc()
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
@@ -246,14 +239,8 @@ def _lag(residual: Map, slope: Map, down: Map, mask: Map, noise: np.float32) -> 
     """Share of the vertical motion that is missing in the right picture.
 
     Vertical motion is the same in both rectified pictures at any depth. A residual along the vertical slope
-    therefore shows that the pictures are not synchronous.
-
-    Args:
-        residual: (H, W), of the brightness.
-        slope: (H, W), derivative of the brightness by y.
-        down: (H, W) px, vertical flow of the left camera.
-        mask: (H, W).
-        noise: variance of the residual.
+    therefore shows that the pictures are not synchronous. `residual`: of the brightness, of variance `noise`;
+    `slope`: derivative of the brightness by y; `down`: vertical flow of the left camera [px]; (H, W) each.
     """
     some = (slice(None, None, 2), slice(None, None, 2))
     q, along = residual[some], (slope * down)[some]
@@ -270,12 +257,10 @@ def gather(
     """Normal equations of one linearisation, summed over cells.
 
     Args:
-        now: (3, H, W), the warped right picture now, with its derivatives.
-        rest: (3, H, W), the right rest picture.
+        now, rest: (3, H, W), the warped right picture now and the right rest picture, with their derivatives.
         lefts: (3, H, W), the sum of the left pictures at rest and now.
         less: (3, H, W), the target of `now`.
-        mask: (H, W).
-        change: (H, W) px, the value of d used for the warp.
+        mask, change: (H, W), and (H, W) px, the value of d used for the warp.
         noise: (3,), variance of the channels.
         cell: px.
         sums: (4, h, w), incremented by J^2, J (J d + q), q^2 (mean over channels) and the number of pixels.

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from synth.arrays import Map, Mask
 from synth.errors import UserError
-from synth.flow.estimator import Flags, Map
 from synth.flow.tvl1 import Tvl1, one_thread
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
@@ -30,18 +30,16 @@ class Rest:
     """Rest disparity on rectified left pixels."""
 
     disparity: Map  # (H, W) px: left column minus right column; finite everywhere
-    found: Flags  # (H, W), False where it was filled from the surroundings
+    found: Mask  # (H, W), False where it was filled from the surroundings
     epipolar_px: float  # median distance of matches from their row: calibration error; NaN: not refined
 
 
-def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, refine: bool = True) -> Rest:
-    """Matches a rectified pair.
+def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refine: bool = True) -> Rest:
+    """Rest disparity of a rectified pair.
 
     Args:
-        left: (n, H, W) grey levels of n rest frames, which are averaged, or (H, W) of one.
-        right: the same of the right camera.
-        left_usable: (H, W), unmasked tissue.
-        right_usable: (H, W), unmasked pixels of the right picture.
+        left, right: (n, H, W) grey levels of n rest frames, which are averaged, or (H, W) of one.
+        left_usable, right_usable: (H, W), unmasked tissue, and unmasked pixels of the right picture.
         refine: to subpixels.
 
     Raises:
@@ -64,7 +62,8 @@ def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, ref
     )
     # Padding lets pixels near the left and right borders match too.
     pad = count + abs(low)
-    padded = [cv2.copyMakeBorder(_bytes(one), 0, 0, pad, pad, cv2.BORDER_REPLICATE) for one in (left, right)]
+    levels = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in (left, right))
+    padded = [cv2.copyMakeBorder(one, 0, 0, pad, pad, cv2.BORDER_REPLICATE) for one in levels]
     raw = matcher.compute(*padded)[:, pad:-pad].astype(np.float32) / 16
     found = (raw >= low) & left_usable
     unmatched = UserError(
@@ -72,7 +71,8 @@ def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, ref
     )
     if not found.any():
         raise unmatched
-    filled = _filled(raw, found)
+    # From the nearest match.
+    filled = raw[tuple(distance_transform_edt(~found, return_distances=False, return_indices=True))]
     if not refine:
         return Rest(filled, found, float("nan"))
     flow, trust = _refined(left, right, left_usable, right_usable, filled)
@@ -84,7 +84,7 @@ def match(left: Map, right: Map, left_usable: Flags, right_usable: Flags, *, ref
     return Rest(np.where(better, -flow[0], filled).astype(np.float32), found, off)
 
 
-def _refined(left: Map, right: Map, left_usable: Flags, right_usable: Flags, start: Map) -> tuple[Map, Map]:
+def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start: Map) -> tuple[Map, Map]:
     """Flow (2, H, W) px from the left to the right rest picture, and its agreement (H, W)."""
 
     def wide(field: NDArray[np.generic]) -> torch.Tensor:
@@ -96,13 +96,3 @@ def _refined(left: Map, right: Map, left_usable: Flags, right_usable: Flags, sta
             wide(left), wide(right), wide(left_usable), wide(right_usable), initial
         )
     return flow[0].numpy(), trust[0, 0].numpy()
-
-
-def _filled(raw: Map, found: Flags) -> Map:
-    """Fills pixels without a match from the nearest match."""
-    rows, columns = distance_transform_edt(~found, return_distances=False, return_indices=True)
-    return np.ascontiguousarray(raw[rows, columns])
-
-
-def _bytes(grey: Map) -> NDArray[np.uint8]:
-    return np.asarray(np.clip(np.rint(grey), 0, 255), np.uint8)

@@ -13,9 +13,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
-from synth.flow.estimator import Flags, Map
 
 _PARALLEL = 1e-9  # rotations and offsets of at most this count as zero
 
@@ -71,7 +70,7 @@ class Rectified:
         x, y = self._maps[camera]
         return np.asarray(cv2.remap(grey, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
 
-    def flags(self, mask: Flags, camera: int) -> Flags:
+    def flags(self, mask: Mask, camera: int) -> Mask:
         """Rectifies a mask (H, W); True where all sampled pixels are True."""
         x, y = self._maps[camera]
         return np.asarray(cv2.remap(mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) > 0.99)
@@ -95,13 +94,8 @@ class Rectified:
         return np.asarray(self.focal * self.baseline_mm / np.maximum(disparity + self.shift, 1e-3))
 
     def motion(self, disparity: Map, change: Map, flow: Map) -> Map:
-        """Motion (H, W, 3) mm in the axes of the left camera, on rectified left pixels.
-
-        Args:
-            disparity: (H, W) px at rest.
-            change: (H, W) px, change of disparity since rest.
-            flow: (2, H, W) px, rectified.
-        """
+        """Motion (H, W, 3) mm in the axes of the left camera, on rectified left pixels, of a rectified flow
+        (2, H, W) px, a disparity at rest and its change since, both (H, W) px."""
         height, width = disparity.shape
         before, after = self.depth(disparity), self.depth(disparity + change)
         x = np.arange(width, dtype=np.float32) - np.float32(self.K_left[0, 2])

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import image, kernels
 from synth.flow.confidence import deviation
-from synth.flow.estimator import Flags, Flow, Map, Rgb
 from synth.flow.stereo import depth_correction, rest
 from synth.flow.stereo.depth_motion import Change, Solver, StereoPictures, fine
 from synth.flow.stereo.rig import Rectified, StereoRig
@@ -39,8 +38,8 @@ STEREO = StereoConstants()
 class Moved:
     """Motion from rest to one frame, on the pixels of the left rest frame."""
 
-    motion: NDArray[np.float32]  # (H, W, 3) mm, in the axes of the left camera; 0 outside the tissue
-    deviation: NDArray[np.float32]  # (H, W, 3) mm, standard deviation of each component; 0 outside the tissue
+    motion: Map  # (H, W, 3) mm, in the axes of the left camera; 0 outside the tissue
+    deviation: Map  # (H, W, 3) mm, standard deviation of each component; 0 outside the tissue
 
     @classmethod
     def nothing(cls, size: tuple[int, ...]) -> Moved:
@@ -57,11 +56,11 @@ class StereoTracker:
     def __init__(
         self,
         rig: StereoRig,
-        lefts: NDArray[np.uint8],
-        rights: NDArray[np.uint8],
-        left_blocked: Flags,
-        right_blocked: Flags,
-        tissue: Flags,
+        lefts: Pixels,
+        rights: Pixels,
+        left_blocked: Mask,
+        right_blocked: Mask,
+        tissue: Mask,
     ) -> None:
         """Starts at the rest frame.
 
@@ -102,7 +101,7 @@ class StereoTracker:
         self._mm_per_px = float(np.median(r.depth(self.rest.disparity))) / r.focal
         self._change: Map | None = None
 
-    def right_tissue(self) -> Flags:
+    def right_tissue(self) -> Mask:
         """Tissue mask (H, W) in the right rest picture."""
         r = self.rectified
         rows, columns = np.nonzero(r.flags(self.tissue, 0))
@@ -114,17 +113,14 @@ class StereoTracker:
         return r.back(cv2.dilate(found, np.ones((3, 5), np.uint8)), 1) > 0
 
     def step(
-        self, left: Rgb, right: Rgb, left_blocked: Flags, right_blocked: Flags, flow: Flow, confidence: Map
+        self, left: Pixels, right: Pixels, left_blocked: Mask, right_blocked: Mask, flow: Map, confidence: Map
     ) -> Moved:
-        """Returns the motion from rest to the next frame.
+        """The motion from rest to the next frame.
 
         Args:
-            left: (H, W, 3) uint8.
-            right: (H, W, 3) uint8.
-            left_blocked: (H, W), instrument and glare masks.
-            right_blocked: (H, W).
-            flow: (H, W, 2) px, of the left camera.
-            confidence: (H, W) in 0..1, of the flow.
+            left, right: (H, W, 3) uint8.
+            left_blocked, right_blocked: (H, W), instrument and glare masks.
+            flow, confidence: (H, W, 2) px, of the left camera, and (H, W) in 0..1.
         """
         r = self.rectified
         now, now_usable = self._normalised(left, r.flags(~left_blocked, 0), 0)
@@ -169,36 +165,29 @@ class StereoTracker:
             np.stack([np.exp(r.back(part)) for part in logs], axis=-1) * inside,
         )
 
-    def describe(self, change: Change, flow: Map, confidence: Map) -> tuple[NDArray[np.float32], Map]:
+    def describe(self, change: Change, flow: Map, confidence: Map) -> tuple[Map, Map]:
         """Features of `depth_correction`, and the standard deviation (h, w) px of a flow component.
 
-        Args:
-            change: solution of the solver.
-            flow: (2, H, W) px, rectified.
-            confidence: (H, W) in 0..1, of the flow, on the original left pixels.
+        `flow`: (2, H, W) px, rectified; `confidence`: (H, W) in 0..1, of the flow, on the original left
+        pixels.
         """
         r, coarse = self.rectified, self.solver.coarse
         visible = r.flags(confidence > 0, 0).astype(np.float32)
         share = coarse(visible)
         sure = coarse(r.picture(confidence, 0) * visible) / np.maximum(share, 0.1)
-        spread = deviation(_filled(np.asarray(sure, np.float32), share > 0.1))
+        fields = (torch.from_numpy(np.asarray(one, np.float32))[None, None] for one in (sure, share > 0.1))
+        spread = deviation(np.asarray(image.fill(*fields)[0, 0], np.float32))
         sizes = self.px_per_mm, self._mm_per_px
         return depth_correction.describe(change, self.solver, flow, share, spread, *sizes), spread
 
-    def _normalised(self, rgb: Rgb, usable: Flags, camera: int) -> tuple[Map, Map]:
+    def _normalised(self, rgb: Pixels, usable: Mask, camera: int) -> tuple[Map, Map]:
         """Rectified picture in local deviations, and the mask, both (H, W) float32."""
         known = usable.astype(np.float32)
         grey = torch.from_numpy(self.rectified.picture(rgb @ image.GREY, camera))[None, None]
         return image.normalise(grey, torch.from_numpy(known)[None, None])[0, 0].numpy(), known
 
 
-def _filled(field: Map, known: Flags) -> Map:
-    """Fills unknown cells (h, w) from their surroundings."""
-    both = (torch.from_numpy(np.asarray(one, np.float32))[None, None] for one in (field, known))
-    return np.asarray(image.fill(*both)[0, 0], np.float32)
-
-
-def still_frames(flow: NDArray[np.float32], tissue: Flags) -> int:
+def still_frames(flow: Map, tissue: Mask) -> int:
     """Number of leading frames of a flow (T, H, W, 2) px that are at rest: 1 to 4."""
     count = 1
     while count < min(len(flow), STEREO.rests):

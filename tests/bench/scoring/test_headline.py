@@ -13,7 +13,7 @@ from bench.methods.protocol import ForceEstimate, Method, MethodContext
 from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
-from synth.flow.estimator import Flags, Rgb
+from synth.arrays import Mask, Pixels
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -26,10 +26,10 @@ class Known(LocalFlow):
     def __init__(self, lost: set[int], fps: float = 10.0) -> None:
         self.lost, self.fps, self.frame = lost, fps, 0
 
-    def begin(self, backend: str, rest: Rgb, masked: object, tissue: Flags) -> None:
+    def begin(self, backend: str, rest: Pixels, masked: object, tissue: Mask) -> None:
         self.shape = tissue.shape
 
-    def submit(self, rgb: Rgb, masked: object) -> Future[FrameMotion]:
+    def submit(self, rgb: Pixels, masked: object) -> Future[FrameMotion]:
         self.frame += 1
         y, x = np.mgrid[: self.shape[0], : self.shape[1]]
         bump = np.exp(-((x - 64) ** 2 + (y - 48) ** 2) / (2 * 17.0**2))

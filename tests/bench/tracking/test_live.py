@@ -20,7 +20,7 @@ from bench.tracking import live
 from bench.tracking.flow_process import FlowProcess
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
-from synth.flow.estimator import Rgb
+from synth.arrays import Pixels
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import LocalFlow
@@ -71,7 +71,7 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
         ahead = 1
         submitted = -1  # one submission precedes the start of the stream
 
-        def submit(self, rgb: Rgb, proposal: Proposal) -> Future[FrameMotion]:
+        def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
             self.submitted += 1
             if self.submitted:
                 log.append(f"in {self.submitted}")
