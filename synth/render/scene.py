@@ -17,8 +17,7 @@ from synth.render.appearance import light
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, right_camera
 from synth.render.camera.camera_sensor import CameraSensor
-from synth.render.content import SceneContent
-from synth.render.materials import Body, Metal, Wet
+from synth.render.content import Body, Metal, SceneContent, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
@@ -107,7 +106,7 @@ class Renderer:
         self._sensor, self._settings, self._extra = sensor, settings, extra
         if not isinstance(content.tissue.material, Wet):
             raise ValueError("the tissue's material must be Wet")
-        self._albedo = content.tissue.material.coat.albedo
+        self._wet = content.tissue.material
         self._static = joined(_NOTHING, *(body.shape for body in content.static))
         metal = [(one.shape, one.material) for one in content.static if isinstance(one.material, Metal)]
         # A face of metal at least, if out of sight: with and without instruments kernels are the same.
@@ -137,7 +136,7 @@ class Renderer:
             after: the next frame's state, for the flow to it.
         """
         camera = state.camera or self.camera
-        radiance, radiance_right = self._gathered(shutter or (state,), seed)
+        radiance, *others = self._gathered(shutter or (state,), seed)
         faces = self.content.tissue.faces
         shapes = (Shape(state.vertices, faces), self._static, self._posed(state))
         own = truth.trace_frame(camera, self.rest, *shapes)
@@ -154,7 +153,7 @@ class Renderer:
         if self._right_rest is not None:
             lens = right_camera(camera, self._settings.stereo_mm)
             other = truth.trace_frame(lens, self._right_rest, *shapes)
-            picture = self.develop(radiance_right, seed + 1)
+            picture = self.develop(others[0], seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
         return RenderedFrame(
@@ -216,28 +215,22 @@ class Renderer:
         instruments = self.content.instruments
         return None if instruments is None else instruments.film(state.tips, state.vertices)
 
-    def _gathered(self, states: Sequence[SceneState], seed: int) -> tuple[Map, Map]:
-        """Mean radiance over some states in the camera and in the right one, which is 0 if there is none."""
-        left: list[Map] = []
-        right: list[Map] = []
+    def _gathered(self, states: Sequence[SceneState], seed: int) -> list[Map]:
+        """Mean radiance over some states, in the camera and in the right one if there is one."""
+        shots: list[list[Map]] = []
         for k, state in enumerate(states):
-            camera = state.camera or self.camera
-            power = np.float32(state.power)
             if self._stage is None:
                 self._stage = self.stage(state, self._settings.spp)
             else:
                 self.move(self._stage, state)
-            left.append(power * self._expose(self._stage, camera, seed + 7919 * k))
+            cameras = [state.camera or self.camera]
             if self.right is not None:
-                other = right_camera(camera, self._settings.stereo_mm)
-                right.append(power * self._expose(self._stage, other, seed + 1 + 7919 * k))
-        return (
-            np.asarray(np.mean(left, axis=0), np.float32),
-            np.asarray(np.mean(right or np.zeros_like(left), axis=0), np.float32),
-        )
-
-    def _expose(self, stage: Stage, camera: Camera, seed: int) -> Map:
-        return stage.render(seed % 2**32, camera) * self._spot(camera)[..., None]
+                cameras.append(right_camera(cameras[0], self._settings.stereo_mm))
+            shots.append([])
+            for side, camera in enumerate(cameras):
+                taken = self._stage.render((seed + side + 7919 * k) % 2**32, camera)
+                shots[-1].append(np.float32(state.power) * (taken * self._spot(camera)[..., None]))
+        return [np.asarray(np.mean(taken, axis=0), np.float32) for taken in zip(*shots, strict=True)]
 
     def _spot(self, camera: Camera) -> Map:
         return light.spot(camera, self.camera, self.content.spot)
@@ -245,14 +238,11 @@ class Renderer:
     def _metal(self, state: SceneState) -> tuple[Shape, Metal]:
         """All metal as one mesh, instruments first."""
         parts = list(self._static_metal)
-        if self.content.instruments is not None:
+        if (instruments := self.content.instruments) is not None:
             posed = self._posed(state)
-            material = Metal(self.content.instruments.tint, self.content.instruments.glow(posed))
-            parts.insert(0, (posed, material))
-        tint, glow = (
-            np.concatenate([getattr(metal, name) for _, metal in parts]) for name in ("tint", "glow")
-        )
-        return joined(*(shape for shape, _ in parts)), Metal(tint, glow)
+            parts.insert(0, (posed, Metal(instruments.tint, instruments.glow(posed))))
+        tint, glow = ([getattr(metal, name) for _, metal in parts] for name in ("tint", "glow"))
+        return joined(*(shape for shape, _ in parts)), Metal(np.concatenate(tint), np.concatenate(glow))
 
     def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""
@@ -261,23 +251,18 @@ class Renderer:
         on = (hits.face >= 0) & (hits.face < len(tissue.faces))
         face, bary = hits.face[on], hits.bary[on]
         uv = truth.blend(tissue.faces, face, bary, tissue.uv)
-        albedo = noise.sample(self._albedo, uv - 0.5, 1.0)
-        irradiance = state.power * self._irradiance(state.vertices)
-        light_in = truth.blend(tissue.faces, face, bary, irradiance)
+        albedo = noise.sample(self._wet.maps.albedo, uv - 0.5, 1.0)
+        normal = normals(Shape(state.vertices, tissue.faces))
+        irradiance = np.zeros((len(normal), 3))  # as radiance of a white diffuser at vertices, unshadowed
+        for lamp in self.content.lamps:
+            _add_light(state.vertices, normal, lamp.position, lamp.intensity, irradiance)
+        light_in = truth.blend(tissue.faces, face, bary, state.power * irradiance)
         spot = self._spot(state.camera or self.camera).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
         excess = _mean(radiance.reshape(-1, 3))[on] - 1.05 * diffuse
         glare = np.zeros(height * width, bool)
         glare[on] = excess * self._sensor.exposure > _GLARE
         return glare.reshape(height, width)
-
-    def _irradiance(self, vertices: Floats) -> Floats:
-        """Radiance (V, 3) of a white diffuser at each vertex, unshadowed."""
-        normal = normals(Shape(vertices, self.content.tissue.faces))
-        total = np.zeros((len(vertices), 3))
-        for lamp in self.content.lamps:
-            _add_light(vertices, normal, lamp.position, lamp.intensity, total)
-        return total
 
 
 def _mean(colour: Array) -> Array:

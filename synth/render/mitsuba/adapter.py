@@ -22,7 +22,7 @@ from synth.arrays import Array, Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
-from synth.render.materials import Body, Lamp, Metal, Wet
+from synth.render.content import Body, Lamp, Metal, Wet
 from synth.render.mitsuba.direct_light import trace
 from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.glow import register_glow
@@ -240,7 +240,7 @@ def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     """Radiance of a body by light that is not of a lamp: reflections of metal, ambient light on tissue."""
     if isinstance(material, Metal):
         return {"type": "mesh_attribute", "name": "vertex_glow"}
-    half = cv2.resize(material.coat.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = cv2.resize(material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return _bitmap(mi, half * np.asarray(material.ambient, np.float32))
 
 
@@ -248,8 +248,8 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
         scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
         return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
-    encoded = material.coat.normal * np.float32(0.5) + np.float32(0.5)
-    albedo = mi.load_dict(_bitmap(mi, material.coat.albedo))  # shared by both coats
+    encoded = material.maps.normal * np.float32(0.5) + np.float32(0.5)
+    albedo = mi.load_dict(_bitmap(mi, material.maps.albedo))  # shared by both coats
 
     def coat(roughness: float) -> dict[str, Any]:
         return {
@@ -268,7 +268,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
             "normalmap": _bitmap(mi, encoded),
             "film": {
                 "type": "blendbsdf",
-                "weight": _bitmap(mi, material.coat.dry),
+                "weight": _bitmap(mi, material.maps.dry),
                 "smooth": coat(material.roughness),
                 "rough": coat(material.dry_roughness),
             },
