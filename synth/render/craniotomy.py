@@ -15,7 +15,7 @@ from synth.render.anatomy import noise, rim, scenery, texture
 from synth.render.anatomy.rim import Rim
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance import light, reflection
-from synth.render.appearance.appearance import Appearance
+from synth.render.appearance.family import Appearance
 from synth.render.appearance.reflection import Theatre
 from synth.render.camera.camera import Camera
 from synth.render.content import Body, Coat, Metal, SceneContent, Wet
@@ -62,7 +62,7 @@ def craniotomy(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(kinds, instrument.finish(kinds, hand), theatre) if shown else None,
+        instruments=instrument.build(kinds, theatre, hand) if shown else None,
         spot=appearance.light.even,
     )
 

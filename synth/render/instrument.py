@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
-from synth.geometry.triangles import Shape, grid_faces, lengths
+from synth.geometry.triangles import Shape, grid_faces, joined, lengths
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
 
@@ -71,11 +72,12 @@ class SteelInstruments:
         for k, parts in enumerate(self.parts):
             ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
             for part in parts:
-                follows = {1: 0, -1: 1}.get(part.side)
-                tip = ends.mean(axis=0) if follows is None else ends[follows]
-                shaft = ways.mean(axis=0) if follows is None else ways[follows]
                 # The flat sides of two tines face each other; a single blade's faces the tissue.
-                across = np.array([0.0, 0.0, 1.0]) if follows is None else ends[1] - ends[0]
+                if part.side == 0:
+                    tip, shaft, across = ends.mean(axis=0), ways.mean(axis=0), np.array([0.0, 0.0, 1.0])
+                else:
+                    tip, shaft = (pair[0 if part.side == 1 else 1] for pair in (ends, ways))
+                    across = ends[1] - ends[0]
                 placed.append(tip + part.profile @ _axes(shaft, across))
         return Shape(np.concatenate(placed), self.faces)
 
@@ -94,35 +96,23 @@ class SteelInstruments:
 
 def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
     """An instrument that suits each gesture."""
-    chosen: list[Kind] = []
-    for gesture in gestures:
-        kinds, shares = _HABITS[gesture]
-        chosen.append(kinds[int(rng.choice(len(kinds), p=shares))])
-    return tuple(chosen)
+    suitable = (_HABITS[gesture] for gesture in gestures)
+    return tuple(kinds[int(rng.choice(len(kinds), p=shares))] for kinds, shares in suitable)
 
 
-def finish(kinds: Sequence[Kind], rng: np.random.Generator) -> tuple[bool, ...]:
-    """Whether the end of each instrument is coated black."""
-    return tuple(bool(drawn) for drawn in rng.random(len(kinds)) < _COATED)
-
-
-def build(kinds: Sequence[Kind], coated: Sequence[bool], theatre: Theatre) -> SteelInstruments:
-    """One or more instruments in a theatre; the `coated` ones have black ends."""
+def build(kinds: Sequence[Kind], theatre: Theatre, rng: np.random.Generator) -> SteelInstruments:
+    """One or more instruments in a theatre, some of them with ends coated black."""
+    coated = rng.random(len(kinds)) < _COATED
     parts = tuple(_SHAPES[kind][0]() for kind in kinds)
-    faces, coat, total = [], [], 0
+    bars, coat = [], []
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
             rings = len(part.profile) // (_AROUND + 1)
-            faces.append(grid_faces(rings, _AROUND + 1).reshape(-1, 3) + total)
+            bars.append(Shape(part.profile, grid_faces(rings, _AROUND + 1).reshape(-1, 3)))
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
-            total += len(part.profile)
     return SteelInstruments(
-        kinds=tuple(kinds),
-        parts=parts,
-        faces=np.concatenate(faces).astype(np.int32),
-        coat=np.concatenate(coat).astype(np.float32),
-        theatre=theatre,
+        tuple(kinds), parts, joined(*bars).faces, np.concatenate(coat).astype(np.float32), theatre
     )
 
 
@@ -158,29 +148,19 @@ def _round_off(s: Floats, over: float) -> Floats:
     return np.asarray(np.sqrt(np.clip(1 - (1 - np.minimum(s / over + 0.01, 1)) ** 2, 0, 1)))
 
 
-def _forceps() -> tuple[Part, ...]:
-    """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1)."""
-    return _tines(np.zeros(96))
+def _forceps(aside_mm: float = 0.0) -> tuple[Part, ...]:
+    """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1).
 
-
-def _bayonet() -> tuple[Part, ...]:
-    """Forceps bent twice, which keeps the hand out of view."""
-    s = _along(96)
-    step = np.clip((s - 24.0) / 14.0, 0, 1)
-    return _tines(13.0 * step**2 * (3 - 2 * step))
-
-
-def _tines(aside: Floats) -> tuple[Part, ...]:
-    """Two tines whose rings are shifted by `aside` (96,) mm across their flat sides."""
+    `aside_mm`: shift of the handle, which a bayonet's two bends move out of view.
+    """
     s = _along(96)
     close = _round_off(s, 0.45)
     wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
     thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
-    shift = np.zeros((len(s), _AROUND + 1, 3))
-    shift[..., 1] = aside[:, None]
-    flat = shift.reshape(-1, 3)
-    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + flat, side) for side in (1, -1))
+    bend = np.clip((s - 24.0) / 14.0, 0, 1)
+    shift = np.repeat(aside_mm * bend**2 * (3 - 2 * bend), _AROUND + 1)[:, None] * [0.0, 1.0, 0.0]
+    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
 
 
 def _dissector() -> tuple[Part, ...]:
@@ -217,7 +197,7 @@ def _spatula() -> tuple[Part, ...]:
 
 _SHAPES: dict[Kind, tuple[Callable[[], tuple[Part, ...]], float]] = {
     "forceps": (_forceps, 0.45),
-    "bayonet": (_bayonet, 0.45),
+    "bayonet": (partial(_forceps, 13.0), 0.45),
     "dissector": (_dissector, 1.5),
     "suction": (_suction, 1.2),
     "spatula": (_spatula, 3.0),

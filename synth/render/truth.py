@@ -91,7 +91,11 @@ class ProjectedScene:
         if pixels is None:
             order, start = np.arange(width * height), np.arange(width * height + 1)
         else:
-            order, start = _sort(pixels, width, height)
+            x, y = np.floor(pixels + 0.5).T
+            within = np.flatnonzero((x >= 0) & (x < width) & (y >= 0) & (y < height))
+            cell = (y[within] * width + x[within]).astype(np.int64)
+            order = within[np.argsort(cell, kind="stable")]
+            start = np.append(0, np.cumsum(np.bincount(cell, minlength=width * height)))
         directions = np.ascontiguousarray(directions)
         return Hits(*_cast(self.points, self.flat, self.faces, directions, order, start, self.size))
 
@@ -205,31 +209,10 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     ray = directions[on]
     facing = np.einsum("nc,nc->n", normal, ray)[:, None]
-    spread = []
-    for side in (across.reshape(-1, 3)[on], down.reshape(-1, 3)[on]):
-        spread.append(along[on, None] * (side - ray * np.einsum("nc,nc->n", normal, side)[:, None] / facing))
-    return np.asarray(np.linalg.norm(np.cross(*spread), axis=1))
-
-
-@compiled
-def _sort(pixels: Floats, width: int, height: int) -> tuple[Ints, Ints]:
-    """Rays sorted by their pixel: order (M,) and each pixel's start in it (H*W + 1,)."""
-    key = np.full(len(pixels), -1, np.int64)
-    start = np.zeros(width * height + 1, np.int64)
-    for n in range(len(pixels)):
-        x, y = np.floor(pixels[n, 0] + 0.5), np.floor(pixels[n, 1] + 0.5)
-        if 0 <= x < width and 0 <= y < height:
-            key[n] = np.int64(y) * width + np.int64(x)
-            start[key[n] + 1] += 1
-    for cell in range(width * height):
-        start[cell + 1] += start[cell]
-    free = start[:-1].copy()
-    order = np.empty(start[-1], np.int64)
-    for n in range(len(pixels)):
-        if key[n] >= 0:
-            order[free[key[n]]] = n
-            free[key[n]] += 1
-    return order, start
+    sides = (across.reshape(-1, 3)[on], down.reshape(-1, 3)[on])
+    slopes = (np.einsum("nc,nc->n", normal, side)[:, None] / facing for side in sides)
+    one, other = (along[on, None] * (side - ray * slope) for side, slope in zip(sides, slopes, strict=True))
+    return np.asarray(np.linalg.norm(np.cross(one, other), axis=1))
 
 
 @compiled

@@ -20,8 +20,7 @@ from synth.job.mechanics import CLEAR_MM, InstrumentSection
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render.anatomy.surface import Relief
-from synth.render.appearance.appearance import Appearance
-from synth.render.appearance.family import FAMILIES, Colour
+from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.camera.camera import CameraView, place, visible_radius
 from synth.render.camera.camera_motion import CameraMotion

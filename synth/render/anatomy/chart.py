@@ -31,14 +31,10 @@ class Chart:
         """Chart coordinates (N, 2) of world x, y (N, 2), mm from the square's middle."""
         return np.asarray(xy + noise.sample(self.shift, xy, self.plan_mm))
 
-    def places(self, pixels: int) -> Floats:
-        """World x, y (pixels^2, 2) mm of a map's pixels, row by row."""
-        return _places(self, pixels)
 
-
-@lru_cache(maxsize=1)
-def _places(chart: Chart, pixels: int) -> Floats:
-    """As `Chart.places`; cached, since sulci and the rim's shade need the same one."""
+@lru_cache(maxsize=1)  # sulci and the rim's shade need the same one
+def places(chart: Chart, pixels: int) -> Floats:
+    """World x, y (pixels^2, 2) mm of the pixels of a map on a chart, row by row."""
     axis = noise.centres(pixels, chart.extent_mm)
     laid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2).astype(np.float64)
     xy = laid

@@ -16,11 +16,12 @@ from scipy.spatial import cKDTree
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render.anatomy import noise, scenery, tube
+from synth.render.anatomy.chart import places
 from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, through
 from synth.render.anatomy.scenery import Patty
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
-from synth.render.appearance.appearance import Appearance
+from synth.render.appearance.family import Appearance
 from synth.render.content import Coat
 
 _AROUND, _OUT = 320, 42  # at most: points around the opening, rings outwards
@@ -181,7 +182,7 @@ def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
 
 def shade(rim: Rim, surface: CortexSurface) -> Map:
     """Share (512, 512) of light that the dura's lip lets reach the surface, over its chart."""
-    x, y = surface.chart.places(512).T.reshape(2, 512, 512)
+    x, y = places(surface.chart, 512).T.reshape(2, 512, 512)
     inside = np.maximum(_round(rim.edge, np.arctan2(y, x)) - CutEdge.lip - np.hypot(x, y), 0)
     return np.asarray(1 - 0.35 * np.exp(-inside / 0.6) - 0.14 * np.exp(-inside / 2.0), np.float32)
 

@@ -17,7 +17,7 @@ from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces
 from synth.job import schema
 from synth.render.anatomy import noise, tube, vessels
-from synth.render.anatomy.chart import Chart, unroll
+from synth.render.anatomy.chart import Chart, places, unroll
 from synth.render.anatomy.tree import Tree
 from synth.render.anatomy.vessels import Vessels
 
@@ -67,7 +67,7 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
     Raises:
         UserError: there is no surface under the opening.
     """
-    extent = _extent(anatomy)
+    extent = 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
     side = max(20, round(anatomy.vertices**0.5))
     axis = np.linspace(-extent / 2, extent / 2, side)
     x, y = np.meshgrid(axis, axis)
@@ -83,7 +83,8 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
     def height(at: Floats) -> Floats:
         if brain is not None:
             return noise.sample(outer, at, extent).astype(np.float64)
-        return _dome(at, anatomy.dome_mm) - relief.sulcus_mm * noise.sample(sulci, at, extent)
+        dome = np.sqrt(np.maximum(anatomy.dome_mm**2 - (at**2).sum(axis=1), 0)) - anatomy.dome_mm
+        return np.asarray(dome - relief.sulcus_mm * noise.sample(sulci, at, extent))
 
     pia = height(xy)
     chart = unroll(height, extent, anatomy.craniotomy.radius_mm + MARGIN_MM / 2)
@@ -99,7 +100,7 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
         uv=(laid / chart.extent_mm + 0.5).astype(np.float32),
         extent_mm=extent,
         chart=chart,
-        sulci=noise.sample(sulci, chart.places(_RELIEF_PX), extent).reshape(_RELIEF_PX, _RELIEF_PX),
+        sulci=noise.sample(sulci, places(chart, _RELIEF_PX), extent).reshape(_RELIEF_PX, _RELIEF_PX),
         vessels=tree,
         seed=relief.seed,
     )
@@ -110,14 +111,6 @@ def bulge(tree: Tree, extent_mm: float) -> Map:
     distance, radius = tube.raster(tree, _BULGE_PX, extent_mm)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
     return noise.blur(inside.astype(np.float32), 0.2, extent_mm)
-
-
-def _extent(anatomy: schema.AnatomySection) -> float:
-    return 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
-
-
-def _dome(xy: Floats, radius: float) -> Floats:
-    return np.asarray(np.sqrt(np.maximum(radius**2 - (xy**2).sum(axis=1), 0)) - radius)
 
 
 def _folds(relief: Relief, extent_mm: float) -> Map:
@@ -145,12 +138,15 @@ def _beds(veins: Tree, extent_mm: float) -> Map:
 def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
     """Height (n, n) mm of the arachnoid over a brain, and its sulci (n, n) from 0 to 1."""
     height = _height_map(brain, extent, _RELIEF_PX // 2)
-    if np.isnan(height).mean() > 1 - LEAST_FILLED:
+    hole = np.isnan(height)
+    if hole.mean() > 1 - LEAST_FILLED:
         raise UserError(
             "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
             "mesh finds suitable places"
         )
-    height = _filled(height)
+    if hole.any():  # the height of the nearest pixel
+        nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
+        height = height[tuple(nearest)]
     # The arachnoid bridges narrow clefts: a closing, then a smoothing.
     pixel = extent / len(height)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(2.0 / pixel) + 1,) * 2)
@@ -188,12 +184,3 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
         window = height[y0 : y1 + 1, x0 : x1 + 1]
         height[y0 : y1 + 1, x0 : x1 + 1] = np.fmax(window, z)
     return height
-
-
-def _filled(height: Map) -> Map:
-    """Fills holes with the height of the nearest pixel."""
-    hole = np.isnan(height)
-    if not hole.any():
-        return height
-    row, column = distance_transform_edt(hole, return_distances=False, return_indices=True)
-    return np.asarray(height[row, column], np.float32)

@@ -102,16 +102,13 @@ def _pulls(nearest: Ints, toward: Floats) -> tuple[Ints, Floats]:
 
 def murray(parent: Ints, leaf: float) -> Floats:
     """Radii (N,) mm by Murray's law from leaves of radius `leaf`; parents come before children."""
-    cubes = np.zeros(len(parent))
-    order = parent.tolist()
-    values = cubes.tolist()
-    smallest = leaf**3
-    for node in range(len(order) - 1, -1, -1):
-        if values[node] == 0.0:
-            values[node] = smallest
-        if order[node] >= 0:
-            values[order[node]] += values[node]
-    return np.asarray(np.cbrt(np.asarray(values)), np.float64)
+    up = parent.tolist()
+    cubes = [0.0] * len(up)
+    for node in range(len(up) - 1, -1, -1):
+        cubes[node] = cubes[node] or leaf**3
+        if up[node] >= 0:
+            cubes[up[node]] += cubes[node]
+    return np.asarray(np.cbrt(np.asarray(cubes)), np.float64)
 
 
 def taper(nodes: Floats, parent: Ints, length: float) -> Floats:
@@ -166,10 +163,9 @@ def relaxed(nodes: Floats, parent: Ints, fixed: int, rounds: int) -> Floats:
     has = np.flatnonzero(parent >= 0)
     for _ in range(rounds):
         total, count = np.zeros_like(nodes), np.zeros(len(nodes))
-        np.add.at(total, has, nodes[parent[has]])
-        np.add.at(count, has, 1)
-        np.add.at(total, parent[has], nodes[has])
-        np.add.at(count, parent[has], 1)
+        for one, neighbour in ((has, parent[has]), (parent[has], has)):
+            np.add.at(total, one, nodes[neighbour])
+            np.add.at(count, one, 1)
         moved = 0.5 * nodes + 0.5 * total / np.maximum(count, 1)[:, None]
         inner = (np.arange(len(nodes)) >= fixed) & (count > 1)
         nodes = np.where(inner[:, None], moved, nodes)

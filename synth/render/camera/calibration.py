@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,40 +27,19 @@ _LARGEST = 1e6  # of any value in px, and of a distortion coefficient
 _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
 
-@dataclass(frozen=True)
-class CameraCalibration:
-    """Intrinsics of a calibrated camera, for pictures of one size."""
+def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
+    """Intrinsics of a calibrated camera from a file, for pictures of a size with the same field of view.
 
-    K: Floats  # (3, 3) px, centre of the top-left pixel at (0, 0)
-    distortion: Floats  # (5,) k1, k2, p1, p2, k3
-    size: tuple[int, int] | None  # width, height of the pictures it was made from, if given
+    Args:
+        path: the file.
+        size: width, height [px].
 
-    def fitted(self, size: tuple[int, int]) -> Floats:
-        """K (3, 3) for pictures of another size with the same field of view.
-
-        Raises:
-            UserError: the shapes of the pictures differ.
-        """
-        if self.size is None or self.size == size:
-            return self.K
-        across, down = size[0] / self.size[0], size[1] / self.size[1]
-        if abs(across / down - 1) > 0.01:
-            raise UserError(
-                f"render.calibration: made from pictures of {self.size[0]} x {self.size[1]}, whose shape "
-                f"differs from render.size {size[0]} x {size[1]}; change render.size"
-            )
-        K = self.K.copy()
-        # Pixel centres, not corners, are whole numbers.
-        K[0, 0], K[0, 2] = K[0, 0] * across, (K[0, 2] + 0.5) * across - 0.5
-        K[1, 1], K[1, 2] = K[1, 1] * down, (K[1, 2] + 0.5) * down - 0.5
-        return K
-
-
-def read(path: Path) -> CameraCalibration:
-    """Reads the calibration in a file.
+    Returns:
+        K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (5,) k1, k2, p1, p2, k3.
 
     Raises:
-        UserError: it cannot be read, or is not of a pinhole camera with Brown-Conrady distortion.
+        UserError: it cannot be read, is not of a pinhole camera with Brown-Conrady distortion, or was made
+            from pictures of another shape.
     """
     largest, is_json = identity.FILES["render", "calibration"], path.suffix.lower() == ".json"
     try:
@@ -69,35 +47,51 @@ def read(path: Path) -> CameraCalibration:
     except UserError as error:
         raise UserError(f"render.calibration: {error}") from None
     if not isinstance(found, dict):
-        raise UserError(f"render.calibration: {path.name}: holds no named values")
+        raise _error(path, "holds no named values")
     K = _array(path, found, _MATRIX, "camera matrix")
     if K.shape != (3, 3):
-        raise UserError(f"render.calibration: {path.name}: the camera matrix is {K.shape}, not 3 x 3")
+        raise _error(path, f"the camera matrix is {K.shape}, not 3 x 3")
     if (
         not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and np.abs(K).max() < _LARGEST)
         or abs(K[0, 1]) > 1e-6 * K[0, 0]
     ):
-        raise UserError(
-            f"render.calibration: {path.name}: the camera matrix has skew, or values out of range"
-        )
+        raise _error(path, "the camera matrix has skew, or values out of range")
     lens = _array(path, found, _LENS, "distortion coefficients").ravel()
     if not (np.abs(lens) < _LARGEST).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
-        raise UserError(
-            f"render.calibration: {path.name}: {len(lens)} distortion coefficients; "
-            "needed are k1 k2 p1 p2 and perhaps k3 (no rational, thin-prism or fisheye model)"
+        raise _error(
+            path,
+            f"{len(lens)} distortion coefficients; "
+            "needed are k1 k2 p1 p2 and perhaps k3 (no rational, thin-prism or fisheye model)",
         )
-    size = None
+    return _resized(path, K, found, size), np.resize(np.append(lens, np.zeros(5)), 5)
+
+
+def _resized(path: Path, K: Floats, found: dict[str, Any], size: tuple[int, int]) -> Floats:
+    """K (3, 3) for pictures of another size than those it was made from, if these are known."""
     for wide, tall in _SIZE:
         if wide in found and tall in found:
-            try:
-                size = (int(float(found[wide])), int(float(found[tall])))
-            except (TypeError, ValueError, OverflowError):
-                size = (0, 0)
-            if min(size) < 1:
-                raise UserError(
-                    f"render.calibration: {path.name}: {wide} and {tall} are not a picture's size"
-                )
-    return CameraCalibration(K, np.resize(np.append(lens, np.zeros(5)), 5), size)
+            break
+    else:
+        return K
+    try:
+        width, height = int(float(found[wide])), int(float(found[tall]))
+    except (TypeError, ValueError, OverflowError):
+        width, height = 0, 0
+    if min(width, height) < 1:
+        raise _error(path, f"{wide} and {tall} are not a picture's size")
+    if (width, height) == size:
+        return K
+    across, down = size[0] / width, size[1] / height
+    if abs(across / down - 1) > 0.01:
+        raise UserError(
+            f"render.calibration: made from pictures of {width} x {height}, whose shape "
+            f"differs from render.size {size[0]} x {size[1]}; change render.size"
+        )
+    K = K.copy()
+    # Pixel centres, not corners, are whole numbers.
+    K[0, 0], K[0, 2] = K[0, 0] * across, (K[0, 2] + 0.5) * across - 0.5
+    K[1, 1], K[1, 2] = K[1, 1] * down, (K[1, 2] + 0.5) * down - 0.5
+    return K
 
 
 def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str) -> Floats:
@@ -110,5 +104,9 @@ def _array(path: Path, found: dict[str, Any], names: tuple[str, ...], what: str)
                 value = np.reshape(value["data"], (int(value["rows"]), -1))
             return np.asarray(value, np.float64)
         except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
-            raise UserError(f"render.calibration: {path.name}: {name} is not a matrix of numbers") from None
-    raise UserError(f"render.calibration: {path.name}: holds no {what} (looked for {', '.join(names)})")
+            raise _error(path, f"{name} is not a matrix of numbers") from None
+    raise _error(path, f"holds no {what} (looked for {', '.join(names)})")
+
+
+def _error(path: Path, fault: str) -> UserError:
+    return UserError(f"render.calibration: {path.name}: {fault}")

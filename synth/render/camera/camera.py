@@ -84,8 +84,7 @@ def place(view: CameraView, render: RenderSection) -> Camera:
         K = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
         distortion = np.asarray(render.distortion, np.float64)
     else:
-        known = calibration.read(render.calibration)
-        K, distortion = known.fitted(render.size), known.distortion
+        K, distortion = calibration.read(render.calibration, render.size)
     return Camera(
         K=K,
         distortion=distortion,
@@ -125,7 +124,7 @@ def visible_radius(camera: Camera) -> float:
 def refuse_unfit(render: RenderSection) -> None:
     """Raises UserError for a calibration that cannot be read or was made from pictures of another shape."""
     if render.calibration is not None:
-        calibration.read(render.calibration).fitted(render.size)
+        calibration.read(render.calibration, render.size)
 
 
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from synth.job.schema import AnatomySection
 from synth.render import instrument
 from synth.render.anatomy import surface
-from synth.render.anatomy.chart import Chart, unroll
+from synth.render.anatomy.chart import Chart, places, unroll
 from synth.render.anatomy.tree import murray
 from synth.render.appearance.reflection import Theatre
 from synth.sequence import scenario
@@ -47,7 +47,7 @@ def test_what_can_be_unrolled_keeps_its_lengths() -> None:
 
 def test_a_place_is_found_again() -> None:
     chart = unroll(folds, PLAN, RADIUS)
-    there = chart.at(chart.places(64)).reshape(64, 64, 2)
+    there = chart.at(places(chart, 64)).reshape(64, 64, 2)
     middle = ((np.arange(64) + 0.5) / 64 - 0.5) * chart.extent_mm
     assert np.abs(there - np.stack(np.meshgrid(middle, middle), axis=-1)).max() < 0.05
     np.testing.assert_array_equal(chart.shift, unroll(folds, PLAN, RADIUS).shift)
@@ -96,7 +96,7 @@ DARK = Theatre(np.zeros((2, 2, 3), np.float32), 30.0, (), np.zeros(3), np.array(
 
 @pytest.mark.parametrize("kind", get_args(instrument.Kind))
 def test_an_instrument_ends_at_its_tips(kind: instrument.Kind) -> None:
-    made = instrument.build([kind], [False], DARK)
+    made = instrument.build([kind], DARK, np.random.default_rng(0))
     points, _ = made.pose(TIPS, SHAFTS)
     assert np.isfinite(points).all()
     assert made.faces.max() == len(points) - 1
