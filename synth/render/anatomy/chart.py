@@ -49,10 +49,7 @@ def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float)
     Where the surface of the disc is flat enough, the projection on x, y. Else least-squares conformal maps by
     xatlas (B. Levy et al., Least squares conformal maps for automatic texture atlas generation, 2002).
 
-    Args:
-        height: (N,) mm of the surface at x, y (N, 2) mm.
-        plan_mm: side of the patch.
-        radius_mm: of the disc.
+    `height`: (N,) mm of the surface at x, y (N, 2) mm; `plan_mm`: side of the patch.
     """
     axis = noise.centres(_COARSE, plan_mm).astype(np.float64)
     plan = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)

@@ -17,28 +17,18 @@ _ROWS = 8  # of a map at a time: intermediate results stay in the processor's ca
 
 
 def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm: float, width: float) -> Map:
-    """Isotropic noise about one wavelength; zero mean, unit variance.
+    """Isotropic noise (pixels, pixels) float32 about one wavelength; zero mean, unit variance.
 
-    Args:
-        rng: source of the noise.
-        pixels: side of the map.
-        extent_mm: side of the square.
-        wavelength_mm: centre of the band.
-        width: half width of the band as a share of its centre frequency.
-
-    Returns:
-        (pixels, pixels) float32.
+    `width`: half width of the band as a share of its centre frequency.
     """
     frequency = _frequencies(pixels, extent_mm)
-    gain = np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2)
-    return _filtered(rng, pixels, gain)
+    return _filtered(rng, np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2))
 
 
 def fractal(rng: np.random.Generator, pixels: int, extent_mm: float, longest_mm: float, slope: float) -> Map:
     """Noise (n, n) of amplitude ~ 1/f^slope for waves below `longest_mm`; zero mean, unit variance."""
     frequency = _frequencies(pixels, extent_mm)
-    gain = (frequency**2 + longest_mm**-2) ** (-0.5 * slope)
-    return _filtered(rng, pixels, gain)
+    return _filtered(rng, (frequency**2 + longest_mm**-2) ** (-0.5 * slope))
 
 
 def blur(image: Map, sigma_mm: float, extent_mm: float) -> Map:
@@ -81,7 +71,8 @@ def _frequencies(pixels: int, extent_mm: float) -> Floats:
     return np.asarray(np.hypot(np.fft.fftfreq(pixels, step)[:, None], np.fft.rfftfreq(pixels, step)[None]))
 
 
-def _filtered(rng: np.random.Generator, pixels: int, gain: Floats) -> Map:
+def _filtered(rng: np.random.Generator, gain: Floats) -> Map:
+    pixels = len(gain)
     white = rng.standard_normal((pixels, pixels), dtype=np.float32)
     spectrum = np.fft.rfft2(white)
     gain[0, 0] = 0.0

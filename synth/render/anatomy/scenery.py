@@ -156,15 +156,9 @@ def with_patty(
 
 
 def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tuple[Floats, Indices, Floats]]:
-    """One or two cotton patties that lie half in the opening.
+    """One or two cotton patties that lie half in an opening with an edge (A,) mm, on points (N, 3) mm.
 
-    Args:
-        edge: (A,) mm, radius of the opening at even angles.
-        points: (N, 3) mm, of everything that they may lie on.
-        rng: source of their positions.
-
-    Returns:
-        Vertices (V, 3) mm, faces (F, 3), and the vertices' places on the patty (V, 2) mm, of each.
+    Of each: vertices (V, 3) mm, faces (F, 3), and the vertices' places on the patty (V, 2) mm.
     """
     tree = cKDTree(points[:, :2])
     faces = grid_faces(*_PATTY_GRID)[::-1, :, [0, 2, 1]].reshape(-1, 3)
@@ -172,12 +166,8 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
     for around in rng.uniform(0, 2 * np.pi) + np.pi * np.arange(int(rng.integers(1, 3))):
         at = edge_at(edge, around) + rng.uniform(-0.6, 1.2)
         turn = around + np.pi / 2 + rng.uniform(-0.6, 0.6)
-        rows, columns = _PATTY_GRID
-        u, v = np.meshgrid(
-            np.linspace(-1.06, 1.06, rows) * PATTY_MM[0],
-            np.linspace(-1.1, 1.1, columns) * PATTY_MM[1],
-            indexing="ij",
-        )
+        long, wide = (np.linspace(-1.06, 1.06, _PATTY_GRID[0]), np.linspace(-1.1, 1.1, _PATTY_GRID[1]))
+        u, v = np.meshgrid(long * PATTY_MM[0], wide * PATTY_MM[1], indexing="ij")
         c, s = np.cos(turn), np.sin(turn)
         x = at * np.cos(around) + c * u - s * v
         y = at * np.sin(around) + s * u + c * v

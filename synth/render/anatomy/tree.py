@@ -142,13 +142,9 @@ def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floa
 def scattered(
     extent_mm: float, spacing: float, rng: np.random.Generator, density: Map | None = None
 ) -> Floats:
-    """Points (n, 2) mm about `spacing` apart: a jittered grid, which neither clumps nor lines up.
+    """Points (n, 2) mm about `spacing` mm apart: a jittered grid, which neither clumps nor lines up.
 
-    Args:
-        extent_mm: side of the square.
-        spacing: of the points [mm].
-        rng: source of the points.
-        density: (m, m) share of the points that stay; all of them if not given.
+    `density`: (m, m) share of the points that stay; all of them if not given.
     """
     side = max(1, int(extent_mm / spacing))
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)

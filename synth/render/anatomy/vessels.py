@@ -53,13 +53,7 @@ class Vessels:
 
 
 def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
-    """Vessels that follow the sulci.
-
-    Args:
-        sulci: (n, n) depth below the gyri, 0 on a crown to 1 in a sulcus.
-        extent_mm: side of the square that the map covers.
-        rng: of the anatomy.
-    """
+    """Vessels of a square patch, along its sulci (n, n): 0 on a crown to 1 in a sulcus."""
     veins = _branched(VEINS, _trunks(VEINS, sulci, extent_mm, rng), extent_mm, rng)
     trunks = _trunks(ARTERIES, sulci, extent_mm, rng)
     # The density of arteries varies between gyri, and is 0 on a wide vein.

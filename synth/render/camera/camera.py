@@ -69,9 +69,7 @@ def place(view: CameraView, render: RenderSection) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
     width, height = render.size
     tilt, azimuth, roll = np.deg2rad([view.tilt_deg, view.azimuth_deg, view.roll_deg])
-    backward = np.array(
-        [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)], dtype=np.float64
-    )
+    backward = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     # Any axis across the view is a start; roll makes the orientation uniform.
     right = np.cross([0.0, 1.0, 0.0], backward)
     right /= np.linalg.norm(right)

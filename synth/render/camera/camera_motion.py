@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from synth.arrays import Floats
 from synth.render.camera.camera import Camera
 
 _SLOW_HZ = (0.05, 0.25)
@@ -26,15 +25,12 @@ class CameraMotion:
         """The camera at a time, `camera` being that of time 0."""
         if self.drift_mm == 0:
             return camera
-        shift = self._waves(seconds) * self.drift_mm / np.sqrt(_WAVES)
-        turn = Rotation.from_rotvec(shift[3:] * _TURN).as_matrix()
-        # The rotation is about the craniotomy, which so stays in view.
-        return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])
-
-    def _waves(self, seconds: float) -> Floats:
-        """Six random waves (x, y, z and three rotations), 0 at time 0."""
+        # Six random waves (x, y, z and three rotations), 0 at time 0.
         rng = np.random.default_rng([self.seed, 0])
         hertz = rng.uniform(*_SLOW_HZ, (_WAVES, 6))
         phase = rng.uniform(0, 2 * np.pi, (_WAVES, 6))
-        total = np.sin(2 * np.pi * hertz * seconds + phase) - np.sin(phase)
-        return np.asarray(total.sum(axis=0))
+        waves = np.sin(2 * np.pi * hertz * seconds + phase) - np.sin(phase)
+        shift = waves.sum(axis=0) * self.drift_mm / np.sqrt(_WAVES)
+        turn = Rotation.from_rotvec(shift[3:] * _TURN).as_matrix()
+        # The rotation is about the craniotomy, which so stays in view.
+        return replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + shift[:3])

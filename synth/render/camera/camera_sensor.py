@@ -37,15 +37,9 @@ class CameraSensor:
 
 
 def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Pixels:
-    """The 8-bit sRGB picture of a linear one.
+    """The sRGB picture (H, W, 3) uint8 of linear radiance (H, W, 3) float32.
 
-    Args:
-        radiance: (H, W, 3) float32, linear.
-        sensor: the camera.
-        rng: photon and readout noise.
-
-    Returns:
-        (H, W, 3) uint8.
+    `rng`: source of photon and readout noise.
     """
     video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
     video = _sharpen(video, sensor.sharpening)
@@ -67,9 +61,8 @@ def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator
     light = _scatter(light, sensor.bloom)
     balanced = rng.standard_normal(light.shape, dtype=np.float32)
     well, read = np.float32(sensor.full_well), np.float32(sensor.read_noise**2)
-    most = np.float32(_HEADROOM)
-    steps = np.float32(2**sensor.bits - 1) / most
-    _convert(np.asarray(light, np.float32), well, read, steps, most, white / least, balanced)
+    steps = np.float32(2**sensor.bits - 1) / np.float32(_HEADROOM)
+    _convert(np.asarray(light, np.float32), well, read, steps, white / least, balanced)
     return balanced
 
 
@@ -80,9 +73,9 @@ def processed(linear: Map, matrix: Matrix, curves: Curves) -> Map:
     `encoded(KNOTS)` give plain sRGB. Black is 0.
     """
     video = np.empty(linear.shape, np.float32)
+    light = np.ascontiguousarray(linear, np.float32)
     red, green, blue = (_table(curve) for curve in curves)
-    light, mixed = np.ascontiguousarray(linear, np.float32), np.array(matrix, np.float32)
-    _look_up(light, mixed, red, green, blue, video)
+    _look_up(light, np.array(matrix, np.float32), red, green, blue, video)
     return video
 
 
@@ -96,19 +89,13 @@ def _table(curve: Curve) -> Map:
 
 @vectorised
 def _convert(
-    light: Map,
-    well: np.float32,
-    read: np.float32,
-    steps: np.float32,
-    most: np.float32,
-    white: Map,
-    noise: Map,
+    light: Map, well: np.float32, read: np.float32, steps: np.float32, white: Map, noise: Map
 ) -> None:
-    """Noise, converter with `steps` per full scale, and white balance, up to `most` full scales.
+    """Noise, converter with `steps` per full scale, and white balance, up to `_HEADROOM`.
 
     Normal `noise` (H, W, 3) is overwritten by the result.
     """
-    zero = np.float32(0)
+    zero, most = np.float32(0), np.float32(_HEADROOM)
     for y in range(light.shape[0]):
         for x in range(light.shape[1]):
             for k in range(3):

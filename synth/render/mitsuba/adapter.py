@@ -25,7 +25,6 @@ from synth.render.camera.camera import Camera
 from synth.render.content import Body, Lamp, Metal, Wet
 from synth.render.mitsuba.direct_light import trace
 from synth.render.mitsuba.edge_filter import soften
-from synth.render.mitsuba.glow import register_glow
 from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
 
@@ -74,21 +73,25 @@ class Stage:
         mi.set_variant(variant)
         self._jit = "scalar" not in variant
         if self._jit:
-            register_glow(variant)
-        _limit_threads()
+            _register_glow(variant)
+        if threads := os.environ.get("SULCUS_THREADS"):  # where several workers share a machine
+            import drjit as dr
+
+            dr.set_thread_count(int(threads))
         self.variant = variant
-        self._mi = mi
         self._faces = {name: body.faces for name, body in bodies.items()}
         scene: dict[str, Any] = {
             "type": "scene",
-            "integrator": _integrator(integrator),
             # A GPU may sort paths by what they hit, which changes the order of sums and so their last bits.
             "allow_thread_reordering": False,
         }
-        for index, lamp in enumerate(lamps):
-            scene[f"lamp{index}"] = _lamp(mi, lamp)
-        for name, body in bodies.items():
-            scene[name] = _mesh(mi, name, body)
+        if integrator == "direct":
+            # Lamps are small: directions sampled from a surface's scattering hardly ever hit one.
+            scene["integrator"] = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+        else:
+            scene["integrator"] = {"type": "path", "max_depth": int(integrator.removeprefix("path"))}
+        scene |= {f"lamp{index}": _lamp(mi, lamp) for index, lamp in enumerate(lamps)}
+        scene |= {name: _mesh(mi, name, body) for name, body in bodies.items()}
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
         # Irradiance of all lamps at their targets, in green.
@@ -102,11 +105,13 @@ class Stage:
         self, name: str, vertices: Floats, *, film: Floats | None = None, glow: Floats | None = None
     ) -> None:
         """Moves a body's vertices (V, 3) mm; `film` and `glow` as of `Body` and `Metal`."""
+        import mitsuba as mi
+
         new = {"positions": vertices, "normals": _bent(vertices, self._faces[name], film), "glow": glow}
         for key, values in new.items():
             if values is not None:
                 flat = _aligned(values, np.float32)
-                self._parameters[f"{name}.vertex_{key}"] = self._mi.Float(flat) if self._jit else flat
+                self._parameters[f"{name}.vertex_{key}"] = mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it is, from a camera with the same lens."""
@@ -118,7 +123,9 @@ class Stage:
             light = trace(self._scene, lens.sensor, self._size, "metal", lens.spp, seed)
             radiance = soften(light, self._power, lens.spp)
         else:
-            image = self._mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
+            import mitsuba as mi
+
+            image = mi.render(self._scene, sensor=lens.sensor, spp=lens.spp, seed=seed)
             radiance = lens.develop(np.array(image, dtype=np.float32)[..., :3])
         if self.variant.startswith("llvm"):
             # Memory goes back after each frame: allocating anew is cheap on a CPU, unlike on a GPU.
@@ -136,7 +143,9 @@ def forget() -> None:
         import drjit as dr
 
         dr.flush_malloc_cache()
-    _trim()
+    # glibc would hold free pages after maps are painted.
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
 
 
 @functools.cache
@@ -145,27 +154,46 @@ def _freeze_modules() -> None:
     gc.freeze()
 
 
-def _trim() -> None:
-    """Returns free pages to the system, which glibc would hold after maps are painted."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
+@functools.cache
+def _register_glow(variant: str) -> None:
+    """Registers an emitter `sulcus_glow` that is visible but never sampled, in one compiled variant.
 
+    Mitsuba's own area light with a sampling weight of 0 is not sampled either, but its sampling would still
+    be compiled, with the mesh's number of faces in the code, which takes a kernel for every scene.
+    """
+    import drjit as dr
+    import mitsuba as mi
 
-def _limit_threads() -> None:
-    """Limits Dr.Jit's threads where several workers share a machine."""
-    threads = os.environ.get("SULCUS_THREADS")
-    if threads:
-        import drjit as dr
+    class Glow(mi.Emitter):
+        """An emitter of a texture's radiance to the side of the normals."""
 
-        dr.set_thread_count(int(threads))
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.radiance = props["radiance"]
+            self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, self.radiance.eval(si, active), 0)
 
-def _integrator(kind: str) -> dict[str, Any]:
-    if kind == "direct":
-        # Lamps are small: directions sampled from a surface's scattering hardly ever hit one.
-        return {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
-    return {"type": "path", "max_depth": int(kind.removeprefix("path"))}
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
+            return dr.zeros(mi.DirectionSample3f), dr.zeros(mi.Color3f)
+
+        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Color3f(0)
+
+        def bbox(self) -> Any:
+            return self.get_shape().bbox()
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("radiance", self.radiance, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "SulcusGlow[]"
+
+    mi.register_emitter("sulcus_glow", Glow)
 
 
 def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
@@ -190,10 +218,15 @@ def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
 def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
+    # Light that is not of a lamp: reflections of metal, ambient light on tissue.
+    if isinstance(body.material, Metal):
+        radiance = {"type": "mesh_attribute", "name": "vertex_glow"}
+    else:
+        half = cv2.resize(body.material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        radiance = _bitmap(mi, half * np.asarray(body.material.ambient, np.float32))
     # Visible, but never sampled as a lamp, since its weight is 0.
     kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
-    glow = {"type": kind, "radiance": _glow(mi, body.material), "sampling_weight": 0.0}
-    properties["glow"] = mi.load_dict(glow)
+    properties["glow"] = mi.load_dict({"type": kind, "radiance": radiance, "sampling_weight": 0.0})
     mesh = mi.Mesh(
         name,
         vertex_count=len(body.vertices),
@@ -234,14 +267,6 @@ def _aligned(values: Array, kind: type[np.generic]) -> Array:
     flat = raw[start : start + count * np.dtype(kind).itemsize].view(kind)
     flat[:] = values.ravel()
     return flat
-
-
-def _glow(mi: Any, material: Wet | Metal) -> dict[str, Any]:
-    """Radiance of a body by light that is not of a lamp: reflections of metal, ambient light on tissue."""
-    if isinstance(material, Metal):
-        return {"type": "mesh_attribute", "name": "vertex_glow"}
-    half = cv2.resize(material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return _bitmap(mi, half * np.asarray(material.ambient, np.float32))
 
 
 def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:

@@ -46,42 +46,32 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
     found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
     number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
     sums = [dr.zeros(mi.Float, width * height) for _ in range(11)]
-    for first in range(0, spp, _AT_ONCE):
-        _add_paths(scene, lens, size, (first, min(spp - first, _AT_ONCE)), (shift, seeds, number), sums)
+    for before in range(0, spp, _AT_ONCE):
+        count = min(spp - before, _AT_ONCE)
+        first, paths = (dr.opaque(mi.UInt32, whole) for whole in (before, count))
+        path = dr.arange(mi.UInt32, width * height * count)
+        pixel = path // paths
+        x, y = pixel % width, pixel // width
+        index = dr.brev(((_spread(x) | (_spread(y) << 1)) << shift) | (first + path - pixel * paths))
+        inside, aperture, window = (_pair(index, seeds[3 * n : 3 * n + 3]) for n in range(3))
+        place = mi.Point2f((x + inside.x) / width, (y + inside.y) / height)
+        ray, _ = lens.sample_ray_differential(0.0, 0.0, place, aperture)
+        si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+        hit = si.is_valid()
+        lamp, weight = scene.sample_emitter_direction(si, window, False, hit)
+        scattered = weight * si.bsdf(ray).eval(mi.BSDFContext(), si, si.to_local(lamp.d), hit)
+        shadow = hit & scene.ray_test(si.spawn_ray_to(lamp.p), hit)
+        radiance = si.emitter(scene).eval(si) + dr.select(shadow, 0, scattered)
+        depth = dr.dot(si.p - lens.centre, lens.rows[2])
+        blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
+        near = hit & (blur > _BLURRED_PX) & (dr.reinterpret_array(mi.UInt32, si.shape) == number)
+        parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1)))]
+        parts.append((shadow & ~near, (*scattered, weight.y)))
+        for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
+            dr.scatter_add(total, value, pixel, where)
+        dr.eval(sums)
     means = np.stack([np.array(total) for total in sums]).reshape(-1, height, width) * np.float32(1 / spp)
     return Light(means[:3], means[3:6], means[6], means[7:10], means[10])
-
-
-def _add_paths(
-    scene: Any, lens: Any, size: tuple[int, int], which: tuple[int, int], order: Any, sums: Any
-) -> None:
-    """Adds the light of paths `which` (first, count) of each pixel to the pixels' sums."""
-    import drjit as dr
-    import mitsuba as mi
-
-    width, height = size
-    first, paths = (dr.opaque(mi.UInt32, number) for number in which)
-    shift, seeds, steel = order
-    path = dr.arange(mi.UInt32, width * height * which[1])
-    pixel = path // paths
-    x, y = pixel % width, pixel // width
-    index = dr.brev(((_spread(x) | (_spread(y) << 1)) << shift) | (first + path - pixel * paths))
-    inside, aperture, window = (_pair(index, seeds[3 * n : 3 * n + 3]) for n in range(3))
-    place = mi.Point2f((x + inside.x) / width, (y + inside.y) / height)
-    ray, _ = lens.sample_ray_differential(0.0, 0.0, place, aperture)
-    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
-    hit = si.is_valid()
-    lamp, weight = scene.sample_emitter_direction(si, window, False, hit)
-    scattered = weight * si.bsdf(ray).eval(mi.BSDFContext(), si, si.to_local(lamp.d), hit)
-    shadow = hit & scene.ray_test(si.spawn_ray_to(lamp.p), hit)
-    radiance = si.emitter(scene).eval(si) + dr.select(shadow, 0, scattered)
-    depth = dr.dot(si.p - lens.centre, lens.rows[2])
-    blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
-    near = hit & (blur > _BLURRED_PX) & (dr.reinterpret_array(mi.UInt32, si.shape) == steel)
-    parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1))), (shadow & ~near, (*scattered, weight.y))]
-    for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
-        dr.scatter_add(total, value, pixel, where)
-    dr.eval(sums)
 
 
 def _pair(index: Any, seeds: list[Any]) -> Any:

@@ -54,7 +54,7 @@ class Scalar:
     def __init__(self, camera: Camera, spp: int) -> None:
         self._fine = 2 if spp >= 4 else 1
         self.spp = max(1, spp // self._fine**2)
-        self._fit(camera)
+        self._K = np.zeros((3, 3))  # of what the film was fitted to
         self.place(camera)
 
     def _fit(self, camera: Camera) -> None:
@@ -71,9 +71,8 @@ class Scalar:
         at = (flat * fx * self._fine).reshape(*x.shape, 2)
         half = np.ceil(np.abs(at).max(axis=(0, 1))).astype(int) + 1
         self._at = (at + half - 0.5).astype(np.float32)
-        film_width, film_height = (2 * half).tolist()
-        self._width, self._height = film_width, film_height
-        self._fov = float(np.rad2deg(2 * np.arctan(film_width / (2 * fx * self._fine))))
+        self._film = _film(*(2 * half).tolist())
+        self._fov = float(np.rad2deg(2 * np.arctan(self._film["width"] / (2 * fx * self._fine))))
 
     def place(self, camera: Camera) -> None:
         """Moves the lens to the camera's pose."""
@@ -94,7 +93,7 @@ class Scalar:
                 "near_clip": 1.0,
                 "far_clip": 1e4,
                 "to_world": mi.ScalarTransform4f(to_world.tolist()),
-                "film": _film(self._width, self._height),
+                "film": self._film,
                 "sampler": {"type": "multijitter", "sample_count": self.spp},
             }
         )
