@@ -121,14 +121,9 @@ def trace_rest(camera: Camera, surface: Shape, static: Shape) -> RestFrame:
 
 
 def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, tool: Shape) -> FrameTruth:
-    """Ground truth of one frame.
+    """Ground truth of one frame, of a camera with the lens of the rest frame.
 
-    Args:
-        camera: the camera of this frame, with the lens of the rest frame.
-        rest: of the rest frame.
-        surface: the fine surface in this frame.
-        static: what never moves.
-        tool: the instruments in this frame.
+    `surface`: the fine one in this frame; `static`: what never moves; `tool`: the instruments in this frame.
     """
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
@@ -156,11 +151,8 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
 def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> Map:
     """Flow (H, W, 2) px from each pixel of one frame to another frame; 0 off the tissue.
 
-    Args:
-        hits: of the first frame's pixels, the surface's faces first.
-        faces: of the surface.
-        vertices: (V, 3) mm, the surface in the other frame.
-        camera: of the other frame.
+    `hits`: of the first frame's pixels, the surface's faces first; `vertices` (V, 3) mm of the surface and
+    `camera`: of the other frame.
     """
     on = (hits.face >= 0) & (hits.face < len(faces))
     points = blend(faces, hits.face[on], hits.bary[on], vertices)

@@ -337,7 +337,5 @@ def _under(surface: CortexSurface, xy: Floats) -> Floats:
     height = surface.vertices[:, 2][near].mean(axis=1)
     # The patch's own dome, as the paraboloid through its heights.
     r2 = (surface.vertices[:, :2] ** 2).sum(axis=1)
-    slope = float(
-        np.linalg.lstsq(np.stack([r2, np.ones_like(r2)], 1), surface.vertices[:, 2], rcond=None)[0][0]
-    )
+    (slope, _), *_ = np.linalg.lstsq(np.stack([r2, np.ones_like(r2)], 1), surface.vertices[:, 2], rcond=None)
     return np.asarray(height + slope * ((xy**2).sum(axis=1) - (inner**2).sum(axis=1)))

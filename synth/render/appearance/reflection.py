@@ -86,13 +86,9 @@ def _ceiling_lamps(direction: Floats, seed: int) -> Floats:
     """Radiance (N, 1) of the theatre's lamps."""
     rng = np.random.default_rng([seed, 3])
     total = np.zeros((len(direction), 1))
-    for azimuth, height, size, power in zip(
-        rng.uniform(0, 2 * np.pi, _LAMPS),
-        rng.uniform(0.05, 0.8, _LAMPS),
-        rng.uniform(0.10, 0.28, _LAMPS),
-        rng.uniform(0.6, 2.6, _LAMPS),
-        strict=True,
-    ):
+    ranges = (0.0, 2 * np.pi), (0.05, 0.8), (0.10, 0.28), (0.6, 2.6)
+    drawn = [rng.uniform(*ends, _LAMPS) for ends in ranges]
+    for azimuth, height, size, power in zip(*drawn, strict=True):
         flat = np.sqrt(1 - height**2)
         middle = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), height])
         total += power * np.exp(-np.maximum(1 - direction @ middle, 0) / (0.5 * size**2))[:, None]

@@ -179,9 +179,9 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
         error = _distort(guess, distortion) - flat
         if not error.size or np.abs(error).max() < 1e-14:
             return guess
-        a, b, c, d = _slope(guess, distortion)
-        determinant = a * d - b * c
-        step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], 1)
+        a, b, d = _slope(guess, distortion)
+        determinant = a * d - b * b
+        step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], 1)
         guess = guess - step / determinant[:, None]
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
         raise UserError("render.distortion: folds the picture over itself; choose smaller coefficients")
@@ -195,26 +195,18 @@ def _distort(flat: Floats, distortion: Floats) -> Floats:
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        ],
-        axis=1,
-    )
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    return np.stack([across, down], axis=1)
 
 
-def _slope(flat: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Jacobian of the distortion, row by row."""
+def _slope(flat: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats]:
+    """Jacobian of the distortion, which is symmetric: (0, 0), (0, 1) and (1, 1)."""
     k1, k2, p1, p2, k3 = distortion
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     growth = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
     cross = growth * x * y + 2 * p1 * x + 2 * p2 * y
-    return (
-        radial + growth * x * x + 2 * p1 * y + 6 * p2 * x,
-        cross,
-        cross,
-        radial + growth * y * y + 2 * p2 * x + 6 * p1 * y,
-    )
+    across = radial + growth * x * x + 2 * p1 * y + 6 * p2 * x
+    return across, cross, radial + growth * y * y + 2 * p2 * x + 6 * p1 * y
