@@ -24,16 +24,10 @@ class Lens:
 
 
 def read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> Lens:
-    """The camera of a calibration message.
+    """The camera of a calibration message `info` of ROS 1 or 2.
 
-    Args:
-        topic: the message's topic.
-        info: the message, of ROS 1 or 2.
-        pictures: the topic of the camera's pictures; those named `image_rect...` are already rectified.
-        size: width and height of the pictures [px].
-
-    Raises:
-        UserError: no calibration, or one for pictures of another size.
+    `pictures`: the topic of the camera's pictures, of width and height `size` [px]; those named
+    `image_rect...` are already rectified. Raises UserError for no calibration, or one for another size.
     """
     K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
     if (info.width, info.height) != size:
@@ -65,8 +59,7 @@ def info_name(topic: str) -> str:
 def join_pair(left: Lens, right: Lens) -> dict[str, Floats]:
     """K1, D1, K2, D2, R, T [mm] as in OpenCV's `stereoCalibrate`: x_right = R x_left + T.
 
-    Raises:
-        UserError: the baseline is 0.
+    Raises UserError if the baseline is 0.
     """
     baseline = right.shift_mm - left.shift_mm
     if not baseline:

@@ -76,12 +76,8 @@ class Intake:
 def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     """Opens a source.
 
-    Args:
-        source: the file, or the folder of a ROS 2 bag.
-        use: role → name in the source, where the choice is ambiguous.
-
-    Raises:
-        UserError: unknown format, a library that is not installed, no usable contents, an ambiguous choice.
+    `use`: role → name in the source, where the choice is ambiguous. Raises UserError for an unknown format, a
+    library that is not installed, no usable contents, or an ambiguous choice.
     """
     if not source.is_dir():
         checked_file.check_file(source, _LARGEST_BYTES)
@@ -148,17 +144,9 @@ def write_recording(
 ) -> Path:
     """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
 
-    A right camera adds right/ and stereo.yaml, a depth camera depth/.
-
-    Args:
-        found: from `read_source`.
-        out: must not exist.
-        newtons: newtons per unit of force in the source.
-        about: contents of meta.yaml.
-        progress: called with the number of frames written.
-
-    Raises:
-        UserError: the folder exists, or a picture can't be decoded.
+    A right camera adds right/ and stereo.yaml, a depth camera depth/. `newtons`: per unit of force in the
+    source; `about`: contents of meta.yaml; `progress`: called with the number of frames written. Raises
+    UserError if the folder exists, or a picture can't be decoded.
     """
     with checked_file.folder_of(out) as part:
         # The container requires rising times; frames.csv has the true ones.

@@ -59,11 +59,9 @@ class Baseline:
 
 
 def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
-    """Rules fitted on the network's own fit sequences, for a fair comparison.
+    """Rules fitted on the network's own fit sequences `clips`, on `GRID`, for a fair comparison.
 
-    Args:
-        clips: the sequences, on `GRID`.
-        source: the displacement: `recovered` or `ideal`, in stereo `motion` or `motion-ideal`.
+    `source`: the displacement: `recovered` or `ideal`, in stereo `motion` or `motion-ideal`.
     """
     moved = np.concatenate([clip.displacement[source] for clip in clips])
     mask = np.concatenate([np.broadcast_to(clip.mask, (clip.frames, *clip.mask.shape)) for clip in clips])

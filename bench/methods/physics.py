@@ -22,7 +22,7 @@ from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from learn.data.clips import assumed_young
-from learn.data.grid import GridView
+from learn.data.grid import GridView, to_image
 from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
 from synth.job.types import MembraneState
@@ -141,12 +141,7 @@ class Physics:
         lattice[at[:, 1] + at.max(), at[:, 0] + at.max()] = (
             np.linalg.norm(found.load, axis=1) / known.node_area
         )
-        axes = [
-            (np.arange(n) - centre) * view.scale_mm_per_px / step + at.max()
-            for n, centre in zip(view.shape, view.centre_px[::-1], strict=True)
-        ]
-        shown = map_coordinates(lattice, np.meshgrid(*axes, indexing="ij"), order=1, mode="constant")
-        return np.asarray(shown, np.float32)
+        return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
 def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:

@@ -83,12 +83,16 @@ class Recording:
     def frames(self) -> Iterator[Picture]:
         """Upright frames in order, with times: from frames.csv if it exists, else the video, else `fps`.
 
-        Raises:
-            UserError: unreadable video or picture.
+        Raises UserError for an unreadable video or picture.
         """
-        first = next(iter(self.numbers()), 0)
+        first, fps = next(iter(self.numbers()), 0), self.meta.fps
         for picture in _pictures(self.footage):
-            yield self._timed(picture, first)
+            time_s = picture.time_s
+            if self.times_s is not None:
+                time_s = self.times_s.get(picture.index)
+            elif time_s is None and fps is not None:
+                time_s = (picture.index - first) / fps
+            yield replace(picture, time_s=time_s)
 
     def right_frames(self) -> Iterator[Picture]:
         """The right camera's frames in order, with the left frames' numbers. UserError: unreadable."""
@@ -123,14 +127,6 @@ class Recording:
         masks = masks.of_frames(self.numbers(), notes)
         return replace(self, masks=masks, region=region, notes=tuple(notes))
 
-    def _timed(self, picture: Picture, first: int) -> Picture:
-        time_s, fps = picture.time_s, self.meta.fps
-        if self.times_s is not None:
-            time_s = self.times_s.get(picture.index)
-        elif time_s is None and fps is not None:
-            time_s = (picture.index - first) / fps
-        return replace(picture, time_s=time_s)
-
 
 def _pictures(files: Video) -> Iterator[Picture]:
     return video.read_video(files) if isinstance(files, Path) else video.read_pictures(files)
@@ -143,12 +139,8 @@ def _numbers(files: Video) -> Collection[int]:
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
     """Reads everything but the pictures. Times since 1970 are counted from the recording's start.
 
-    Args:
-        folder: of the recording.
-        phantom: whether it shows a phantom, whatever meta.yaml states.
-
-    Raises:
-        UserError: no folder, bad meta.yaml, neither or both of video and frames, an unusable CSV.
+    `phantom`: whether it shows a phantom, whatever meta.yaml states. Raises UserError for no folder, a bad
+    meta.yaml, neither or both of video and frames, or an unusable CSV.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: no recording folder; `bench import` converts other systems' files")

@@ -24,13 +24,7 @@ def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["pn
     A stereo sequence adds the right camera and the calibration. Ground truth that a real recording lacks is
     not written: no true flow, no traction, no glare mask.
 
-    Args:
-        sequence: a sealed sequence.
-        folder: must not exist.
-        frames: `png` is lossless, `mp4` is H.264.
-
-    Raises:
-        UserError: the folder exists.
+    `frames`: `png` is lossless, `mp4` is H.264. Raises UserError if the folder exists.
     """
     folder = as_path("recording", folder)
     with checked_file.folder_of(folder) as part:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -46,18 +46,9 @@ def evaluate_recording(
 ) -> Result:
     """Tracks the recording and scores every method against its sensor.
 
-    Args:
-        recording: the opened recording.
-        methods: by name, in the table's order.
-        main: the method that the report is about.
-        scale: the recording's scale.
-        settings: of this run.
-        described: properties of the methods, for the report.
-        progress: called after every frame.
-        flow: computes the flow, e.g. in another process; None: computed here.
-
-    Raises:
-        UserError: as `track_recording` and `force_sensor.process_force`.
+    `methods`: by name, in the table's order, with `main`, which the report is about; `described`: their
+    properties. `progress`, `flow`: as of `track_recording`, whose UserError it raises, and that of
+    `force_sensor.process_force`.
     """
     # The lengths of flow are the least that a method should exceed.
     methods = {main: methods[main], **flow_sizes(), **methods}
@@ -67,42 +58,31 @@ def evaluate_recording(
     meta, time_s = recording.meta, np.array(tracked.time_s)
     sensor = align_sensor(recording, time_s, _speed(tracked), tracked.turning)
     findings = judge(recording, tracked, find_sensor_motion(recording, tracked, methods, sensor))
-    against = _select_frames(meta, tracked, sensor, bool(first_fault(findings)))
-    missing = tuple(one.message for one in findings if one.severity == "missing")
-    return Result(
+    scored, unscored = _select_frames(meta, tracked, sensor)
+    missing = [one.message for one in findings if one.severity == "missing"]
+    result = Result(
         recording=recording.name,
         main=main,
         time_s=time_s,
         sensor_mn=sensor.size_mn,
         sensor_axes_mn=sensor.axes_mn,
-        methods=_score_methods(methods, main, tracked, against),
+        methods={},
         scale=scale,
         relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=sensor.noise_floor_mn,
-        scored=against.scored,
-        lost=against.lost,
+        scored=scored,
+        lost=~np.array(tracked.trusted) | bool(first_fault(findings)),
         sync=sensor.offset,
-        notes=(*missing, *tracked.notes, *sensor.notes, *against.notes),
+        notes=(*missing, *tracked.notes, *sensor.notes, *unscored),
         steps=sensor.steps,
         settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
         tracked=tracked,
         turn=sensor.rotation,
         findings=problems(findings),
-        absolute=against.absolute,
+        absolute=meta.young_kpa is not None,
     )
-
-
-@dataclass(frozen=True)
-class _Reference:
-    """The data that every method is scored against."""
-
-    time_s: Floats
-    sensor: AlignedSensor
-    lost: Mask  # (T,) frames without valid forces
-    scored: Mask  # (T,) frames that are scored, unless they are lost
-    press: Mask | None  # (T,) frames of the calibrating press; None without one
-    absolute: bool  # whether E is known
-    notes: tuple[str, ...]  # on frames that are not scored
+    press = None if meta.press_s is None else _within(time_s, meta.press_s)
+    return replace(result, methods=_score_methods(methods, result, press, sensor.in_camera_axes))
 
 
 def _speed(tracked: TrackedRecording) -> Floats:
@@ -111,11 +91,8 @@ def _speed(tracked: TrackedRecording) -> Floats:
     return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
 
 
-def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor, fault: bool) -> _Reference:
-    """Selects the frames to score: not those that something is calibrated on, nor repeated pictures.
-
-    `fault`: whether no force of any frame is valid.
-    """
+def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor) -> tuple[Mask, list[str]]:
+    """Frames (T,) to score, not those that something is calibrated on, nor repeated pictures; and notes."""
     time_s = np.array(tracked.time_s)
     notes: list[str] = []
     scored = np.ones(len(time_s), bool)
@@ -131,10 +108,7 @@ def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor,
     again = _repeated(tracked, sensor.size_mn)
     if again.any():
         notes.append(f"{again.sum()} frames show an earlier one again, frozen or repeated: not scored")
-    lost = ~np.array(tracked.trusted) | fault
-    press = None if meta.press_s is None else _within(time_s, meta.press_s)
-    known = meta.young_kpa is not None
-    return _Reference(time_s, sensor, lost, scored & ~again, press, known, tuple(notes))
+    return scored & ~again, notes
 
 
 def _within(time_s: Floats, span: Span) -> Mask:
@@ -155,48 +129,55 @@ def _repeated(tracked: TrackedRecording, sensor_mn: Floats | None) -> Mask:
 
 
 def _score_methods(
-    methods: Mapping[str, Method], main: str, tracked: TrackedRecording, against: _Reference
+    methods: Mapping[str, Method], against: Result, press: Mask | None, in_camera_axes: bool
 ) -> dict[str, Scored]:
-    """Scores of each method by name, the main one first."""
+    """Scores of each method by name, the main one first.
+
+    `against`: the result without methods; `press`: (T,) frames of the calibrating press, if there is one;
+    `in_camera_axes`: whether components of the sensor's force can be compared.
+    """
     scored: dict[str, Scored] = {}
     for name, method in methods.items():
-        force, first, gain = np.array(tracked.force_mn[name], np.float64), scored.get(main), None
+        force, gain = np.array(against.tracked.force_mn[name], np.float64), None
+        first = scored.get(against.main)
         force[against.lost] = np.nan
         if isinstance(method, FlowSize):
-            gain = _fit_gain(_magnitude(force), main, first, against)
+            gain = _fit_gain(_magnitude(force), first, against, press)
             force *= gain.mn_per_mm
-        one = replace(_score(force, first, against), gain=gain)
-        scored[name] = _with_interval(one, tracked.bounds[name], against)
+        one = replace(_score(force, first, against, press, in_camera_axes), gain=gain)
+        scored[name] = _with_interval(one, against.tracked.bounds[name], against)
     return scored
 
 
-def _fit_gain(size: Floats, main: str, first: Scored | None, against: _Reference) -> Gain:
+def _fit_gain(size: Floats, first: Scored | None, against: Result, press: Mask | None) -> Gain:
     """The gain from a length of flow, (T,) mm, to force.
 
     Fitted on the press if there is one. Else in hindsight on the scored frames, which favours the baseline:
     a method with a larger error may lack only a gain. Without a sensor it is fitted to the main method.
     """
-    sensor = against.sensor.size_mn
+    sensor = against.sensor_mn
     if sensor is None:
         target = size if first is None else first.size_mn
-        return Gain(metrics.gain(target, size, np.ones(len(size), bool)), main)
-    if against.press is not None:
-        pressed = metrics.gain(sensor, size, against.press)
+        return Gain(metrics.gain(target, size, np.ones(len(size), bool)), against.main)
+    if press is not None:
+        pressed = metrics.gain(sensor, size, press)
         if math.isfinite(pressed):
             return Gain(pressed, "press")
     return Gain(metrics.gain(sensor, size, against.scored), "hindsight")
 
 
-def _score(force: Floats, first: Scored | None, against: _Reference) -> Scored:
+def _score(
+    force: Floats, first: Scored | None, against: Result, press: Mask | None, in_camera_axes: bool
+) -> Scored:
     """Scores one method's force (T, 3) against the sensor; `first`: the main method, if this is another."""
-    size, sensor, used = _magnitude(force), against.sensor.size_mn, against.scored
-    axes = against.sensor.axes_mn
+    size, sensor, used = _magnitude(force), against.sensor_mn, against.scored
+    axes = against.sensor_axes_mn
     if sensor is None or axes is None:
         return Scored(force, size)
     x, y = sensor[used], size[used]
-    scores, events = metrics.compute_all(against.time_s, sensor, size, against.sensor.noise_floor_mn, used)
+    scores, events = metrics.compute_all(against.time_s, sensor, size, against.noise_floor_mn, used)
     components: dict[str, dict[str, float]] = {}
-    if against.sensor.in_camera_axes and np.isfinite(force).any(axis=0).all():
+    if in_camera_axes and np.isfinite(force).any(axis=0).all():
         components = {axis: metrics.agreement(axes[used, k], force[used, k]) for k, axis in enumerate("xyz")}
     rng = np.random.default_rng(_SEED)
     intervals = metrics.agreement_intervals(x, y, rng)
@@ -206,14 +187,14 @@ def _score(force: Floats, first: Scored | None, against: _Reference) -> Scored:
         components = {axis: metrics.without_newtons(values) for axis, values in components.items()}
         intervals, worse = {key: intervals[key] for key in intervals if key in metrics.RELATIVE}, None
     calibrated: dict[str, float] = {}
-    if against.press is not None:
-        gain = metrics.gain(sensor, size, against.press)
+    if press is not None:
+        gain = metrics.gain(sensor, size, press)
         calibrated = {"gain": gain, **metrics.agreement(x, gain * y)}
         calibrated["mae_of_peak"] = metrics.ratio(calibrated["mae_mn"], scores["event_peak_mn"])
     return Scored(force, size, scores, components, events, intervals, calibrated, worse)
 
 
-def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], against: _Reference) -> Scored:
+def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], against: Result) -> Scored:
     """Adds the method's prediction intervals, their mean width and their coverage of the sensor."""
     low, high = np.where(against.lost, np.nan, np.array(bounds, np.float64).T)
     known = np.isfinite(low)
@@ -221,7 +202,7 @@ def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], agains
         return scored
     known &= against.scored
     interval = {"level": LEVEL, "width_mn": _mean((high - low)[known])}
-    sensor = against.sensor.size_mn
+    sensor = against.sensor_mn
     if sensor is not None and against.absolute:
         known &= np.isfinite(sensor)
         interval["coverage"] = _mean(((sensor >= low) & (sensor <= high))[known])

@@ -168,31 +168,17 @@ def per_event(
         if known.sum() < 2:
             continue
         t, x, y = time_s[part][known], sensor[part][known], predicted[part][known]
-        rows.append(
-            {
-                "from_s": float(t[0]),
-                "to_s": float(t[-1]),
-                "peak_mn": float(x.max()),
-                "impulse_mns": float(np.trapezoid(x, t)),
-                **_event_errors(t, x, y),
-            }
-        )
+        row = {"from_s": t[0], "to_s": t[-1], "peak_mn": x.max(), "impulse_mns": np.trapezoid(x, t)}
+        both = np.isfinite(y)
+        if both.sum() > 1:  # else the errors are NaN
+            t, x, y = t[both], x[both], y[both]
+        peak, impulse = float(x.max()), float(np.trapezoid(x, t))
+        row["predicted_peak_mn"] = y.max()
+        row["peak_error"] = ratio(y.max() - peak, peak)
+        row["impulse_error"] = ratio(float(np.trapezoid(y, t)) - impulse, impulse)
+        row["mae_mn"] = np.abs(y - x).mean()
+        rows.append({key: float(value) for key, value in row.items()})
     return rows
-
-
-def _event_errors(t: Floats, x: Floats, y: Floats) -> dict[str, float]:
-    """Errors of a contact's predicted force `y` against the sensor's `x`, both in mN."""
-    known = np.isfinite(y)
-    if known.sum() < 2:
-        return dict.fromkeys(("predicted_peak_mn", "peak_error", "impulse_error", "mae_mn"), math.nan)
-    t, x, y = t[known], x[known], y[known]
-    peak, impulse = float(x.max()), float(np.trapezoid(x, t))
-    return {
-        "predicted_peak_mn": float(y.max()),
-        "peak_error": ratio(float(y.max()) - peak, peak),
-        "impulse_error": ratio(float(np.trapezoid(y, t)) - impulse, impulse),
-        "mae_mn": float(np.abs(y - x).mean()),
-    }
 
 
 def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> dict[str, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import MOST_LOST
-from learn.evaluation.statistics import LEAST_GROUPS, null_if_nan, over_groups
+from learn.evaluation.statistics import LEAST_GROUPS, as_plain, over_groups
 from synth.errors import UserError
 from synth.formats import SCORE, check_format
 from synth.publish.svg import svg
@@ -147,8 +148,8 @@ def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
 def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
     """Mean of the finite values and its interval; None if undefined or from too few specimens."""
     found = over_groups(values, specimens, np.random.default_rng(0))
-    ends = null_if_nan({"mean": found.mean, "low": found.low, "high": found.high})
-    return {**ends, "n": int(np.isfinite(values).sum())}
+    mean: dict[str, float | None] = as_plain(replace(found, n=int(np.isfinite(values).sum())))
+    return mean
 
 
 def _number(value: float | None) -> float:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import platform
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import dataclass, field
 from typing import Any
-
-import numpy as np
 
 from bench.bootstrap import Interval
 from bench.recording.pixel_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
+from learn.evaluation.statistics import as_plain
 from synth.arrays import Floats, Mask
 from synth.formats import SCORE
 from synth.recording_flow.finding import Finding, first_fault
@@ -179,19 +176,5 @@ def as_json(result: Result) -> dict[str, Any]:
             **{end: curves for end, curves in ends.items() if curves},
         },
     }
-    plain: dict[str, Any] = _plain(tree)
+    plain: dict[str, Any] = as_plain(tree, digits=9)
     return plain
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if isinstance(value, (float, np.floating)):
-        return round(float(value), 9) if math.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value

@@ -26,11 +26,11 @@ _SAME_PEAK = 0.95
 class Offset:
     """The offset between two clocks."""
 
-    offset_s: float  # to be added to the sensor's times [s]
-    r: float  # correlation at that offset
-    r_at_zero: float  # correlation without an offset
-    deviation_s: float  # standard deviation over all bootstrap resamples, including other peaks [s]
-    refused: str  # why the offset must not be used; empty if it may be
+    offset_s: float = 0.0  # to be added to the sensor's times [s]
+    r: float = np.nan  # correlation at that offset
+    r_at_zero: float = np.nan  # correlation without an offset
+    deviation_s: float = np.nan  # standard deviation over all bootstrap resamples, including other peaks [s]
+    refused: str = ""  # why the offset must not be used; empty if it may be
     correlogram: tuple[tuple[float, float], ...] = ()  # offset [s] and correlation of every candidate
 
 
@@ -55,7 +55,9 @@ def find_offset(
     t, force = sensor_s[good], force_mn[good]
     widths = np.diff(frame_s)
     if len(widths) < LEAST_INTERVALS:
-        return _none(f"only {len(widths)} frame intervals in the calibration span, {LEAST_INTERVALS} needed")
+        return Offset(
+            refused=f"only {len(widths)} frame intervals in the calibration span, {LEAST_INTERVALS} needed"
+        )
     frame = float(np.median(widths))
     step = frame / _STEPS_PER_FRAME
     offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
@@ -64,16 +66,16 @@ def find_offset(
     usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
     followed = int(np.isfinite(moved).sum())
     if followed < LEAST_INTERVALS:
-        return _none(
-            f"only {followed} of {len(widths)} frame intervals in the calibration span could be tracked, "
-            f"{LEAST_INTERVALS} needed"
-        )
+        lacking = f"only {followed} of {len(widths)} frame intervals in the calibration span could be tracked"
+        return Offset(refused=f"{lacking}, {LEAST_INTERVALS} needed")
     if usable.sum() < LEAST_INTERVALS:
-        return _none("the sensor doesn't cover the calibration span with the search's margin on both sides")
+        return Offset(
+            refused="the sensor doesn't cover the calibration span with the search's margin on both sides"
+        )
     change, moved = change[:, usable], moved[usable]
     r = _correlations(np.ones((1, len(moved))), change, moved)[0]
     if not np.isfinite(r).any():
-        return _none("no motion or no change of force in the calibration span")
+        return Offset(refused="no motion or no change of force in the calibration span")
     best = int(np.nanargmax(r))
     rng = np.random.default_rng(0)  # reproducible
     weights = bootstrap.counts(len(moved), bootstrap.block_length(moved), _RESAMPLES, rng)
@@ -119,7 +121,3 @@ def _refined(offsets: NDArray[np.floating], r: Floats, best: int) -> float:
     bend = left - 2 * middle + right
     shift = 0.5 * (left - right) / bend if np.isfinite(bend) and bend < 0 else 0.0
     return float(offsets[best] + shift * (offsets[1] - offsets[0]))
-
-
-def _none(reason: str) -> Offset:
-    return Offset(0.0, np.nan, np.nan, np.nan, reason)

@@ -31,10 +31,10 @@ _STARTS = Rotation.create_group("O")
 class SensorRotation:
     """A sensor's rotation and its uncertainty."""
 
-    rows: tuple[tuple[float, ...], ...]  # of the rotation to the camera's axes; empty if not determined
-    deviation_deg: float  # standard deviation of its angle, from bootstrap resamples and misfit
-    explained: float  # share of the motion's variance
-    refused: str  # why it must not be used; empty if it may be
+    rows: tuple[tuple[float, ...], ...] = ()  # of the rotation to the camera's axes; empty: not determined
+    deviation_deg: float = np.nan  # standard deviation of its angle, from bootstrap resamples and misfit
+    explained: float = np.nan  # share of the motion's variance
+    refused: str = ""  # why it must not be used; empty if it may be
 
     def describe(self) -> str:
         """Uncertainty and explained motion, in words."""
@@ -55,11 +55,13 @@ def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRot
     """
     good = np.isfinite(force_mn).all(axis=1)
     if good.sum() < LEAST_TURNING:
-        return _none(f"only {good.sum()} tracked frames with force, {LEAST_TURNING} needed")
+        return SensorRotation(refused=f"only {good.sum()} tracked frames with force, {LEAST_TURNING} needed")
     force, shift = force_mn[good], _shift(moved[good], visible[good])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
     if spread[2] < _FLAT * spread[0] or not shift.any():
-        return _none("the force stays in a plane or on a line" if shift.any() else "nothing moves")
+        return SensorRotation(
+            refused="the force stays in a plane or on a line" if shift.any() else "nothing moves"
+        )
     every = np.ones(len(force))
     turn, explained, misfit = _fitted(force, shift, every, _STARTS)
     rng = np.random.default_rng(0)  # reproducible
@@ -112,7 +114,3 @@ def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> 
     misfit = np.sqrt(2 * best.cost / max(float(np.square(linear).sum()), 1e-12))
     explained = 1 - unexplained / total if total > 0 else 0.0
     return Rotation.from_rotvec(best.x) * start, explained, float(misfit)
-
-
-def _none(reason: str) -> SensorRotation:
-    return SensorRotation((), np.nan, np.nan, reason)

@@ -91,15 +91,13 @@ def track_recording(
 
     Args:
         recording: the opened recording.
-        methods: by name.
+        methods: by name; of `pictured` the snapshots show the force map.
         scale_mm_per_px: of the original pixels.
         settings: of the tracking.
-        pictured: method whose force map the snapshots show.
         flow: computes the flow and is closed by the caller; None: in this process. Another process computes
             it while the methods are applied to the previous frame.
-        progress: called after every frame.
+        progress: called after every frame; `each`: with every tracked frame.
         only: numbers of the frames to track, with the rest frame; None: all.
-        each: called with every tracked frame.
 
     Raises:
         UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
@@ -109,7 +107,9 @@ def track_recording(
     footage, free_s = replace(as_footage(recording, scale_mm_per_px), only=only), about.pulse.free_s
     for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
         mm_per_px = scale_mm_per_px * video.rest.shrink
-        forces = _Forces(methods, pictured, watch, video.rest, _context(about, video.rest.tissue, mm_per_px))
+        known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
+        scene = MethodContext(video.rest.tissue, mm_per_px, *known)
+        forces = _Forces(methods, pictured, watch, video.rest, scene)
         pictures = RightPictures(video)
         for frame in video.frames():
             each(frame)
@@ -164,12 +164,6 @@ def _describe(
         ]
 
 
-def _context(about: Meta, tissue: Mask, mm_per_px: float) -> MethodContext:
-    return MethodContext(
-        tissue, mm_per_px, about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
-    )
-
-
 class _Forces:
     """Applies every method to every frame."""
 
@@ -198,17 +192,12 @@ class _Forces:
         wanted = position % self.stride == 0
         self.cameras = 1 if frame.motion is None else 2
         estimates: dict[str, ForceEstimate] = {}
-        density = None
         for name, method in self.methods.items():
-            if isinstance(method, Fusion):
-                continue
-            with self.watch.stage(name):
-                shown = wanted and name == self.pictured
-                estimate = method(frame, scene, shown)
-            estimates[name] = replace(estimate, density=None)
-            if name == self.pictured:
-                density = estimate.density
-        self.estimates.append(estimates)
+            if not isinstance(method, Fusion):
+                with self.watch.stage(name):
+                    estimates[name] = method(frame, scene, wanted and name == self.pictured)
+        density = estimates[self.pictured].density if self.pictured in estimates else None
+        self.estimates.append({name: replace(one, density=None) for name, one in estimates.items()})
         speed = 0.0
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
@@ -230,7 +219,7 @@ class _Forces:
         inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
         contact_free = np.array(self.out.trusted, bool) & inside
         for name, method in self.methods.items():
-            if isinstance(method, Revising) and len(times):
+            if isinstance(method, Revising):
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate

@@ -116,7 +116,7 @@ class GridView:
         return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
 
     def to_image(self, values: NDArray[np.floating]) -> Map:
-        """See `to_image`: (..., N, N) → (..., H, W) float32."""
+        """See `to_image`: (N, N) → (H, W) float32."""
         return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
 
     def matches(self, tissue: Mask, scale_mm_per_px: float, centre_px: tuple[float, float] | None) -> bool:
@@ -149,19 +149,14 @@ def to_image(
 ) -> Map:
     """Values of a grid's cells at a picture's pixels, bilinear, 0 outside the grid.
 
-    `values`: (..., N, N); `shape`: (H, W) of the picture; `centre_px`: x, y of the grid's centre in it.
-    Returns (..., H, W) float32.
+    `values`: (N, N); `shape`: (H, W) of the picture; `centre_px`: x, y of the grid's centre in it. Returns
+    (H, W) float32.
     """
-    n, ratio = values.shape[-1], scale_mm_per_px / pitch_mm
-    x = (np.arange(shape[1]) - centre_px[0]) * ratio + (n - 1) / 2
-    y = (np.arange(shape[0]) - centre_px[1]) * ratio + (n - 1) / 2
-    inside = ((y >= -0.5) & (y <= n - 0.5))[:, None] & ((x >= -0.5) & (x <= n - 0.5))[None, :]
-    x, y = np.clip(x, 0, n - 1), np.clip(y, 0, n - 1)
-    x0, y0 = np.minimum(x.astype(int), n - 2), np.minimum(y.astype(int), n - 2)
-    fx, fy = (x - x0), (y - y0)[:, None]
-    top = values[..., y0, :][..., x0] * (1 - fx) + values[..., y0, :][..., x0 + 1] * fx
-    low = values[..., y0 + 1, :][..., x0] * (1 - fx) + values[..., y0 + 1, :][..., x0 + 1] * fx
-    return np.where(inside, top * (1 - fy) + low * fy, 0).astype(np.float32)
+    ratio, middle = scale_mm_per_px / pitch_mm, (len(values) - 1) / 2
+    axes = [(np.arange(n) - at) * ratio for n, at in zip(shape, centre_px[::-1], strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"))
+    shown = ndimage.map_coordinates(values, cells + middle, order=1, mode="nearest")
+    return np.where((np.abs(cells) <= middle + 0.5).all(axis=0), shown, 0).astype(np.float32)
 
 
 def settled(amount: Map, mask: Map) -> Map:

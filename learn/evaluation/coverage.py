@@ -11,7 +11,7 @@ import numpy as np
 
 from learn.data.clips import Clip
 from learn.evaluation.fit_intervals import predict_clip
-from learn.evaluation.statistics import Interval, interval, null_if_nan
+from learn.evaluation.statistics import Interval, as_plain, interval
 from learn.inference.predict import Predictor
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import is_moving
@@ -34,8 +34,8 @@ class Coverage:
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
         ends = {name: {"mean": s.mean, "low": s.low, "high": s.high} for name, s in self.shares.items()}
-        known = {name: null_if_nan(one) for name, one in ends.items()}
-        return {"level": self.level, **known, **null_if_nan(self.values)}
+        found: dict[str, Any] = as_plain({"level": self.level, **ends, **self.values})
+        return found
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:

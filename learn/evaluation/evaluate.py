@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, amount, target
 from learn.data.grid import Grid
 from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments
-from learn.evaluation.statistics import Interval, Paired, interval, null_if_nan, paired, pooled_r2
+from learn.evaluation.statistics import Interval, Paired, as_plain, interval, paired, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.arrays import Floats, Map, Mask
 from synth.system.terminal import ProgressCallback
@@ -131,17 +132,16 @@ class EvaluationReport:
             out[name] = pooled_r2(np.array(parts), rng)
         return out
 
-    def as_dict(self) -> dict[str, object]:
+    def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
-        return {
-            "sequences": [
-                {"name": c.name, "young_kpa": c.young_kpa} | null_if_nan(c.as_row()) for c in self.clips
-            ],
-            "columns": {young: null_if_nan(self.summary(young)) for young in self.columns},
-            "intervals": {
-                k: null_if_nan({"low": i.low, "high": i.high}) for k, i in self.intervals().items()
-            },
-        }
+        found: dict[str, Any] = as_plain(
+            {
+                "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
+                "columns": {young: self.summary(young) for young in self.columns},
+                "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
+            }
+        )
+        return found
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -35,13 +35,11 @@ def add_intervals(
     Sequences of `split.select` that did not choose the epoch count as used for intervals from then on.
 
     Args:
-        folder: of the model.
-        predictor: the model.
+        folder: of the model `predictor`.
         clips: sequences of known force.
         split: `fit`: training sequences, for the distribution of motion; `select`: for the error model;
             `intervals`: for the factors.
         source: displacement that the intervals are for; None: the one that the model is scored on.
-        report: receives the number of sequences done and in all.
 
     Raises:
         UserError: nothing moves in the sequences.
@@ -78,12 +76,9 @@ def fit_from_datasets(
 ) -> Intervals:
     """Fits a trained model's intervals on all sequences `clips` of some `datasets`, into its card.
 
-    Args as of `add_intervals`, and:
-        datasets: the training data, and any with sequences that are new to the model.
-        from_test: whether to use half of the test brains.
-
-    Raises:
-        UserError: no training sequence among them, or too few others.
+    `datasets`: the training data, and any with sequences that are new to the model; `from_test`: whether to
+    use half of the test brains; others as of `add_intervals`. Raises UserError if there is no training
+    sequence among them, or too few others.
     """
     clips = regroup(clips, find_unit(predictor.card))
     marked = [read_split(one, required=False).sides.items() for one in datasets]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,9 +24,23 @@ _DRAWS = 4000
 _SIGNS = 10_000
 
 
-def null_if_nan(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Numbers as JSON can store them: None for NaN and infinity."""
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+def as_plain(value: Any, digits: int | None = None) -> Any:
+    """A value of dataclasses, mappings, sequences and arrays as JSON can store it.
+
+    Numbers are rounded to `digits` decimals, if given; NaN and infinity become None.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(key): as_plain(part, digits) for key, part in value.items()}
+    if isinstance(value, np.ndarray | np.integer):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [as_plain(part, digits) for part in value]
+    if isinstance(value, float | np.floating):
+        number = float(value) if digits is None else round(float(value), digits)
+        return number if math.isfinite(value) else None
+    return value
 
 
 @dataclass(frozen=True)

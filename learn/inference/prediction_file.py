@@ -93,20 +93,11 @@ def predict_files(
     membrane: MembraneState = "unknown",
     overlay: bool = False,
 ) -> Iterator[PredictedFile]:
-    """Estimates and writes the forces of each video of a source, one after the other.
+    """Estimates and writes the forces of each video of a source, one after the other, into the folder `out`.
 
-    Args:
-        predictor: the model.
-        source: as of `motions`.
-        out: folder for the files.
-        options: of a video.
-        input: displacement read from a store; None: as of `Predictor.stored`.
-        young_kpa: of the tissue, instead of the data's.
-        membrane: its state.
-        overlay: whether to write NAME.force.mp4 where the source has pictures.
-
-    Raises:
-        UserError: as `motions` and `apply`, or a file that would overwrite its source.
+    `source`, `options`: as of `motions`; `input`: as of `Predictor.stored`; `young_kpa`, `membrane`: as of
+    `apply`; `overlay`: whether to write NAME.force.mp4 where the source has pictures. Raises UserError as
+    those, and for a file that would overwrite its source.
     """
     alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
     for motion in motions(source, predictor.stored(input), options):
@@ -147,12 +138,8 @@ def tabulate(found: dict[str, Any]) -> str:
 def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
     """Writes `stem`.force.mp4: the processed frames with the force map on them and its curve below.
 
-    The map is drawn in the rest frame. Returns None, without a file, if the source holds no pictures.
-
-    Args:
-        found: fields that `apply` returns.
-        source: a video, or a sequence's store.
-        stem: path of the file without its ending.
+    The map is drawn in the rest frame. `found`: fields that `apply` returns; `source`: a video, or a
+    sequence's store. Returns None, without a file, if the source holds no pictures.
     """
     pictures = _pictures(source, {int(number) for number in found["frame"]})
     if pictures is None:

@@ -22,7 +22,7 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, sources, typical_young
 from learn.data.grid import Scales
-from learn.evaluation.metrics import agreement
+from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
@@ -228,11 +228,9 @@ def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.d
         for batch in frames.sequential(c, frames.sources[-1]):
             here = batch.to(device)
             inside = here.mask.bool().expand_as(here.target)
-            predicted = forward(net, here, frames.settings, scales)
-            sums = sums + moments(here.target[inside], predicted[inside])
-            forces = forces + moments(
-                *((one * inside).sum((2, 3)).flatten() for one in (here.target, predicted))
-            )
+            pair = here.target, forward(net, here, frames.settings, scales)
+            sums = sums + moments(*(one[inside].cpu().numpy() for one in pair))
+            forces = forces + moments(*((one * inside).sum((2, 3)).cpu().numpy() for one in pair))
     result = agreement(sums)
     return {
         "select_r2": result.r2 if math.isfinite(result.r2) else -math.inf,
@@ -247,13 +245,6 @@ def _gain(forces: Floats, anatomies: int) -> float:
     if anatomies < _GAIN_ANATOMIES or not tp > 0:
         return 1.0
     return min(max(float(tp / pp), _GAINS[0]), _GAINS[1])
-
-
-def moments(true: torch.Tensor, predicted: torch.Tensor) -> Floats:
-    """`metrics.moments`, summed on the tensors' own device."""
-    t, p = true.double(), predicted.double()
-    sums = torch.stack([t.sum(), p.sum(), t @ t, p @ p, t @ p, (p - t).abs().sum()])
-    return np.array([t.numel(), *sums.tolist()])
 
 
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
