@@ -270,10 +270,8 @@ def predict_command(
         model, source = choose_model(has_right_camera(model)), model
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
-    options, predictor = (
-        VideoOptions(read_scale(scale), tissue, settings, files),
-        load_model(model, quick=True),
-    )
+    options = VideoOptions(read_scale(scale), tissue, settings, files)
+    predictor = load_model(model, quick=True)
     found = []
     for one in predict_files(predictor, source, out, options, input, young, membrane, overlay):
         found.append(one)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,8 +37,7 @@ def draw_force(result: Result, others: bool = False) -> str:
     holds_young = method.low_mn is not None and result.main in (PHYSICS, FUSION)
     spread = 1.96 * (2 * result.scale.uncertainty if holds_young else result.relative_uncertainty)
 
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
+    def draw(axes: Axes) -> None:
         if result.absolute and method.low_mn is not None and method.high_mn is not None:
             name = f"{method.interval['level']:.0%} interval"
             _band(axes, time_s, method.low_mn, method.high_mn, name, _INTERVAL)
@@ -63,9 +63,8 @@ def draw_force(result: Result, others: bool = False) -> str:
             axes.set_ylim(low - 0.04 * (high - low), high + 0.08 * (high - low))
         for left in np.flatnonzero(result.lost[:-1] | result.lost[1:]):
             axes.axvspan(time_s[left], time_s[left + 1], color=_RED, alpha=0.1, linewidth=0)
-        _finish(axes, "time [s]", label, columns=5)
 
-    return svg(_WIDE, _HIGH + 40, draw)
+    return _chart((_WIDE, _HIGH + 40), draw, "time [s]", label, columns=5)
 
 
 def scale_curves(result: Result) -> tuple[Floats | None, dict[str, Floats], str]:
@@ -94,28 +93,25 @@ def draw_components(result: Result) -> str:
     method = result.methods[result.main]
     sensor = result.sensor_axes_mn if method.components else None
 
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
+    def draw(axes: Axes) -> None:
         for k, name in enumerate(("x, right", "y, down", "z, away")):
             if sensor is not None:
                 axes.plot(result.time_s, sensor[:, k], ":", color=_OTHERS[k], label=f"{name}: sensor")
             axes.plot(result.time_s, method.force_mn[:, k], color=_OTHERS[k], label=name)
-        _finish(axes, "time [s]", "force [mN]" if result.absolute else "force [mN a kPa]", columns=6)
 
-    return svg(_WIDE, _HIGH, draw)
+    unit = "force [mN]" if result.absolute else "force [mN a kPa]"
+    return _chart((_WIDE, _HIGH), draw, "time [s]", unit, columns=6)
 
 
 def draw_correlogram(found: Offset) -> str:
     """Correlation of force and motion at every offset that was tried, and the best offset."""
     offsets, r = np.array(found.correlogram).T
 
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
+    def draw(axes: Axes) -> None:
         axes.plot(offsets, r, color=_MAIN)
         axes.plot([found.offset_s], [found.r], "o", color=_RED, label="best")
-        _finish(axes, "offset added to the sensor's times [s]", "correlation")
 
-    return svg(_WIDE, _HIGH, draw)
+    return _chart((_WIDE, _HIGH), draw, "offset added to the sensor's times [s]", "correlation")
 
 
 def draw_scatter(result: Result) -> str:
@@ -123,22 +119,19 @@ def draw_scatter(result: Result) -> str:
     x, y = _scored_pairs(result)
     top = 1.05 * max(_largest(x), _largest(y))
 
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
+    def draw(axes: Axes) -> None:
         axes.plot([0, top], [0, top], ":", color=_SENSOR, label="equal")
         _dots(axes, x, y)
         axes.set(xlim=(-0.02 * top, top), ylim=(-0.02 * top, top))
-        _finish(axes, "sensor [mN]", "predicted [mN]")
 
-    return svg(_HALF, _HIGH, draw)
+    return _chart((_HALF, _HIGH), draw, "sensor [mN]", "predicted [mN]")
 
 
 def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
     """Difference against mean, with bias and limits of agreement; `limits`: bias_mn, low_mn, high_mn."""
     x, y = _scored_pairs(result)
 
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
+    def draw(axes: Axes) -> None:
         _dots(axes, (x + y) / 2, y - x)
         for key, name, colour in (
             ("bias_mn", "bias", _MAIN),
@@ -147,9 +140,8 @@ def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
         ):
             if math.isfinite(limits[key]):
                 axes.axhline(limits[key], ls="--", color=colour, label=f"{name} {limits[key]:+.3g}")
-        _finish(axes, "mean of both [mN]", "predicted − sensor [mN]", columns=3)
 
-    return svg(_HALF, _HIGH, draw)
+    return _chart((_HALF, _HIGH), draw, "mean of both [mN]", "predicted − sensor [mN]", columns=3)
 
 
 def _scored_pairs(result: Result) -> tuple[Floats, Floats]:
@@ -174,8 +166,15 @@ def _dots(axes: Axes, x: Floats, y: Floats) -> None:
     axes.scatter(x, y, 12 if many else 28, _MAIN, alpha=0.45 if many else 0.8, linewidths=0)
 
 
-def _finish(axes: Axes, x: str, y: str, columns: int = 2) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    handles: Any = axes.get_legend_handles_labels()
-    if handles[0]:
-        axes.legend(*handles, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
+def _chart(size: tuple[int, int], draw: Callable[[Axes], None], x: str, y: str, columns: int = 2) -> str:
+    """A chart with a label at each axis, and a legend in `columns` above it if anything in it has a name."""
+
+    def draw_all(figure: Figure) -> None:
+        axes = figure.subplots()
+        draw(axes)
+        axes.set(xlabel=x, ylabel=y)
+        handles: Any = axes.get_legend_handles_labels()
+        if handles[0]:
+            axes.legend(*handles, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
+
+    return svg(*size, draw_all)

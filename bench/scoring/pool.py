@@ -18,6 +18,7 @@ import numpy as np
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import MOST_LOST
 from learn.evaluation.statistics import LEAST_GROUPS, as_plain, over_groups
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.formats import SCORE, check_format
 from synth.publish.svg import svg
@@ -41,8 +42,7 @@ _CALIBRATED = {
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
     """The score.json of each path (a file, or a folder of `bench score`), in their order.
 
-    Raises:
-        UserError: no path, a file of another kind, a recording twice, or main methods that differ.
+    Raises UserError for no path, a file of another kind, a recording twice, or main methods that differ.
     """
     found = []
     for path in paths:
@@ -84,18 +84,18 @@ def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     common = [identity for identity in scored[0] if all(identity in one for one in scored)]
     first = _identity(found[0], main)
 
-    def values(method: str, part: str, key: str) -> list[float]:
-        return [_number(one[method][part].get(key)) for one in scored]
+    def values(method: str, part: str, key: str) -> Floats:
+        return np.array([one[method][part].get(key) for one in scored], np.float64)  # None: NaN
 
     methods: dict[str, Any] = {}
     for identity in common:
         name = names[0][identity]
-        pairs = zip(values(first, "scores", "mae_mn"), values(identity, "scores", "mae_mn"), strict=True)
+        worse = values(first, "scores", "mae_mn") - values(identity, "scores", "mae_mn")
         methods[name] = {
             "identity": identity,
             "scores": {key: _mean(values(identity, "scores", key), specimens) for key in SCORES},
             "calibrated": {key: _mean(values(identity, "calibrated", key), specimens) for key in _CALIBRATED},
-            "main_worse_by_mn": None if name == main else _mean([a - b for a, b in pairs], specimens),
+            "main_worse_by_mn": None if name == main else _mean(worse, specimens),
         }
     return {
         "format": "sulcus-pool",
@@ -145,15 +145,11 @@ def _one_recording(tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _mean(values: Sequence[float], specimens: Sequence[str]) -> dict[str, float | None]:
+def _mean(values: Floats, specimens: Sequence[str]) -> dict[str, float | None]:
     """Mean of the finite values and its interval; None if undefined or from too few specimens."""
     found = over_groups(values, specimens, np.random.default_rng(0))
     mean: dict[str, float | None] = as_plain(replace(found, n=int(np.isfinite(values).sum())))
     return mean
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
@@ -168,19 +164,16 @@ def write(tree: dict[str, Any], out: Path, command: str) -> None:
 def page(tree: Mapping[str, Any]) -> str:
     """The page in Markdown; methods with a smaller error than the main one are marked."""
     methods, count = tree["methods"], f"{len(tree['recordings'])} recordings"
-    own = methods[tree["main"]]["scores"]
+    error = methods[tree["main"]]["scores"]["mae_mn"]["mean"]
     rows = []
     for name, found in methods.items():
-        scores = {key: found["scores"][key] for key in _SHOWN if key in own}
-        better = name != tree["main"] and _number(scores["mae_mn"]["mean"]) < _number(own["mae_mn"]["mean"])
-        rows.append(
-            {"method": f"{name} (better)" if better else name}
-            | {METRICS[key].heading: _text(value, METRICS[key].digits) for key, value in scores.items()}
-            | {
-                head: _text(found["calibrated"][key], METRICS[key].digits)
-                for key, head in _CALIBRATED.items()
-            }
-        )
+        better = None not in (error, own := found["scores"]["mae_mn"]["mean"]) and own < error
+        row = {"method": f"{name} (better)" if better else name}
+        row |= {METRICS[key].heading: _text(found["scores"][key], METRICS[key].digits) for key in _SHOWN}
+        row |= {
+            head: _text(found["calibrated"][key], METRICS[key].digits) for key, head in _CALIBRATED.items()
+        }
+        rows.append(row)
     parts = [
         f"# {count}, {tree['specimens']} specimens, {tree['frames']} frames",
         f"    {tree['command']}",
@@ -205,26 +198,23 @@ def _table(rows: Sequence[Mapping[str, str]]) -> str:
 
 def _row(one: Mapping[str, Any]) -> dict[str, str]:
     """One recording's row of the table."""
-    offset = "–"
-    if one["offset_s"] is not None:
-        offset = f"{1e3 * one['offset_s']:.0f} ± {1e3 * _number(one['offset_deviation_s']):.0f}"
+    known = {key: math.nan if value is None else value for key, value in one.items()}
+    offset = f"{1e3 * known['offset_s']:.0f} ± {1e3 * known['offset_deviation_s']:.0f}"
     return {
         "recording": one["recording"],
         "frames": str(one["frames"]),
-        "event peak [mN]": f"{_number(one['event_peak_mn']):.2f}",
-        "MAE of peak": f"{_number(one['mae_of_peak']):.1%}",
-        "r": f"{_number(one['r']):.3f}",
-        "clocks' offset [ms]": offset,
+        "event peak [mN]": f"{known['event_peak_mn']:.2f}",
+        "MAE of peak": f"{known['mae_of_peak']:.1%}",
+        "r": f"{known['r']:.3f}",
+        "clocks' offset [ms]": "–" if one["offset_s"] is None else offset,
     } | ({"lost": f"{one['lost']:.0%}"} if one.get("lost") is not None else {})
 
 
 def _text(value: Mapping[str, float | None], digits: int) -> str:
-    mean, low, high = (value[key] for key in ("mean", "low", "high"))
-    if mean is None:
-        return "–"
-    return f"{mean:.{digits}f}" + (
-        "" if low is None or high is None else f" [{low:.{digits}f}, {high:.{digits}f}]"
+    mean, low, high = (
+        "–" if value[key] is None else f"{value[key]:.{digits}f}" for key in ("mean", "low", "high")
     )
+    return mean if value["low"] is None else f"{mean} [{low}, {high}]"
 
 
 def chart(tree: Mapping[str, Any]) -> str:
@@ -232,7 +222,7 @@ def chart(tree: Mapping[str, Any]) -> str:
     errors = {name: found["scores"]["mae_of_peak"] for name, found in tree["methods"].items()}
     at = np.arange(len(errors))
     colours = ["#1f6feb" if name == tree["main"] else "#c2352b" for name in errors]
-    mean, low, high = ([_number(e[key]) for e in errors.values()] for key in ("mean", "low", "high"))
+    mean, low, high = np.array([[e[key] for e in errors.values()] for key in ("mean", "low", "high")], float)
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()

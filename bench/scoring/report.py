@@ -26,7 +26,6 @@ from synth.publish import picture
 
 _PEAKS, _WORST = 4, 2
 
-_COLUMNS = {key: metric for key, metric in METRICS.items() if metric.column}
 _NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "false_positive_rate")
 """Columns that fit into the 80 of a terminal, and those of the report's first table."""
 
@@ -62,8 +61,9 @@ def render_report(result: Result, title: str = "") -> str:
     if result.sync is not None and result.sync.correlogram:
         figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
-    columns, lower = _columns(result), methods_with_lower_error(result)
-    in_hindsight = [n for n in lower if (gain := result.methods[n].gain) and gain.source == "hindsight"]
+    columns, mae = _columns(result), main.scores.get("mae_mn", math.nan)
+    lower = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
+    in_hindsight = [n for n, m in lower.items() if m.gain and m.gain.source == "hindsight"]
     better = [n for n in lower if n not in in_hindsight]
     return environment.get_template("report.html.jinja").render(
         title=title or f"Force from video: {result.recording}",
@@ -72,7 +72,7 @@ def render_report(result: Result, title: str = "") -> str:
         first={key: metric for key, metric in columns.items() if key in _NARROW},
         more={key: metric for key, metric in columns.items() if key not in _NARROW},
         headline=headline(result),
-        best=_best(result),
+        best=_best(result, columns),
         better=better,
         in_hindsight=in_hindsight,
         origin=result.settings.get("networks", {}).get(result.main, {}).get("origin", ""),
@@ -82,7 +82,6 @@ def render_report(result: Result, title: str = "") -> str:
         panels=panels,
         flow_px=flow_px,
         masks=None if (masked := picture_masks(result.tracked)) is None else _jpeg(masked),
-        masked=result.tracked.summary.describe(),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
         cost=_cost(result),
@@ -110,8 +109,8 @@ def _columns(result: Result) -> dict[str, Metric]:
     every = [method.scores for method in result.methods.values()]
     return {
         key: metric
-        for key, metric in _COLUMNS.items()
-        if any(math.isfinite(scores.get(key, math.nan)) for scores in every)
+        for key, metric in METRICS.items()
+        if metric.column and any(math.isfinite(scores.get(key, math.nan)) for scores in every)
     }
 
 
@@ -125,16 +124,6 @@ def limits_of_agreement(result: Result) -> dict[str, float]:
     state = np.where(scored, contact, -1)
     run = np.cumsum(np.diff(state, prepend=state[:1]) != 0)
     return metrics.limits_of_agreement((predicted - result.sensor_mn)[scored], run[scored])
-
-
-def methods_with_lower_error(result: Result) -> list[str]:
-    """Names of the other methods whose MAE is lower than the main one's."""
-    own = result.methods[result.main].scores.get("mae_mn", math.nan)
-    return [
-        name
-        for name, method in result.methods.items()
-        if name != result.main and method.scores.get("mae_mn", math.inf) < own
-    ]
 
 
 def shown(value: float | None, unit: str = "") -> str:
@@ -217,17 +206,17 @@ def select_frames(result: Result) -> list[tuple[str, Snapshot]]:
 
 def _caption(result: Result, snap: Snapshot) -> str:
     k = snap.position
-    predicted = shown(float(result.methods[result.main].size_mn[k]))
+    predicted = shown(result.methods[result.main].size_mn[k])
     caption = f"{result.time_s[k]:.2f} s, predicted {predicted} {'mN' if result.absolute else 'mN per kPa'}"
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
-        caption += f", sensor {shown(float(result.sensor_mn[k]))} mN"
+        caption += f", sensor {shown(result.sensor_mn[k])} mN"
     return caption
 
 
-def _best(result: Result) -> dict[str, float]:
+def _best(result: Result, columns: dict[str, Metric]) -> dict[str, float]:
     """The best value of each column, for bold type."""
     best = {}
-    for key, metric in _COLUMNS.items():
+    for key, metric in columns.items():
         found = [method.scores.get(key, math.nan) for method in result.methods.values()]
         values = {value for value in found if math.isfinite(value)}
         if len(values) > 1 and metric.ideal is not None:
@@ -237,23 +226,20 @@ def _best(result: Result) -> dict[str, float]:
 
 def _cost(result: Result) -> list[tuple[str, str, str]]:
     """Stage, CPU milliseconds per frame, share of real time."""
-    frames = max(len(result.time_s), 1)
-    duration = float(result.time_s[-1] - result.time_s[0]) if len(result.time_s) > 1 else math.nan
-    rows = []
-    for stage, spent in result.tracked.timings.items():
-        if isinstance(spent, dict):
-            rows.append((stage, f"{1000 * spent['cpu_s'] / frames:.1f}", f"{spent['wall_s'] / duration:.2f}"))
-    return rows
+    frames, duration = len(result.time_s), float(np.ptp(result.time_s)) or math.nan
+    return [
+        (stage, f"{1000 * spent['cpu_s'] / frames:.1f}", f"{spent['wall_s'] / duration:.2f}")
+        for stage, spent in result.tracked.timings.items()
+        if isinstance(spent, dict)
+    ]
 
 
 def _flat(tree: dict[str, Any], before: str = "") -> list[tuple[str, str]]:
+    """Keys, with those of the dictionaries around them, and values as text."""
     rows: list[tuple[str, str]] = []
     for key, value in tree.items():
         name = f"{before}{key}"
-        if isinstance(value, dict):
-            rows += _flat(value, f"{name}.")
-        else:
-            rows.append((name, html.unescape(str(value))))
+        rows += _flat(value, f"{name}.") if isinstance(value, dict) else [(name, html.unescape(str(value)))]
     return rows
 
 

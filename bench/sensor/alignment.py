@@ -39,14 +39,9 @@ def align_sensor(
 ) -> AlignedSensor:
     """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames.
 
-    Args:
-        recording: with its force and meta.yaml.
-        time_s: (T,) times of the frames [s].
-        speed: (T,) mean speed of the tissue since the frame before [mm/s]; NaN where unknown.
-        surface: the tissue's motion over `sensor.turn_s`; None without that span.
-
-    Raises:
-        UserError: as `force_sensor.process_force`.
+    `time_s`: (T,) times of the frames [s]; `speed`: (T,) mean speed of the tissue since the frame before
+    [mm/s], NaN where unknown; `surface`: the tissue's motion over `sensor.turn_s`, None without that span.
+    Raises UserError as `force_sensor.process_force`.
     """
     force, sensor = recording.force, recording.meta.sensor
     if force is None or clocks.find_other_unit(time_s, force.time_s):
@@ -66,9 +61,8 @@ def align_sensor(
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if covered < len(time_s):
         notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
-    floor, steps = processed.noise_floor_mn, processed.steps
-    in_camera = sensor.in_camera_axes
-    return AlignedSensor(axes if covered else None, floor, steps, found, rotation, in_camera, tuple(notes))
+    about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
+    return AlignedSensor(axes if covered else None, *about)
 
 
 def describe_span(span: Span) -> str:

@@ -80,8 +80,7 @@ def stream_video(
         young_kpa: of the tissue, if known.
         paced: drop frames that arrive while another is processed; False: process every frame.
         report: called with the result of every frame.
-        flow: computes the flow and is closed by the caller; None: in this process. Another process computes
-            it while the next frame is masked and the force of the previous one is estimated.
+        flow: as of `track_recording`; another process also works while the next frame is masked.
 
     Raises:
         UserError: unreadable video, fewer than two frames, or a model without a scale.

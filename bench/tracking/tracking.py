@@ -14,7 +14,7 @@ from bench.methods.fusion import Fusion
 from bench.methods.protocol import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
-from bench.recording.meta import Meta, Span
+from bench.recording.meta import Meta
 from bench.recording.right_pictures import RightPictures, StereoQuality
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
@@ -81,7 +81,7 @@ def track_recording(
     scale_mm_per_px: float,
     settings: RecordingFlowSettings,
     *,
-    pictured: str | None = None,
+    pictured: str = "",
     flow: LocalFlow | None = None,
     progress: Progress = lambda done: None,
     only: Container[int] | None = None,
@@ -110,29 +110,21 @@ def track_recording(
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
         scene = MethodContext(video.rest.tissue, mm_per_px, *known)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
-        pictures = RightPictures(video)
+        pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
         for frame in video.frames():
             each(frame)
             pictures.add(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
-                _gather_turning(forces.out, frame, about.sensor.turn_s, video.rest.tissue)
+                if (span := about.sensor.turn_s) and frame.trusted and span[0] <= frame.time_s <= span[1]:
+                    turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     forces.finish(about)  # of the last pass
-    forces.out.stereo = pictures.quality
+    forces.out.stereo, forces.out.turning = pictures.quality, turning if turning.time_s else None
     _describe(forces.out, video, recording, methods, mm_per_px)
     forces.out.timings |= watch.report()  # of all passes
     return forces.out
-
-
-def _gather_turning(out: TrackedRecording, frame: FrameMotion, span_s: Span | None, tissue: Mask) -> None:
-    """Adds a frame to the motion over `sensor.turn_s`, if it is in that span."""
-    if span_s is None or frame.time_s is None or not frame.trusted:
-        return
-    if span_s[0] <= frame.time_s <= span_s[1]:
-        out.turning = out.turning or SurfaceMotion(tissue)
-        out.turning.add(frame.time_s, frame.flow, frame.confidence)
 
 
 def _describe(
@@ -170,16 +162,16 @@ class _Forces:
     def __init__(
         self,
         methods: Mapping[str, Method],
-        pictured: str | None,
+        pictured: str,
         watch: Stopwatch,
         rest: RestFrame,
         scene: MethodContext,
     ) -> None:
         """Starts with the rest frame and the constants of the recording."""
-        shown = methods.get(pictured) if pictured is not None else None
+        shown = methods.get(pictured)
         self.pictured = shown.parts[0] if isinstance(shown, Fusion) else pictured
         self.methods, self.watch, self.scene = methods, watch, scene
-        self.out = TrackedRecording(pictured=self.pictured or "", rest=_shrunk(rest.rgb))
+        self.out = TrackedRecording(pictured=self.pictured, rest=_shrunk(rest.rgb))
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: Map | None = None
@@ -232,7 +224,6 @@ class _Forces:
                     frame[name] = estimate
                 for frame in self.estimates:
                     frame.setdefault(name, frame[method.parts[0]])
-        for name in self.methods:
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
 

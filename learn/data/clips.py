@@ -193,11 +193,8 @@ def load_clips(
     code = "" if cache is None else provenance.source("synth", "learn/data")
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
-        clips.append(
-            read_clip(sequence, grid, wanted)
-            if cache is None
-            else _packed(sequence, grid, wanted, cache, code)
-        )
+        packed = cache and _packed(sequence, grid, wanted, cache, code)
+        clips.append(packed or read_clip(sequence, grid, wanted))
     report(len(dataset), len(dataset))
     return clips
 

@@ -75,7 +75,9 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
     return _bootstrap(r2, tuple(np.asarray(moments, np.float64).T), rng, draws)
 
 
-def over_groups(values: Sequence[float], groups: Sequence[str], rng: np.random.Generator) -> Interval:
+def over_groups(
+    values: Sequence[float] | Floats, groups: Sequence[str], rng: np.random.Generator
+) -> Interval:
     """Mean over recordings and its percentile interval; whole groups (specimens) are resampled.
 
     `values`: one per recording, NaN is left out; `groups`: the specimen of each. The interval is NaN with

@@ -149,12 +149,8 @@ class ForceEstimator:
         return notes
 
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
-        young = self._young_kpa
-        found = self._predictor(
-            *(frame.flow, self._tissue, self._scale, young, frame.confidence, frame.motion),
-            centre_px=place,
-            membrane=self._membrane,
-        )
+        given = frame.flow, self._tissue, self._scale, self._young_kpa, frame.confidence, frame.motion
+        found = self._predictor(*given, centre_px=place, membrane=self._membrane)
         if found.young_known:
             return found
         part = np.float32(UNKNOWN_YOUNG_KPA / found.young_kpa)
