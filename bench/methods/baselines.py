@@ -70,7 +70,9 @@ def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
     # Not centred, so that no motion stays zero.
     basis = TruncatedSVD(min(_COMPONENTS, min(rows.shape) - 1), algorithm="arpack", random_state=0).fit(rows)
     features = basis.transform(rows)
-    strengths, fold = np.geomspace(1e-4, 1e2, 13), _groups(clips) % 4
+    names = sorted({clip.group for clip in clips})
+    fold = np.concatenate([np.full(clip.frames, names.index(clip.group) % 4) for clip in clips])
+    strengths = np.geomspace(1e-4, 1e2, 13)
     # A partial of a named function, which can be pickled.
     return {RIDGE: partial(_regress, basis, ridge(features, force, fold, strengths))}
 
@@ -110,8 +112,3 @@ def ridge(
         for part in parts:
             best[part] = alphas[errors[:, part].sum(axis=1).argmin()]
     return Ridge(best, fit_intercept=False, solver="cholesky").fit(x, y)
-
-
-def _groups(clips: Sequence[Clip]) -> NDArray[np.intp]:
-    names = sorted({clip.group for clip in clips})
-    return np.concatenate([np.full(clip.frames, names.index(clip.group)) for clip in clips])

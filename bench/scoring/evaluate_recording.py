@@ -56,7 +56,10 @@ def evaluate_recording(
         recording, methods, scale.mm_per_px, settings, pictured=main, flow=flow, progress=progress
     )
     meta, time_s = recording.meta, np.array(tracked.time_s)
-    sensor = align_sensor(recording, time_s, _speed(tracked), tracked.turning)
+    lost = ~np.array(tracked.trusted)
+    # Since the frame before, which may be lost too.
+    speed = np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
+    sensor = align_sensor(recording, time_s, speed, tracked.turning)
     findings = judge(recording, tracked, find_sensor_motion(recording, tracked, methods, sensor))
     scored, unscored = _select_frames(meta, tracked, sensor)
     missing = [one.message for one in findings if one.severity == "missing"]
@@ -71,7 +74,7 @@ def evaluate_recording(
         relative_uncertainty=math.hypot(2 * scale.uncertainty, meta.young_uncertainty),
         noise_floor_mn=sensor.noise_floor_mn,
         scored=scored,
-        lost=~np.array(tracked.trusted) | bool(first_fault(findings)),
+        lost=lost | bool(first_fault(findings)),
         sync=sensor.offset,
         notes=(*missing, *tracked.notes, *sensor.notes, *unscored),
         steps=sensor.steps,
@@ -83,12 +86,6 @@ def evaluate_recording(
     )
     press = None if meta.press_s is None else _within(time_s, meta.press_s)
     return replace(result, methods=_score_methods(methods, result, press, sensor.in_camera_axes))
-
-
-def _speed(tracked: TrackedRecording) -> Floats:
-    """Speed of the tissue, (T,) mm/s; NaN where this frame or the one before is lost."""
-    lost = ~np.array(tracked.trusted)
-    return np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
 
 
 def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor) -> tuple[Mask, list[str]]:

@@ -69,14 +69,12 @@ def score(
     Raises:
         UserError: unusable recording, model or settings, or nothing to score; nothing is written.
     """
-    opened = recording
-    if not isinstance(opened, Recording):
-        opened = open_recording(as_path("recording", opened))
-    model = _require_model(model, methods, train, opened.has_stereo)
-    frames = len(opened.numbers()) or None
-    bar: AbstractContextManager[Progress] = nullcontext(lambda done: None)
-    if progress:
-        bar = counting(f"scoring {opened.name}", frames)
+    if not isinstance(recording, Recording):
+        recording = open_recording(as_path("recording", recording))
+    model = _require_model(model, methods, train, recording.has_stereo)
+    frames = len(recording.numbers()) or None
+    bar: AbstractContextManager[Progress]
+    bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
     with ExitStack() as stack:
         if out is not None:
             stack.enter_context(checked_file.made_folder(Path(out), _OUTPUT_BYTES))
@@ -84,11 +82,11 @@ def score(
         if own_process and (frames or _LONG) >= _LONG:
             # The process takes seconds to start, during which the baselines are fitted.
             flow = stack.enter_context(flow_process.open_flow_process())
-        chosen = _choose_methods(model, methods or {}, opened.has_stereo, baselines, train)
-        scale, main = pixel_scale.find_scale(opened.meta, opened.folder), next(iter(chosen))
+        chosen = _choose_methods(model, methods or {}, recording.has_stereo, baselines, train)
+        scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
         used, about = settings or Settings(), _describe(chosen)
         with bar as done:
-            result = evaluate_recording(opened, chosen, main, scale, used, about, done, flow)
+            result = evaluate_recording(recording, chosen, main, scale, used, about, done, flow)
         if out is not None:
             write_result(result, Path(out), title)
     return result

@@ -82,17 +82,12 @@ class Clip:
             return np.asarray(self.confidence)[:, None]
         if source == "motion" and self.motion_confidence is not None:
             return np.asarray(self.motion_confidence)
-        return np.broadcast_to(np.float32(1), (self.frames, components(source) - 1, *self.mask.shape))
+        return np.broadcast_to(np.float32(1), (self.frames, 1 + has_depth(source), *self.mask.shape))
 
 
 def has_depth(wanted: str) -> bool:
     """Whether an input kind or a source is motion in three dimensions, from stereo."""
     return wanted.startswith("motion")
-
-
-def components(wanted: str) -> int:
-    """Number of components of a displacement, 2 or 3."""
-    return 3 if has_depth(wanted) else 2
 
 
 def scored_source(wanted: Input) -> str:
@@ -272,11 +267,6 @@ def amount(clip: Clip, components: int, pitch_mm: float) -> Floats:
     length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
     total: Floats = length.sum((1, 2))[:, None] * pitch_mm**2
     return total
-
-
-def typical_young(clips: Iterable[Clip]) -> float:
-    """Geometric mean of E over sequences [kPa]."""
-    return float(np.exp(np.mean([np.log(c.young_kpa) for c in clips])))
 
 
 def assumed_young(young_kpa: float | None) -> float:

@@ -92,8 +92,8 @@ class GridView:
         self._cols, self._rows = (
             _hats(self.shape[1 - axis], self.centre_px[axis], self.scale_mm_per_px, grid) for axis in (0, 1)
         )
-        self._share = self._apply(self.tissue.astype(np.float32), self._rows, self._cols)
-        full = float(self._apply(np.ones(self.shape, np.float32), self._rows, self._cols).max(initial=0.0))
+        self._share = self._each(self.tissue, self._rows, self._cols)
+        full = float(self._each(np.ones(self.shape), self._rows, self._cols).max(initial=0.0))
         self.mask = (self._share / (full or 1.0) > 0.5).astype(np.float32)
         """(N, N) 1 where more than half of a cell is tissue, else 0."""
         if not self.mask.any():
@@ -125,19 +125,13 @@ class GridView:
         return same and np.array_equal(self.tissue, tissue)
 
     def _each(
-        self, values: NDArray[np.floating], rows: sparse.csr_array, cols: sparse.csr_array
+        self, values: NDArray[np.floating | np.bool_], rows: sparse.csr_array, cols: sparse.csr_array
     ) -> NDArray[np.floating]:
-        flat = values.reshape(-1, *self.shape)
-        n = self.grid.size
-        return np.stack([self._apply(v, rows, cols) for v in flat]).reshape(*values.shape[:-2], n, n)
-
-    @staticmethod
-    def _apply(
-        values: NDArray[np.floating], rows: sparse.csr_array, cols: sparse.csr_array
-    ) -> NDArray[np.floating]:
-        half: NDArray[np.floating] = rows @ np.ascontiguousarray(values, np.float32)
-        out: NDArray[np.floating] = (cols @ np.ascontiguousarray(half.T)).T
-        return out
+        """Weighted sums of pixels, (..., H, W) → (..., N, N)."""
+        flat, n = values.reshape(-1, *self.shape), self.grid.size
+        half = [rows @ np.ascontiguousarray(plane, np.float32) for plane in flat]
+        cells = [(cols @ np.ascontiguousarray(plane.T)).T for plane in half]
+        return np.stack(cells).reshape(*values.shape[:-2], n, n)
 
 
 def to_image(

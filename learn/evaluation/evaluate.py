@@ -159,10 +159,8 @@ def evaluate(
     columns: dict[str, list[ClipScore]] = {}
     for i, clip in enumerate(clips):
         report(i, len(clips))
-        known = clip.young_kpa
-        young = dict(
-            zip(YOUNG, (known, known * 0.5, known * 2.0, predictor.card.typical_young_kpa), strict=True)
-        )
+        known, typical = clip.young_kpa, predictor.card.typical_young_kpa
+        young = dict(zip(YOUNG, (known, known * 0.5, known * 2.0, typical), strict=True))
         # The prediction is proportional to E: one pass serves all columns.
         shift = np.asarray(clip.displacement[source])
         per_kpa = predictor.density(shift, clip.mask, 1.0, clip.confidence_of(source))

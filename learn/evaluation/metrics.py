@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from synth.arrays import Array, Mask
 
@@ -126,9 +127,7 @@ def contact_mm(map_: Array, pitch_mm: float) -> Array:
     if peak <= 0:
         return np.full(2, np.nan)
     weight = np.where(map_ >= 0.5 * peak, map_, 0.0).astype(np.float64)
-    rows, cols = np.indices(map_.shape)
-    centre: Array = np.array([(weight * cols).sum(), (weight * rows).sum()]) / weight.sum()
-    return centre * pitch_mm
+    return pitch_mm * np.array(ndimage.center_of_mass(weight)[::-1])
 
 
 def line(x: Array, y: Array) -> tuple[float, float]:

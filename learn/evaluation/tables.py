@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -20,10 +20,8 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
     heads = ("E known [95%]", "E × ½", "E × 2", "E unknown")[: 4 if all else 1]
     table = open_table(title, *heads)
     columns, sure = [report.summary(y) for y in YOUNG[: len(heads)]], report.intervals()
-    for key, metric in METRICS.items():
-        if not (metric.listed if all else key in FIRST) or key not in columns[0]:
-            continue
-        cells = [_cell(metric, c.get(key)) for c in columns]
+    for key, metric in _shown(columns[0], all).items():
+        cells = [_cell(metric, c[key]) for c in columns]
         if key in sure and sure[key].low == sure[key].low:
             cells[0] += f" [{_cell(metric, sure[key].low)}, {_cell(metric, sure[key].high)}]"
         table.add_row(metric.heading, *cells)
@@ -47,11 +45,10 @@ def coverage_table(covered: Sequence[Coverage]) -> Table:
 def paired_table(pairs: Mapping[str, Paired], title: str, all: bool) -> Table:
     """Differences, this model minus the other, sequence by sequence."""
     table = open_table(title, "difference [95%]", "p", "larger on")
-    for key, metric in METRICS.items():
-        if (metric.listed if all else key in FIRST) and key in pairs:
-            d, pair = pairs[key].difference, pairs[key]
-            difference = f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]"
-            table.add_row(metric.heading, difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")
+    for key, metric in _shown(pairs, all).items():
+        d, pair = pairs[key].difference, pairs[key]
+        difference = f"{d.mean:+.3g} [{d.low:+.3g}, {d.high:+.3g}]"
+        table.add_row(metric.heading, difference, f"{pair.p:.2g}", f"{pair.wins:.0%}")
     return table
 
 
@@ -64,5 +61,10 @@ def open_table(title: str, *heads: str, label: str = "") -> Table:
     return table
 
 
-def _cell(metric: Metric, value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.{metric.digits}g}"
+def _shown(known: Container[str], all: bool) -> dict[str, Metric]:
+    """Those of the `known` scores that have a row."""
+    return {k: m for k, m in METRICS.items() if k in known and (m.listed if all else k in FIRST)}
+
+
+def _cell(metric: Metric, value: float) -> str:
+    return "-" if value != value else f"{value:.{metric.digits}g}"

@@ -20,7 +20,7 @@ from torchmetrics.aggregation import MeanMetric
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
-from learn.data.clips import Clip, sources, typical_young
+from learn.data.clips import Clip, sources
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
@@ -63,7 +63,8 @@ def train(
     fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
-    card = ModelCard(settings, scales, typical_young(fit), *name_parts(clips, split), [*split.hashes])
+    typical_young = float(np.exp(np.mean([np.log(clip.young_kpa) for clip in fit])))
+    card = ModelCard(settings, scales, typical_young, *name_parts(clips, split), [*split.hashes])
     state = _open(out, card)
     try:
         run = _start(card, state)
