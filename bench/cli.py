@@ -315,10 +315,11 @@ def live(
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
-    from bench.tracking import flow_process, live
+    from bench.tracking import live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
     from synth.recording_flow.decode import RecordingFlowSettings
+    from synth.recording_flow.flow_process import open_flow_process
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
 
@@ -326,7 +327,7 @@ def live(
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
     threadpool_limits(set_threads(None))
-    with flow_process.open_flow_process() as process:
+    with open_flow_process(set_threads) as process:
         stream = live.stream_video(
             _open_footage(video, files),
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),

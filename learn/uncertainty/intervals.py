@@ -100,6 +100,17 @@ class Intervals:
     units: int  # exchangeable units in the calibration: brains, or sequences if a brain is on several sides
     sequences: int  # in the calibration
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a card whose arrays don't fit together."""
+        frame, count = len(self.features), len(self.features) - len(ESTIMATE)
+        for spread in (self.size, *self.axes):
+            if {len(spread.scale.slopes), len(spread.scale.low), len(spread.scale.high)} != {frame}:
+                raise ValueError(f"an error model doesn't have {frame} features")
+            if spread.factors.keys() != {str(level) for level in LEVELS}:
+                raise ValueError(f"levels are not {', '.join(map(str, LEVELS))}")
+        if {len(row) for row in (self.distribution.mean, *self.distribution.precision)} != {count}:
+            raise ValueError(f"the distribution doesn't have {count} features")
+
     def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:
         """Intervals of the frames' forces at a level of `LEVELS`, per unit stiffness."""
         features = frame_features(predicted, self.force_unit)

@@ -12,8 +12,8 @@ import numpy as np
 from synth.arrays import Mask
 from synth.errors import UserError, as_positive
 from synth.recording_flow.finding import Finding
-from synth.recording_flow.frame_faults import VideoFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
+from synth.recording_flow.picture_faults import VideoFaults, find_bars, find_fault, is_inside_out
 from synth.recording_flow.stereo import DepthVideo, RightVideo
 from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS

@@ -10,8 +10,8 @@ import numpy as np
 from synth.arrays import Mask, Pixels
 from synth.flow import mask_detection
 from synth.flow.mask_selection import Proposal
-from synth.recording_flow.frame_faults import find_fault
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
+from synth.recording_flow.picture_faults import find_fault
 from synth.video.read import shrink_mask
 
 

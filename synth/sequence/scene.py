@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -22,6 +22,7 @@ from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
 from synth.render.camera.camera import Camera
+from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
 from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import scenario
@@ -63,6 +64,8 @@ class RestScene:
     """The microscope at rest."""
     brain: Brain | None
     """The user's brain that the surface is part of, if any, with its transform to world axes."""
+    content: Callable[[RestScene], SceneContent]
+    """What is drawn of it: `draw_craniotomy`, or content of your own around the same surface."""
 
     @property
     def shape(self) -> Shape:
@@ -82,10 +85,8 @@ class RestScene:
     @cached_property
     def renderer(self) -> Renderer:
         """Renderer of this scene for any state of its surface and instruments."""
-        kinds = [gesture.kind for gesture in self.scenario.gestures]
-        appearance, job = self.scenario.appearance, self.job
-        content = craniotomy(self.surface, appearance, self.view, job, kinds)
-        return Renderer(content, self.view, appearance.sensor, job.render, job.store.extra)
+        sensor, job = self.scenario.appearance.sensor, self.job
+        return Renderer(self.content(self), self.view, sensor, job.render, job.store.extra)
 
     @property
     def tissue(self) -> Mask:
@@ -186,8 +187,19 @@ class Scene(RestScene):
         return track.recover_flow(rgb, tools, self.tissue, chosen)
 
 
+def draw_craniotomy(rest: RestScene) -> SceneContent:
+    """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
+    kinds = [gesture.kind for gesture in rest.scenario.gestures]
+    return craniotomy(rest.surface, rest.scenario.appearance, rest.view, rest.job, kinds)
+
+
 def at_rest(
-    job: Job, index: int = 0, gestures: Sequence[str] | None = None, *, case: Scenario | None = None
+    job: Job,
+    index: int = 0,
+    gestures: Sequence[str] | None = None,
+    *,
+    case: Scenario | None = None,
+    content: Callable[[RestScene], SceneContent] = draw_craniotomy,
 ) -> RestScene:
     """Draws sequence `index` of a job and builds its surface and renderer.
 
@@ -198,6 +210,7 @@ def at_rest(
         index: number of the sequence.
         gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
         case: a scenario to use instead of the drawn one.
+        content: what is drawn.
 
     Raises:
         UserError: the job's surface or calibration cannot be used.
@@ -213,7 +226,7 @@ def at_rest(
     surface, brain = _cortex(
         job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
     )
-    return RestScene(job, index, case, surface, view, brain)
+    return RestScene(job, index, case, surface, view, brain, content)
 
 
 @lru_cache(maxsize=4)

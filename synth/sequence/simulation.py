@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from synth.errors import UserError
@@ -10,10 +10,11 @@ from synth.fem.deformation import check_deformation
 from synth.fem.tool_gesture import ToolMotion
 from synth.job.reader import as_job
 from synth.job.schema import Job
+from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
 from synth.sequence.scenario import Scenario
-from synth.sequence.scene import Scene, at_rest
+from synth.sequence.scene import RestScene, Scene, at_rest, draw_craniotomy
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 
@@ -26,10 +27,11 @@ def simulate(
     case: Scenario | None = None,
     motions: Sequence[ToolMotion] = (),
     mechanics: Mechanics | None = None,
+    content: Callable[[RestScene], SceneContent] = draw_craniotomy,
 ) -> Scene:
     """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
 
-    Without `case`, `motions` and `mechanics` the scene is the one that `synth render` computes for that job
+    Without `case`, `motions`, `mechanics` and `content` the scene is the one that `synth render` computes for that job
     and index.
 
     Args:
@@ -41,6 +43,7 @@ def simulate(
             `at` like that of `CameraMotion`.
         motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
         mechanics: what moves the surface instead of this package's finite elements; it has no `motions`.
+        content: what is drawn around the surface and of it.
 
     Raises:
         UserError: no such sequence, a job that cannot be carried out (surface, load, inverted element), or
@@ -54,7 +57,7 @@ def simulate(
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     with watch.stage("mesh"):
-        rest = at_rest(job, index, case=case)
+        rest = at_rest(job, index, case=case, content=content)
     motion = (mechanics or FemMechanics(motions)).deform(rest, report, watch)
     check_deformation(motion, rest.shape, job.frames, len(rest.scenario.gestures))
-    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, motion)
+    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, content, motion)

@@ -17,13 +17,13 @@ from bench.methods.network import Model
 from bench.recording.folder import open_recording
 from bench.recording.writer import write_video
 from bench.tracking import live
-from bench.tracking.flow_process import FlowProcess
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
 from synth.arrays import Pixels
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import LocalFlow
+from synth.recording_flow.flow_process import FlowProcess
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture, read_video

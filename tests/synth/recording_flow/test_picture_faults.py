@@ -6,7 +6,7 @@ import pytest
 from fake_recording import texture
 from numpy.typing import NDArray
 
-from synth.recording_flow.frame_faults import VideoFaults, find_bars, is_inside_out
+from synth.recording_flow.picture_faults import VideoFaults, find_bars, is_inside_out
 
 
 def _video() -> NDArray[np.uint8]:

@@ -11,7 +11,7 @@ import os
 import resource
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
@@ -27,8 +27,10 @@ class FlowProcess(LocalFlow):
 
     ahead = 1
 
-    def __init__(self) -> None:
-        self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_set_up)
+    def __init__(self, set_up: Callable[[], object]) -> None:
+        """`set_up`: called in the process before anything else."""
+        spawn = get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin_process, initargs=(set_up,))
         # The other process inherits the blocked SIGINT: on Ctrl-C this process closes it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -50,22 +52,20 @@ class FlowProcess(LocalFlow):
 
 
 @contextlib.contextmanager
-def open_flow_process() -> Iterator[FlowProcess | None]:
-    """Opens a process for flow and closes it at the end; None on a single core."""
+def open_flow_process(set_up: Callable[[], object]) -> Iterator[FlowProcess | None]:
+    """Opens a process for flow, which calls `set_up` first, and closes it at the end; None on a single core."""
     if len(os.sched_getaffinity(0)) < 2:
         yield None
         return
-    with contextlib.closing(FlowProcess()) as process:
+    with contextlib.closing(FlowProcess(set_up)) as process:
         yield process
 
 
 _flow = LocalFlow()  # of the other process, for one video at a time
 
 
-def _set_up() -> None:
-    from learn.training.threads import set_threads
-
-    set_threads(None)
+def _begin_process(set_up: Callable[[], object]) -> None:
+    set_up()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
