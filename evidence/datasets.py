@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import cache
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView, settled
+from synth.arrays import Map, Mask
 from synth.dataset import location
 from synth.dataset.store import Sequence, open_sequence
 from synth.flow.estimator import Estimator
@@ -38,7 +38,7 @@ def render(job: Job, index: int, folder: Path) -> Sequence:
 
 
 def recover_flow(
-    sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: NDArray[np.bool_], grid: Grid
+    sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: Mask, grid: Grid
 ) -> tuple[Clip, float]:
     """Clip with the recovered flow of its rendered sequence, and the CPU time of all frames' flow [s].
 
@@ -61,12 +61,12 @@ def recover_flow(
 def coarser(clip: Clip, times: int = 2) -> Clip:
     """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
 
-    def blocks(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def blocks(values: Map) -> Map:
         n = values.shape[-1] // times
-        pooled: NDArray[np.float32] = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
+        pooled: Map = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
         return pooled
 
-    def mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def mean(values: Map) -> Map:
         return (blocks(values * clip.mask) / share * mask).astype(np.float32)
 
     cover = blocks(np.asarray(clip.mask))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.evaluation.statistics import interval, paired
+from synth.arrays import Floats
 
-Values = Sequence[float | None] | NDArray[np.float64]
+Values = Sequence[float | None] | Floats
 """One of each sequence; None or NaN: left out."""
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.cluster.vq import kmeans2
 from sklearn.metrics import roc_auc_score
@@ -17,16 +16,13 @@ from torch import nn
 
 from evidence import report, status
 from evidence.flow.scenes import jpeg
-from evidence.render.realism import OUTLINE, Picture, bare_picture, corners, outlined, scaled_photograph
+from evidence.render.realism import OUTLINE, bare_picture, corners, outlined, scaled_photograph
 from evidence.study import Study
+from synth.arrays import Floats, Ints, Mask, Pixels
 from synth.errors import UserError
 from synth.fit.fitting import fit_camera
 from synth.fit.photograph import Photograph, read_photograph
 from synth.job.schema import Job
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
@@ -38,7 +34,7 @@ _PATCHES = 40  # of the photograph; the control assigns one label to each
 _BLURRED_PX = 3.0
 
 
-def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Picture, Floats]:
+def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) -> tuple[Pixels, Floats]:
     """Crops (N, 128, 128, 3) of the photograph inside an outline, and their corners (N, 2) in it [px].
 
     Raises:
@@ -51,7 +47,7 @@ def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) ->
     return _cut(taken(image, 0), found), np.array(found, float)
 
 
-def of_job(job: Job, step: int = 64) -> tuple[Picture, Ints]:
+def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
     """Crops of tissue in the first frame of each sequence, without instruments; and their sequence (N,)."""
     field = job.render.size[0] * MM_PER_PX
     keys = job.model_dump()
@@ -90,13 +86,13 @@ def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) 
     return job.model_copy(update={"sensor": sensor})
 
 
-def taken(rgb: Picture, seed: int) -> Picture:
+def taken(rgb: Pixels, seed: int) -> Pixels:
     """The image with the noise and JPEG compression common to all crops."""
     noise = np.random.default_rng([seed, 5]).normal(0, _NOISE, rgb.shape)
     return jpeg(np.clip(rgb + noise, 0, 255).astype(np.uint8), _QUALITY)
 
 
-def _cut(rgb: Picture, found: list[tuple[int, int]]) -> Picture:
+def _cut(rgb: Pixels, found: list[tuple[int, int]]) -> Pixels:
     crops = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
     return np.asarray(crops, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
 
@@ -121,11 +117,11 @@ def measure(
     near = np.asarray((np.abs(places[:, None] - places[None]) < SIDE_PX).all(axis=2))  # overlapping
     rows = []
 
-    def add(name: str, pictures: Picture, label: Ints, fold: Ints, near: Flags) -> None:
+    def add(name: str, pictures: Pixels, label: Ints, fold: Ints, near: Mask) -> None:
         scores = held_out(pictures, label, fold, near, epochs, seed)
         rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
-    def against(job: Job) -> tuple[Picture, Ints, Ints, Flags]:
+    def against(job: Job) -> tuple[Pixels, Ints, Ints, Mask]:
         ours, sequence = of_job(job)
         label = np.repeat([0, 1], (len(theirs), len(ours)))
         fold, both = np.concatenate([region, sequence % _FOLDS]), np.pad(near, (0, len(ours)))
@@ -187,10 +183,10 @@ def summary(scores: list[float]) -> dict[str, Any]:
 
 
 def held_out(
-    pictures: Picture,
+    pictures: Pixels,
     label: Ints,
     fold: Ints,
-    near: Flags,
+    near: Mask,
     epochs: int,
     seed: int,
     tested: tuple[int, ...] = tuple(range(_FOLDS)),
@@ -209,7 +205,7 @@ def held_out(
     return found
 
 
-def trained_scores(pictures: Picture, label: Ints, test: Picture, epochs: int, seed: int) -> Floats:
+def trained_scores(pictures: Pixels, label: Ints, test: Pixels, epochs: int, seed: int) -> Floats:
     """Scores of test crops by a network trained on rotated and mirrored others, labels weighted equally."""
     order = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng():
@@ -246,7 +242,7 @@ def _network() -> nn.Module:
     )
 
 
-def _tensor(pictures: Picture) -> torch.Tensor:
+def _tensor(pictures: Pixels) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).float() / 127.5 - 1
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.decomposition import TruncatedSVD
 
 from evidence import cache, report, status, training
@@ -29,10 +28,10 @@ from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import Predictor
 from learn.settings import TrainingSettings
 from learn.split import Split
+from synth.arrays import Floats
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 
-Floats = NDArray[np.float64]
 Estimate = Callable[[Clip], Floats]  # clip → force (T, 3) mN, camera axes
 
 RIDGE = "ridge"

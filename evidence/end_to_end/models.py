@@ -21,9 +21,9 @@ from bench.methods.protocol import Field
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor
 from learn.training import batches
+from synth.arrays import Array, Floats
 from synth.flow.confidence import deviation
 
-Floats = NDArray[np.float64]
 Estimate = Callable[[Clip], Floats]  # clip with `recovered` displacement → force (T, 3) mN, camera axes
 
 RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "physics"
@@ -72,7 +72,7 @@ def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
 def turned(clip: Clip) -> list[Clip]:
     """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
 
-    def each(fields: NDArray[Any], turn: int) -> NDArray[Any]:
+    def each(fields: Array, turn: int) -> Array:
         return batches.turned(torch.from_numpy(np.array(fields)), turn).numpy()
 
     return [

@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from synth.arrays import Floats, Indices, Mask
 from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
@@ -15,8 +15,6 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
 from synth.sequence import scenario
-
-Floats = NDArray[np.float64]
 
 ANATOMY = schema.AnatomySection()
 WAYS = {"push": (0.0, 0.0, -1.0), "pull": (0.0, 0.0, 1.0), "aside": (0.87, 0.0, 0.5)}
@@ -29,9 +27,9 @@ class Patch:
     """The dome over the opening as a fine surface."""
 
     vertices: Floats
-    faces: NDArray[np.int32]
+    faces: Indices
     area: Floats
-    opening: NDArray[np.bool_]  # (V,) in the opening, where errors are measured
+    opening: Mask  # (V,) in the opening, where errors are measured
 
 
 def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:

@@ -7,11 +7,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ellipe, ellipk, j0, j1
 
 from evidence import report
 from evidence.study import Study
+from synth.arrays import Floats
 from synth.fem import surface_embedding
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
@@ -19,7 +19,6 @@ from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
 from synth.job import schema
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 _RADIUS_MM = 4.5
 _POISSONS = (0.4, 0.45, 0.49)

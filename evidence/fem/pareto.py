@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import report
 from evidence.fem import case as fem_case
 from evidence.study import Study
+from synth.arrays import Floats
 from synth.fem import solver
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.laws import NUMBER
@@ -25,7 +25,6 @@ from synth.geometry.triangles import Shape
 from synth.job import schema
 from synth.sequence import scenario
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 _LOADS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)

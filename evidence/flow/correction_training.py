@@ -20,13 +20,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from evidence import report
 from evidence.flow import scenes as drawn_scenes
 from evidence.flow.scenes import Recipe, inverse, jpeg, noise_field, pairs, pixels, sample
 from evidence.study import Study
+from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow import correction, image, mask_detection
 from synth.flow.stereo import depth_correction
@@ -330,7 +330,7 @@ def depth_example(frames: Frames) -> Frames:
     return _example(rows)
 
 
-def _normalised(rgb: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
+def _normalised(rgb: Pixels, usable: Mask) -> Tensor:
     return image.normalise(image.tensor(rgb), image.flags(usable))
 
 
@@ -378,7 +378,7 @@ def _resized(frames: Frames, share: float) -> Frames:
     }
 
 
-def _corrupted(picture: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _corrupted(picture: Pixels, rng: np.random.Generator) -> Pixels:
     """The image dark, out of focus, shifted or rotated: untrackable, so that the variance must be large."""
     ways = (
         lambda: (picture * 0.02).astype(np.uint8),

@@ -13,8 +13,9 @@ import torch
 
 from evidence import report
 from evidence.flow.measure import Error, epe, mean_error
-from evidence.flow.scenes import CLEAN, Flags, Recipe, Rgb, Stage, pairs
+from evidence.flow.scenes import CLEAN, Recipe, Stage, pairs
 from evidence.study import Study
+from synth.arrays import Mask, Pixels
 from synth.flow import mask_detection
 from synth.flow.estimator import create
 from synth.flow.track import Tracker
@@ -72,7 +73,7 @@ def _targets(on: str, ours: Error) -> Iterator[Row]:
     yield row("divergence, 1 - correlation", on, 1 - ours.divergence_r, 0.10, "share")
 
 
-def _automatic(picture: Rgb, _: Flags) -> Flags:
+def _automatic(picture: Pixels, _: Mask) -> Mask:
     """Mask of usable pixels detected in the image."""
     return ~mask_detection.blocked(picture)
 

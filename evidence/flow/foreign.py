@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import report
 from evidence.flow.foreign_scenes import Frame, Recipe, recipes, video
 from evidence.flow.measure import epe
 from evidence.study import Study
+from synth.arrays import Array, Mask
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
@@ -19,7 +19,7 @@ from synth.video.read import Picture
 _MASKS = ("auto", "both", "none")  # selected, all detected, none
 _CORRUPTED = ("black", "covered", "defocus", "jump")  # faults whose frames count for the flags alone
 _FPS = 10.0
-Table = Mapping[str, NDArray[Any]]
+Table = Mapping[str, Array]
 
 
 def measure(
@@ -60,7 +60,7 @@ def judge(recipe: Recipe, size: int, frames: int) -> dict[str, Any]:
     }
 
 
-def _follow(shown: Sequence[Frame], masks: str) -> tuple[NDArray[Any], ...]:
+def _follow(shown: Sequence[Frame], masks: str) -> tuple[Array, ...]:
     """Tracking of a video as by `bench score`, with tissue all over the image.
 
     Returns:
@@ -78,11 +78,11 @@ def _follow(shown: Sequence[Frame], masks: str) -> tuple[NDArray[Any], ...]:
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
-def _mean(field: NDArray[Any], where: NDArray[np.bool_]) -> float:
+def _mean(field: Array, where: Mask) -> float:
     return float(field[where].mean()) if where.any() else float("nan")
 
 
-def _ratio(part: NDArray[Any], whole: NDArray[Any]) -> float:
+def _ratio(part: Array, whole: Array) -> float:
     return float(part.sum() / max(1, whole.sum()))
 
 

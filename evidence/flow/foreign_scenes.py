@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 from skimage import data as photographs  # type: ignore[import-not-found, unused-ignore]
 
-from evidence.flow.scenes import Flags, Floats, Rgb, jpeg, noise_field, pixels
+from evidence.flow.scenes import jpeg, noise_field, pixels
+from synth.arrays import Array, Floats, Map, Mask, Pixels
 
 _FINE = 2  # samples of the source a pixel
 _MARGIN = 24  # px of the source beyond the image, which motion may bring into view
@@ -63,10 +63,10 @@ class Recipe:
 class Frame:
     """One frame and its ground truth."""
 
-    rgb: Rgb
-    flow: Floats  # (H, W, 2) px from the rest frame, on its pixels
-    visible: Flags  # (H, W) on the rest frame's pixels: unobstructed tissue in both images
-    free: Flags  # (H, W) on this frame's pixels: tissue away from tool and highlights
+    rgb: Pixels
+    flow: Map  # (H, W, 2) px from the rest frame, on its pixels
+    visible: Mask  # (H, W) on the rest frame's pixels: unobstructed tissue in both images
+    free: Mask  # (H, W) on this frame's pixels: tissue away from tool and highlights
     amplitude: float  # share of the full motion
     fault: str
 
@@ -100,7 +100,7 @@ def _recipe(index: int, surfaces: list[str]) -> Recipe:
     )
 
 
-def _surface(name: str, size: int, rng: np.random.Generator) -> Floats:
+def _surface(name: str, size: int, rng: np.random.Generator) -> Map:
     """Cubic-spline coefficients (3, N, N) of a low-pass filtered image, `_FINE` samples a pixel, of
     (size + 2 margins) px a side."""
     fine = _FINE * (size + 2 * _MARGIN)
@@ -109,7 +109,7 @@ def _surface(name: str, size: int, rng: np.random.Generator) -> Floats:
     return np.stack([spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)])
 
 
-def _photograph(name: str, fine: int) -> Floats:
+def _photograph(name: str, fine: int) -> Map:
     picture = np.asarray(getattr(photographs, name)())
     picture = np.repeat(picture[..., None], 3, -1) if picture.ndim == 2 else picture[..., :3]
     side = min(picture.shape[:2])
@@ -120,7 +120,7 @@ def _photograph(name: str, fine: int) -> Floats:
     return np.asarray(np.clip(cv2.resize(square, (fine, fine), interpolation=ways), 0, 1), np.float32)
 
 
-def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
+def _drawn(name: str, fine: int, rng: np.random.Generator) -> Map:
     """Image of a phantom, (fine, fine, 3) in 0..1."""
     shape = (fine, fine)
     paper = 1 + 0.02 * noise_field(shape, 60, rng)
@@ -147,7 +147,7 @@ def _drawn(name: str, fine: int, rng: np.random.Generator) -> Floats:
     return _over(picture, 0.7 * marks, 0.25 if level > 0.4 else 0.45)
 
 
-def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Floats:
+def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> Map:
     """Coverage in 0..1 by discs on a jittered grid, (fine, fine)."""
     cover = np.zeros((fine, fine), np.uint8)
     line = np.arange(0, fine, apart)
@@ -157,7 +157,7 @@ def _dots(fine: int, rng: np.random.Generator, apart: float, radius: float) -> F
     return np.asarray(cover / 255, np.float32)
 
 
-def _over(picture: NDArray[np.floating], cover: Floats, ink: float) -> Floats:
+def _over(picture: Array, cover: Map, ink: float) -> Map:
     return np.asarray(np.clip(picture + cover[..., None] * (ink - picture), 0, 1), np.float32)
 
 
@@ -166,9 +166,9 @@ class Field:
     """A motion in closed form whose largest displacement is 1 px."""
 
     motion: str
-    centre: NDArray[np.float64]  # (2,) px
+    centre: Floats  # (2,) px
     radius: float  # px
-    way: NDArray[np.float64]  # (2,) unit vector
+    way: Floats  # (2,) unit vector
 
     @classmethod
     def draw(cls, motion: str, size: int, rng: np.random.Generator) -> Field:
@@ -177,7 +177,7 @@ class Field:
         radius, turn = size * rng.uniform(0.16, 0.26), rng.uniform(0, 2 * np.pi)
         return cls(motion, centre, radius, np.array([np.cos(turn), np.sin(turn)]))
 
-    def at(self, place: Floats) -> Floats:
+    def at(self, place: Map) -> Map:
         """Displacement (..., 2) px at places (..., 2) px."""
         away = place - self.centre
         square = (away**2).sum(-1, keepdims=True) / self.radius**2
@@ -241,7 +241,7 @@ class _Stage:
         grid = pixels(size, size)
         jump = np.array([18.0, -11.0]) * size / 192 if fault == "jump" else np.zeros(2)
 
-        def moved(at: Floats) -> Floats:
+        def moved(at: Map) -> Map:
             return np.asarray(amplitude * self.peak_px * self.field.at(at) + jump, np.float32)
 
         source = grid
@@ -270,7 +270,7 @@ class _Stage:
         visible = cv2.remap(free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
         return Frame(rgb, flow, visible & scope & ~self.rest_blocked, free, amplitude, fault)
 
-    def _shine(self, picture: Floats, amplitude: float) -> tuple[Floats, Flags]:
+    def _shine(self, picture: Map, amplitude: float) -> tuple[Map, Mask]:
         """The image with highlights, which stay with the light, and their mask."""
         if self.recipe.glare <= 0:
             return picture, np.zeros(picture.shape[:2], bool)
@@ -280,7 +280,7 @@ class _Stage:
         lit = picture + strength * (1.08 * np.array(_LAMPS[self.recipe.lamp]) - picture)
         return np.asarray(lit, np.float32), strength[..., 0] > 0.1
 
-    def _tool(self, picture: Floats, amplitude: float, flow: Floats) -> tuple[Floats, Flags]:
+    def _tool(self, picture: Map, amplitude: float, flow: Map) -> tuple[Map, Mask]:
         """The image with a shaft from the border to the moving contact, and its mask; retracted at rest."""
         recipe, size = self.recipe, self.size
         mask = np.zeros((size, size), np.uint8)
@@ -318,7 +318,7 @@ class _Stage:
         lit = picture * shadow * (1 - soft) + soft * colour
         return np.asarray(lit, np.float32), mask.astype(bool)
 
-    def _sense(self, picture: Floats, rng: np.random.Generator) -> Rgb:
+    def _sense(self, picture: Map, rng: np.random.Generator) -> Pixels:
         if self.recipe.mono:
             picture = np.repeat(picture.mean(-1, keepdims=True), 3, -1)
         noise = rng.normal(0, self.recipe.noise, picture.shape[:2] + ((1,) if self.recipe.mono else (3,)))
@@ -326,6 +326,6 @@ class _Stage:
         return jpeg(rgb, self.recipe.quality)
 
 
-def _near(mask: Flags) -> Flags:
+def _near(mask: Mask) -> Mask:
     """Mask (H, W) dilated by 4 px, so that soft rims and shadow edges are left out."""
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, bool)

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from evidence.flow.scenes import Flags, Floats, Pair, Rgb
+from evidence.flow.scenes import Pair
+from synth.arrays import Array, Map, Mask, Pixels
 from synth.flow.estimator import Estimator
 
 _SIGMA = 1.0  # px: divergence is compared after this Gaussian, on both sides
@@ -32,18 +32,18 @@ class Error:
     cpu_s: float  # processor time
 
 
-def epe(flow: Floats, truth: Floats) -> Floats:
+def epe(flow: Map, truth: Map) -> Map:
     """Endpoint error, (H, W) px (Baker et al., IJCV 2011)."""
     return np.asarray(np.linalg.norm(flow - truth, axis=-1), np.float32)
 
 
-def divergence(flow: Floats) -> Floats:
+def divergence(flow: Map) -> Map:
     """d u/d x + d v/d y after a Gaussian of 1 px, (H, W)."""
     smooth = cv2.GaussianBlur(flow, (0, 0), _SIGMA)
     return np.asarray(np.gradient(smooth[..., 0], axis=1) + np.gradient(smooth[..., 1], axis=0), np.float32)
 
 
-def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
+def against(flow: Map, pair: Pair, cpu_s: float) -> Error:
     """Errors of one flow, (H, W, 2) px."""
     error, visible = epe(flow, pair.flow), pair.inside & ~pair.hidden
     size, real = np.linalg.norm(flow, axis=-1)[visible], np.linalg.norm(pair.flow, axis=-1)[visible]
@@ -63,7 +63,7 @@ def against(flow: Floats, pair: Pair, cpu_s: float) -> Error:
     )
 
 
-Masks = Callable[[Rgb, Flags], Flags]  # (image, exact mask of usable pixels) → the mask to use
+Masks = Callable[[Pixels, Mask], Mask]  # (image, exact mask of usable pixels) → the mask to use
 
 
 def mean_error(
@@ -87,7 +87,7 @@ def mean_error(
     return Error(**{n: float(np.median(v)) if n == "cpu_s" else _mean(v) for n, v in table.items()})
 
 
-def _mean(values: Sequence[float] | NDArray[np.floating]) -> float:
+def _mean(values: Sequence[float] | Array) -> float:
     good = np.asarray(values)
     good = good[np.isfinite(good)]
     return float(good.mean()) if len(good) else float("nan")

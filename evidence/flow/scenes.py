@@ -7,12 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-Floats = NDArray[np.float32]
-Flags = NDArray[np.bool_]
-Rgb = NDArray[np.uint8]
+from synth.arrays import Map, Mask, Pixels
 
 _FINE = 2  # texture samples a pixel, so that resampling loses no detail that the sensor resolves
 
@@ -41,19 +38,19 @@ CLEAN = Recipe(tool=0.0, highlights=0.0, illumination=0.0, noise=0.0)  # nothing
 class Pair:
     """Two images and their ground truth, on the rest frame's pixels unless stated otherwise."""
 
-    rest: Rgb  # (H, W, 3) uint8, without tool
-    now: Rgb  # (H, W, 3) uint8
-    flow: Floats  # (H, W, 2) px, rest to now
-    rest_usable: Flags  # (H, W): no highlight in the rest frame
-    now_usable: Flags  # (H, W), on the current frame's pixels: neither tool nor highlight
-    tool: Flags  # (H, W), on the current frame's pixels
-    glare: Flags  # (H, W), on the current frame's pixels
-    hidden: Flags  # (H, W): material points under the tool in the current frame, inside the image
-    contact: Flags  # (H, W): within the dimple's radius of the contact
-    inside: Flags  # (H, W): material points inside the current image
+    rest: Pixels  # (H, W, 3) uint8, without tool
+    now: Pixels  # (H, W, 3) uint8
+    flow: Map  # (H, W, 2) px, rest to now
+    rest_usable: Mask  # (H, W): no highlight in the rest frame
+    now_usable: Mask  # (H, W), on the current frame's pixels: neither tool nor highlight
+    tool: Mask  # (H, W), on the current frame's pixels
+    glare: Mask  # (H, W), on the current frame's pixels
+    hidden: Mask  # (H, W): material points under the tool in the current frame, inside the image
+    contact: Mask  # (H, W): within the dimple's radius of the contact
+    inside: Mask  # (H, W): material points inside the current image
 
 
-def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator) -> Floats:
+def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator) -> Map:
     """Smooth noise of zero mean and unit deviation with features about `period` samples apart, (H, W)."""
     white = rng.standard_normal(shape)
     fy = np.fft.fftfreq(shape[0])[:, None]
@@ -63,7 +60,7 @@ def noise_field(shape: tuple[int, int], period: float, rng: np.random.Generator)
     return np.asarray((smooth - smooth.mean()) / smooth.std(), np.float32)
 
 
-def cortex(size: int, rng: np.random.Generator) -> Floats:
+def cortex(size: int, rng: np.random.Generator) -> Map:
     """Albedo like an exposed cortex: parenchyma, arteries, fine vessels and a vein; (size, size, 3) in 0..1.
 
     Vessels are the zero lines of smooth noise. They are not anatomical, but the image has the gradients, the
@@ -72,7 +69,7 @@ def cortex(size: int, rng: np.random.Generator) -> Floats:
     shape = (size, size)
     unit = size / 448.0
 
-    def line(period: float, width: float) -> Floats:
+    def line(period: float, width: float) -> Map:
         wave = noise_field(shape, period * unit, rng)
         slope = np.hypot(*np.gradient(wave)) + 1e-3
         return np.asarray(np.exp(-((wave / slope / (width * unit)) ** 2)), np.float32)
@@ -90,7 +87,7 @@ def cortex(size: int, rng: np.random.Generator) -> Floats:
     return np.asarray(cv2.GaussianBlur(np.clip(colour, 0, 1), (0, 0), 0.9), np.float32)
 
 
-def pull_field(recipe: Recipe) -> Floats:
+def pull_field(recipe: Recipe) -> Map:
     """Displacement of a surface pulled at its centre, (H, W, 2) px at the rest frame's pixels.
 
     Outside the contact it decreases as under a point load on an elastic half-space (1/r, Boussinesq), inside
@@ -110,12 +107,12 @@ def pull_field(recipe: Recipe) -> Floats:
     return np.asarray(np.stack([u, v], -1) * (recipe.pull / np.hypot(u, v).max()), np.float32)
 
 
-def pixels(height: int, width: int) -> Floats:
+def pixels(height: int, width: int) -> Map:
     """Coordinates (x, y) of pixel centres, (H, W, 2)."""
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float32)
 
 
-def inverse(flow: Floats) -> Floats:
+def inverse(flow: Map) -> Map:
     """Position x in the rest frame of each pixel y, x + u(x) = y, by fixed-point iteration. (H, W, 2) px."""
     grid = source = pixels(*flow.shape[:2])
     for _ in range(60):
@@ -126,7 +123,7 @@ def inverse(flow: Floats) -> Floats:
     return source
 
 
-def sample(field: Floats, where: Floats, order: int = 3) -> Floats:
+def sample(field: Map, where: Map, order: int = 3) -> Map:
     """Field (H, W) at points (x, y), (..., 2), by cubic splines.
 
     OpenCV's remap rounds to 1/32 px and its bicubic kernel displaces a ramp by up to 0.05 px: too much for a
@@ -142,10 +139,10 @@ class Stage:
     """One surface under one light, which yields any frame of a pull."""
 
     recipe: Recipe
-    albedo: Floats  # (2H, 2W, 3) or finer, in 0..1
-    wet: Floats  # (H, W) field whose high values are highlights
-    drift: Floats  # (H, W) change of `wet` as the surface tilts
-    field: Floats = field(repr=False)  # (H, W, 2) px: displacement at full pull
+    albedo: Map  # (2H, 2W, 3) or finer, in 0..1
+    wet: Map  # (H, W) field whose high values are highlights
+    drift: Map  # (H, W) change of `wet` as the surface tilts
+    field: Map = field(repr=False)  # (H, W, 2) px: displacement at full pull
 
     @classmethod
     def set(cls, recipe: Recipe, rng: np.random.Generator) -> Stage:
@@ -157,13 +154,13 @@ class Stage:
         wet = noise_field(size, 14 * unit, rng) + 1.2 * noise_field(size, 70 * unit, rng)
         return cls(recipe, albedo, wet, noise_field(size, 40 * unit, rng), pull_field(recipe))
 
-    def rest(self, rng: np.random.Generator) -> tuple[Rgb, Flags]:
+    def rest(self, rng: np.random.Generator) -> tuple[Pixels, Mask]:
         """The rest frame and its highlights: (H, W, 3) uint8, (H, W) bool."""
         grid = pixels(self.recipe.size, self.recipe.size)
         picture, glare = self._light(self._sample(grid), self.wet, 0.0)
         return self._sense(picture, rng), glare
 
-    def against(self, rest: tuple[Rgb, Flags], share: float, rng: np.random.Generator) -> Pair:
+    def against(self, rest: tuple[Pixels, Mask], share: float, rng: np.random.Generator) -> Pair:
         """The rest frame and the frame at `share` of the full pull."""
         recipe = self.recipe
         flow = np.asarray(share * self.field, np.float32)
@@ -194,11 +191,11 @@ class Stage:
             inside=inside,
         )
 
-    def _sample(self, at: Floats) -> Floats:
+    def _sample(self, at: Map) -> Map:
         fine = self.albedo.shape[0] / self.recipe.size
         return np.stack([sample(self.albedo[..., c], (at + 0.5) * fine - 0.5) for c in range(3)], -1)
 
-    def _light(self, albedo: Floats, wet: Floats, share: float) -> tuple[Floats, Flags]:
+    def _light(self, albedo: Map, wet: Map, share: float) -> tuple[Map, Mask]:
         recipe = self.recipe
         ramp = np.linspace(-1, 1, recipe.size, dtype=np.float32)
         change = recipe.illumination * share
@@ -209,7 +206,7 @@ class Stage:
         strength = np.clip((wet - level) / 0.25 + 0.5, 0, 1)[..., None]
         return np.asarray(picture + strength * (1.05 - picture), np.float32), strength[..., 0] > 0.12
 
-    def _tool(self, share: float) -> Flags:
+    def _tool(self, share: float) -> Mask:
         """Mask of two branches from the lower right to the contact, which they follow."""
         recipe = self.recipe
         mask = np.zeros((recipe.size, recipe.size), np.uint8)
@@ -227,7 +224,7 @@ class Stage:
             cv2.fillConvexPoly(mask, np.round(outline * 16).astype(np.int32), 1, shift=4)
         return mask.astype(bool)
 
-    def _sense(self, picture: Floats, rng: np.random.Generator) -> Rgb:
+    def _sense(self, picture: Map, rng: np.random.Generator) -> Pixels:
         noisy = 255 * picture + rng.normal(0, max(self.recipe.noise, 0), picture.shape)
         return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
@@ -240,7 +237,7 @@ def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:
         yield stage.against(stage.rest(rng), 1.0, rng)
 
 
-def jpeg(rgb: Rgb, quality: int) -> Rgb:
+def jpeg(rgb: Pixels, quality: int) -> Pixels:
     """The image after JPEG compression; quality 0: unchanged."""
     if not quality:
         return rgb
@@ -248,7 +245,7 @@ def jpeg(rgb: Rgb, quality: int) -> Rgb:
     return np.ascontiguousarray(np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)[..., ::-1])
 
 
-def _metal(shape: tuple[int, int]) -> Floats:
+def _metal(shape: tuple[int, int]) -> Map:
     """Dull grey steel, (H, W, 3) in 0..1; bright lines along the branches would be easier to detect."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     sheen = 0.32 + 0.12 * np.sin(0.35 * (y - 0.6 * x)) + 0.05 * np.sin(0.11 * (x + y))

@@ -10,8 +10,9 @@ import numpy as np
 
 from evidence import report
 from evidence.flow.measure import epe
-from evidence.flow.scenes import Floats, Pair, Recipe, pairs
+from evidence.flow.scenes import Pair, Recipe, pairs
 from evidence.study import Study
+from synth.arrays import Map
 from synth.flow.estimator import Estimator, create
 from synth.flow.track import Tracker
 
@@ -42,7 +43,7 @@ def measure(
 
 def _pairs(
     size: int, count: int, seed: int
-) -> Iterator[tuple[str, float, Sequence[tuple[Pair, Floats | None]]]]:
+) -> Iterator[tuple[str, float, Sequence[tuple[Pair, Map | None]]]]:
     """Disturbance, its size, and pairs with the initial flow (None: zero)."""
     for disturbance, (field, values) in _DISTURBANCES.items():
         for value in values:
@@ -55,7 +56,7 @@ def _pairs(
     yield "blank frame", 1.0, [(replace(p, now=np.full_like(p.now, 128)), None) for p in made]
 
 
-def _point(estimator: Estimator, pair: Pair, start: Floats | None) -> dict[str, float]:
+def _point(estimator: Estimator, pair: Pair, start: Map | None) -> dict[str, float]:
     """Errors [px], and whether the frame is lost, flagged, and both ("hits")."""
     tracker = Tracker(estimator, pair.rest, ~pair.rest_usable, np.ones_like(pair.inside))
     tracker.initial = start

@@ -7,20 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import report, status
 from evidence.study import Study
+from synth.arrays import Array, Mask
 from synth.dataset.store import Dataset, Sequence
-
-Floats = NDArray[np.floating]
-Flags = NDArray[np.bool_]
 
 _EVERY = 7  # one in so many visible pixels is measured
 _CONTACT, _DEEP_MM = 0.05, 0.1  # pressed: load above this share of its peak, and moved this far in depth
 
 
-Sample = tuple[Floats, Floats, Floats, Flags]
+Sample = tuple[Array, Array, Array, Mask]
 """Visible tissue of one frame: true and recovered motion, deviation, (n, 3) mm; whether in contact (n,)."""
 
 
@@ -55,7 +52,7 @@ def figures(samples: list[Sample]) -> dict[str, float]:
     }
 
 
-def _rms(values: Floats) -> float:
+def _rms(values: Array) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 

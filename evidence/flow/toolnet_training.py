@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from evidence import report
 from evidence.study import Study
+from synth.arrays import Floats, Mask, Pixels
 from synth.flow import mask_detection, toolnet
 from synth.job.schema import Job
 from synth.render.scene import SceneState
@@ -34,17 +34,14 @@ _AWAY_MM = 300.0  # outside every view
 _HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
 _BATCH, _RATE = 8, 3e-3
 
-Picture = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class Frame:
     """One image and its instrument mask."""
 
     scene: int
-    rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
-    tool: NDArray[np.bool_]  # (H, W)
+    rgb: Pixels  # (H, W, 3) sRGB
+    tool: Mask  # (H, W)
 
 
 def frames_of(scenes: range, seed: int) -> Iterator[Frame]:
@@ -78,9 +75,7 @@ def _scene(job: Job, index: int) -> Iterator[Frame]:
         yield Frame(index, shot.rgb, shot.tool)
 
 
-def _pose(
-    vertices: NDArray[np.float64], radius_mm: float, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pose(vertices: Floats, radius_mm: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """An instrument's two tips (2, 3) mm over the opening, and directions of its shafts (2, 3)."""
     around, far = rng.uniform(0, 2 * np.pi), 0.95 * radius_mm * np.sqrt(rng.uniform())
     over = far * np.array([np.cos(around), np.sin(around)])
@@ -132,7 +127,7 @@ def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
     return net.eval()
 
 
-def overlap(frames: Sequence[Frame], find: Callable[[Picture], Flags]) -> float:
+def overlap(frames: Sequence[Frame], find: Callable[[Pixels], Mask]) -> float:
     """Intersection over union of detected and true tool pixels, pooled over all frames."""
     both = either = 0
     for frame in frames:
@@ -152,7 +147,7 @@ def _batches(frames: Sequence[Frame], rng: np.random.Generator) -> Iterator[tupl
         yield pictures, F.avg_pool2d(small, 2)
 
 
-def _vary(picture: Picture, mask: Flags, rng: np.random.Generator) -> tuple[Picture, Flags]:
+def _vary(picture: Pixels, mask: Mask, rng: np.random.Generator) -> tuple[Pixels, Mask]:
     """Random rotation, zoom and square crop, and changes of light, steel and colour."""
     side = min(mask.shape)
     turn, zoom = rng.uniform(0, 360), rng.uniform(0.55, 1.3)

@@ -19,7 +19,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
@@ -29,11 +28,11 @@ from evidence import report
 from evidence.pooled import FOLDERS, score_and_pool
 from evidence.scoring.exvivo import ramp
 from evidence.study import Study
+from synth.arrays import Floats, Map, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import read_picture
 
-Floats = NDArray[np.float64]
 KINDS = ("plain", "membrane", "pulse")
 _WORKER = Path(__file__).with_name("worker.py")
 _FIELD_MM, _SIDE, _TEXELS, _SIZE = 46.0, 220, 1200, (320, 240)
@@ -270,7 +269,7 @@ def _scene(
     return {"rest": surface.rest, "moved": np.array(moved), "albedo": albedo, "bumps": bumps} | tool
 
 
-def texture(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def texture(rng: np.random.Generator) -> tuple[Map, Map]:
     """Linear albedo (M, M, 3) of a pink ground with branching vessels, and bumps (M, M) of 0 to 1."""
     ground = np.zeros((_TEXELS, _TEXELS))
     for sigma in (3, 9, 27, 80):
@@ -278,7 +277,7 @@ def texture(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.f
         ground += octave / octave.std() * sigma**0.3
     ground /= ground.std()
     shade = (1 + 0.05 * ground).astype(np.float32)[..., None]
-    albedo: NDArray[np.float32] = np.array([0.62, 0.36, 0.30], np.float32) * shade
+    albedo: Map = np.array([0.62, 0.36, 0.30], np.float32) * shade
     bumps = gaussian_filter(ground, 2)
     for colour, number, width in (((0.30, 0.05, 0.06), 6, 16.0), ((0.45, 0.07, 0.05), 9, 9.0)):
         cover = np.zeros((_TEXELS, _TEXELS), np.uint8)
@@ -291,9 +290,7 @@ def texture(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.f
     return np.clip(albedo, 0, 1).astype(np.float32), (bumps / bumps.max()).astype(np.float32)
 
 
-def _grow(
-    cover: NDArray[np.uint8], start: Floats, heading: float, width: float, rng: np.random.Generator
-) -> None:
+def _grow(cover: Pixels, start: Floats, heading: float, width: float, rng: np.random.Generator) -> None:
     """Draws a winding vessel that becomes thinner and branches."""
     at = np.array(start, float)
     while width > 1.0 and (at > -50).all() and (at < _TEXELS + 50).all():
@@ -340,7 +337,7 @@ def write_pair(file: Path, left: Floats, right: Floats, focal_px: float) -> None
     writer.write_storage(file, values)
 
 
-def _sensed(picture: Path, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _sensed(picture: Path, rng: np.random.Generator) -> Pixels:
     """The image with a sensor's noise."""
     rgb = read_picture(picture)[..., ::-1].astype(np.float32)
     noise = np.sqrt(0.6 + 0.012 * rgb) * rng.normal(size=rgb.shape)

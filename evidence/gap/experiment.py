@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evidence import cache, report, status, training
 from evidence.gap import gap
@@ -25,9 +24,9 @@ from learn.evaluation.statistics import interval
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
+from synth.arrays import Floats
 from synth.errors import UserError
 
-Curve = NDArray[np.float64]
 Errors = Mapping[str, Mapping[str, list[float | None]]]  # by test and metric, of each sequence
 Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
 KINDS = ("I", "R", "N", "mixed")
@@ -138,7 +137,7 @@ def summary(trained: Mapping[str, Sequence[Errors]]) -> dict[str, Any]:
     """Errors with intervals, and the share of the gap closed by each training, for every metric."""
     out: dict[str, Any] = {"errors": {}, "closed": {}, "noise_less_real": {}}
     for key in KEYS:
-        of: dict[str, dict[str, Curve]] = {  # means over seeds
+        of: dict[str, dict[str, Floats]] = {  # means over seeds
             kind: {
                 test: np.mean([np.array(run[test][key], float) for run in runs], axis=0) for test in _TESTS
             }

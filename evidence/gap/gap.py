@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from bench.bootstrap import Interval
 from learn.data.clips import Clip
-
-Curve = NDArray[np.float64]
+from synth.arrays import Floats, Map
 
 _RESAMPLES = 2000
 
@@ -27,7 +25,7 @@ class Gap:
 
 
 def closed(
-    ideal_on_unseen: Curve, trained_on_unseen: Curve, ideal_on_ideal: Curve, rng: np.random.Generator
+    ideal_on_unseen: Floats, trained_on_unseen: Floats, ideal_on_ideal: Floats, rng: np.random.Generator
 ) -> Gap:
     """Share of the gap closed, from errors on the same sequences, out of distribution.
 
@@ -59,9 +57,7 @@ class Noise:
     reach_cells: float
     """Standard deviation of the Gaussian filter that reproduces the error's spatial correlation."""
 
-    def add(
-        self, displacement: NDArray[np.float32], mask: NDArray[np.float32], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def add(self, displacement: Map, mask: Map, rng: np.random.Generator) -> Map:
         """Displacement (T, 2, N, N) mm with noise in all frames except the first, the rest frame."""
         out = self.gain * displacement
         for t in range(1, len(out)):

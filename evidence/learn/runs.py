@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from evidence import cache as stored
 from evidence import report, status, training
@@ -29,6 +28,7 @@ from learn.inference.predict import Predictor
 from learn.loss import Loss
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import Split
+from synth.arrays import Floats
 from synth.job import reader
 from synth.job.schema import Job
 
@@ -108,7 +108,7 @@ def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str
     return found
 
 
-def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float64]:
+def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> Floats:
     """A score of every tested sequence, sorted by name; means over the runs that tested it."""
     values: dict[str, list[float]] = {}
     for run in runs:

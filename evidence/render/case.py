@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from synth.arrays import Floats
 from synth.job.schema import Job
 from synth.render.scene import Renderer, SceneState
 from synth.sequence.scene import at_rest
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import Any, get_args
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from evidence import report
 from evidence.study import Study
+from synth.arrays import Pixels
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
 from synth.render import instrument
@@ -21,7 +21,6 @@ from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 
-Picture = npt.NDArray[np.uint8]
 Settings = dict[str, Any]
 
 _GESTURES: dict[Kind, str] = {
@@ -79,7 +78,7 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
         cv2.imwrite(str(out / f"{name}.webp"), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
-def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Picture:
+def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
     job = Job.model_validate(
         _merged(

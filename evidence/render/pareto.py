@@ -10,15 +10,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from evidence import report
 from evidence.render.case import Case, case
 from evidence.study import Study
+from synth.arrays import Map, Mask
 from synth.job.schema import Job, RenderSection
 from synth.render.scene import Renderer
-
-Map = npt.NDArray[np.float32]
 
 _LIFT = 1.5
 _STAGE = signature(Renderer.stage).parameters
@@ -93,7 +91,7 @@ def measure_setting(ours: Case, spp: int, kind: str) -> dict[str, float]:
     }
 
 
-def noises(one: Map, two: Map, inside: npt.NDArray[np.bool_], white: float = 1.0) -> dict[str, float]:
+def noises(one: Map, two: Map, inside: Mask, white: float = 1.0) -> dict[str, float]:
     """Root mean square noise of an image over a mask, relative to the mean: of its radiance, where reflected
     lamps dominate, and after clipping at the radiance of a white surface, as in a camera."""
     kinds = {"noise": (one, two), "noise_clipped": (np.minimum(one, white), np.minimum(two, white))}

@@ -8,16 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import kurtosis, wasserstein_distance
 
 from evidence import report, status
 from evidence.render.case import case
 from evidence.study import Study
+from synth.arrays import Indices, Ints, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.job.schema import Job
-
-Picture = NDArray[np.uint8]
 
 # A highlight is lighter than its surroundings by this much, and nearly white.
 _BRIGHTER_L = 12.0
@@ -30,7 +28,7 @@ OUTLINE = (
 """Of the cortex in the photograph of the stored results."""
 
 
-def statistics(rgb: Picture) -> dict[str, float]:
+def statistics(rgb: Pixels) -> dict[str, float]:
     """Statistics of one crop (N, N, 3) sRGB.
 
     Lab means and standard deviations (CIE 1976, D65), the slope of the radial power spectrum of L from 1/64
@@ -49,7 +47,7 @@ def statistics(rgb: Picture) -> dict[str, float]:
     return found
 
 
-def distances(rgb: Picture, pooled: Picture) -> dict[str, float]:
+def distances(rgb: Pixels, pooled: Pixels) -> dict[str, float]:
     """Earth mover's distance, in Lab, of a crop's histograms from those of pixels (M, 3)."""
     found = {}
     for k, name in enumerate("Lab"):
@@ -58,13 +56,13 @@ def distances(rgb: Picture, pooled: Picture) -> dict[str, float]:
     return found
 
 
-def pool(crops: list[Picture], count: int = 4000) -> Picture:
+def pool(crops: list[Pixels], count: int = 4000) -> Pixels:
     """Pixels (count, 3) at equal distances over crops."""
     pixels = np.concatenate([crop.reshape(-1, 3) for crop in crops])
     return pixels[np.linspace(0, len(pixels) - 1, count).astype(np.int64)]
 
 
-def spread(crops: list[Picture], pooled: Picture) -> dict[str, tuple[float, float, float]]:
+def spread(crops: list[Pixels], pooled: Pixels) -> dict[str, tuple[float, float, float]]:
     """Smallest, median and largest of each statistic over crops; histograms against those of `pooled`."""
     rows = [statistics(crop) | distances(crop, pooled) for crop in crops]
     return {
@@ -73,23 +71,23 @@ def spread(crops: list[Picture], pooled: Picture) -> dict[str, tuple[float, floa
     }
 
 
-def tiles(rgb: Picture, inside: NDArray[np.bool_], side: int, step: int) -> list[Picture]:
+def tiles(rgb: Pixels, inside: Mask, side: int, step: int) -> list[Pixels]:
     """Square crops of `side` px wholly inside a mask, every `step` px."""
     return [rgb[y : y + side, x : x + side] for x, y in corners(inside, side, step)]
 
 
-def corners(inside: NDArray[np.bool_], side: int, step: int) -> list[tuple[int, int]]:
+def corners(inside: Mask, side: int, step: int) -> list[tuple[int, int]]:
     """Upper left corners (x, y) of the crops of `tiles`."""
     summed = cv2.integral(inside.astype(np.uint8))
     covered = summed[side:, side:] - summed[:-side, side:] - summed[side:, :-side] + summed[:-side, :-side]
     return [(int(x * step), int(y * step)) for y, x in np.argwhere(covered[::step, ::step] == side * side)]
 
 
-def _lab(rgb: Picture) -> NDArray[np.float32]:
+def _lab(rgb: Pixels) -> Map:
     return np.asarray(cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), np.float32)
 
 
-def _slope(light: NDArray[np.float32]) -> float:
+def _slope(light: Map) -> float:
     side = light.shape[0]
     window = np.hanning(side)[:, None] * np.hanning(side)[None]
     power = np.abs(np.fft.fft2((light - light.mean()) * window)) ** 2
@@ -100,12 +98,12 @@ def _slope(light: NDArray[np.float32]) -> float:
     return float(np.polyfit(np.log(np.sqrt(edges[1:] * edges[:-1])), np.log(mean), 1)[0])
 
 
-def _kurtosis(light: NDArray[np.float32]) -> float:
+def _kurtosis(light: Map) -> float:
     slopes = np.concatenate([np.diff(light, axis=0).ravel(), np.diff(light, axis=1).ravel()]).astype(float)
     return float(kurtosis(slopes, fisher=False))
 
 
-def _highlights(light: NDArray[np.float32]) -> dict[str, float]:
+def _highlights(light: Map) -> dict[str, float]:
     around = cv2.medianBlur(np.clip(light * 2.55, 0, 255).astype(np.uint8), 31) / 2.55
     bright = ((light > around + _BRIGHTER_L) & (light > _WHITE_L)).astype(np.uint8)
     count, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
@@ -118,7 +116,7 @@ def _highlights(light: NDArray[np.float32]) -> dict[str, float]:
     }
 
 
-def _elongation(label: NDArray[np.int32], chosen: NDArray[np.int64]) -> float:
+def _elongation(label: Indices, chosen: Ints) -> float:
     """Median ratio of axes of the ellipses with the second moments of the chosen labels' pixels."""
     found = [1.0]
     for k in chosen:
@@ -168,7 +166,7 @@ def measure(
     }
 
 
-def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float]:
+def _rendered(frames: int, family: str, seed: int) -> tuple[list[Pixels], float]:
     """Crops of the tissue in frames without an instrument, and the median mm of a pixel."""
     job = Job.model_validate({"seed": seed, "appearance": {"families": [family]}, "render": {"tool": False}})
     crops, pixels = [], []
@@ -179,7 +177,7 @@ def _rendered(frames: int, family: str, seed: int) -> tuple[list[Picture], float
     return crops, float(np.median(pixels))
 
 
-def bare_picture(job: Job, index: int) -> tuple[Picture, NDArray[np.bool_], float]:
+def bare_picture(job: Job, index: int) -> tuple[Pixels, Mask, float]:
     """First frame of a sequence, its tissue less a rim of 4 px, and its scale [mm per px]."""
     one = case(job, index)
     rest = one.renderer.rest
@@ -187,7 +185,7 @@ def bare_picture(job: Job, index: int) -> tuple[Picture, NDArray[np.bool_], floa
     return one.renderer.render(one.state(), index).rgb, inside, rest.scale_mm_per_px
 
 
-def outlined(outline: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def outlined(outline: str, shape: tuple[int, ...]) -> Mask:
     """Pixels (H, W) inside a polygon in shares of the image, "x,y x,y ..."."""
     corners = np.array([[float(v) for v in pair.split(",")] for pair in outline.split()])
     inside = np.zeros(shape, np.uint8)
@@ -195,7 +193,7 @@ def outlined(outline: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return inside > 0
 
 
-def scaled_photograph(photo: Path, width_px: float) -> Picture:
+def scaled_photograph(photo: Path, width_px: float) -> Pixels:
     """The photograph (H, W, 3) sRGB, `width_px` wide."""
     image = cv2.imread(str(photo), cv2.IMREAD_COLOR)
     if image is None:

@@ -13,14 +13,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.recording import writer
 from evidence import report, status
 from evidence.study import Study
+from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 
-Rgb = NDArray[np.uint8]
 _PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
 _SENSOR_HZ = 200.0
 _FPS, _SIZE = 30.0, (680, 480)
@@ -64,12 +63,12 @@ def record(folder: Path, seconds: float) -> None:
     writer.write_meta(folder, {"scale_mm_per_px": 35.0 / _SIZE[0], "young_kpa": 2.0, "sensor": sensor})
 
 
-def _motion(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def _motion(time_s: Floats) -> Floats:
     """Displacement of the bump's centre [px]: one press a period after half a second at rest."""
     return _PEAK_PX * np.clip(np.sin(2 * np.pi * (time_s - 0.5) / _PERIOD_S), 0, None) * (time_s > 0.5)
 
 
-def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
+def texture(height: int, width: int, rng: np.random.Generator) -> Pixels:
     """Band-pass filtered noise in the colours of tissue, (H, W, 3) uint8."""
     noise = rng.normal(size=(height, width)).astype(np.float32)
     fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
@@ -78,7 +77,7 @@ def texture(height: int, width: int, rng: np.random.Generator) -> Rgb:
     return np.asarray(np.clip(rgb, 0, 210), np.uint8)
 
 
-def pushed(rest: Rgb, peak_px: float) -> Rgb:
+def pushed(rest: Pixels, peak_px: float) -> Pixels:
     """The texture (H, W, 3) moved to the right by a bump of `peak_px` at the centre."""
     height, width = rest.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)

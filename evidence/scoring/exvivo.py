@@ -13,13 +13,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.recording import writer
 from evidence import report
 from evidence.pooled import FOLDERS, score_and_pool
 from evidence.study import Study
+from synth.arrays import Floats, Ints, Pixels
 from synth.errors import UserError
 from synth.fem import solver, tool_gesture
 from synth.fem.deformation import Deformation
@@ -33,8 +33,6 @@ from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 from synth.system import checked_file
 from synth.system.terminal import counting
-
-Floats = NDArray[np.float64]
 
 _GESTURES = 3
 _LEVELS = 9
@@ -91,7 +89,7 @@ class _Course:
     time_s: Floats  # (N,)
     level: Floats  # (N,) force relative to its peak
     strain: Floats  # (N,) elastic level of the same displacement: `level` after creep
-    gesture: NDArray[np.int64]  # (N,) index of the gesture
+    gesture: Ints  # (N,) index of the gesture
     away: Floats  # (N,) distance of the tips from the tissue, relative to the hover height
 
 
@@ -146,8 +144,8 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
     course = _course(plan, rng)
     times = _frame_times(plan, rng)
     renderer = scene.renderer
-    pictures: list[NDArray[np.uint8]] = []
-    pictures_right: list[NDArray[np.uint8]] = []
+    pictures: list[Pixels] = []
+    pictures_right: list[Pixels] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
 from bench.methods.fusion import Fusion
@@ -30,7 +29,6 @@ from synth.dataset.store import Sequence as Stored
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
-Floats = NDArray[np.float64]
 Case = dict[str, Any]  # input of the methods: `cameras`, and whether the membrane is stated
 _STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.methods.comparison import untrained
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
@@ -22,9 +21,8 @@ from evidence import report
 from evidence.flow.scenes import inverse
 from evidence.scoring.cost import texture
 from evidence.study import Study
+from synth.arrays import Floats
 from synth.recording_flow.decode import RecordingFlowSettings
-
-Floats = NDArray[np.float64]
 
 YOUNG_KPA = 3.0
 _CONTACT_MM = 4.0

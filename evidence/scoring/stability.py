@@ -32,6 +32,7 @@ from evidence import report
 from evidence.study import Study
 from learn import load_model
 from learn.inference.shipped import choose_model
+from synth.arrays import Floats, Mask, Pixels
 from synth.dataset.store import Dataset, Sequence
 from synth.engine.run import render_job
 from synth.errors import UserError
@@ -49,12 +50,12 @@ _NOTES = "out of distribution|again, frozen"
 class Video:
     """A recording in memory: images of both cameras (T, H, W, 3), masks, sensor (N, 4) in s and newtons."""
 
-    rgb: NDArray[np.uint8]
+    rgb: Pixels
     right: Any
-    tool: NDArray[np.bool_]
-    tissue: NDArray[np.bool_]
-    time_s: NDArray[np.float64]
-    sensor: NDArray[np.float64]
+    tool: Mask
+    tissue: Mask
+    time_s: Floats
+    sensor: Floats
     meta: dict[str, Any]
     pair: str  # stereo.yaml
     codec: tuple[int, str, int] | None = None
@@ -143,7 +144,7 @@ def _written(video: Video, work: Path) -> Path:
     return folder
 
 
-def _encode(path: Path, images: NDArray[np.uint8], codec: tuple[int, str, int]) -> None:
+def _encode(path: Path, images: Pixels, codec: tuple[int, str, int]) -> None:
     """Writes H.264; see `Video.codec`."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=8, options={"crf": str(codec[0]), "threads": "1"})
@@ -249,7 +250,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Scoring: degraded recordings", found, (), sections, words)
 
 
-def _each(change: Callable[[NDArray[np.uint8], int], Any]) -> Change:
+def _each(change: Callable[[Pixels, int], Any]) -> Change:
     """A change of each image (H, W, 3) of the left camera and its number."""
     return lambda video: replace(
         video,
@@ -257,7 +258,7 @@ def _each(change: Callable[[NDArray[np.uint8], int], Any]) -> Change:
     )
 
 
-def _warped(rgb: NDArray[np.uint8], matrix: Any) -> Any:
+def _warped(rgb: Pixels, matrix: Any) -> Any:
     return cv2.warpAffine(rgb, matrix, rgb.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
@@ -280,7 +281,7 @@ def _moved_untouched(video: Video) -> Video:
     )(video)
 
 
-def _rippled(rgb: NDArray[np.uint8], k: int) -> Any:
+def _rippled(rgb: Pixels, k: int) -> Any:
     y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]].astype(np.float32)
     wave = (k > 2) * np.sin(y / 6 - 1.3 * k)
     return cv2.remap(rgb, x + wave, y + wave, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
@@ -304,7 +305,7 @@ def _hand(video: Video) -> Video:
     weave = np.random.default_rng(2).normal(0, 60, (height, width, 1)).astype(np.float32)
     weave = cv2.GaussianBlur(weave, (0, 0), 2)[..., None]
 
-    def one(rgb: NDArray[np.uint8], k: int) -> Any:
+    def one(rgb: Pixels, k: int) -> Any:
         into = min(max(k - len(video.rgb) // 3, 0) / 5, 1) * 0.45 * width
         mask, centre = np.zeros((height, width), np.uint8), (int(width * 1.1 - into), height // 2)
         cv2.ellipse(mask, centre, (width // 5, height // 6), 0, 0, 360, 255, -1)
@@ -313,14 +314,14 @@ def _hand(video: Video) -> Video:
     return _each(one)(video)
 
 
-def _noise(levels: float, k: int, rgb: NDArray[np.uint8]) -> Any:
+def _noise(levels: float, k: int, rgb: Pixels) -> Any:
     return np.random.default_rng((4, k)).normal(0, levels, rgb.shape)
 
 
 def _still(colour: tuple[int, int, int], noise: float, *points: tuple[float, float]) -> Change:
     """A polygon of a colour in all frames; points in shares of the image."""
 
-    def one(rgb: NDArray[np.uint8], k: int) -> Any:
+    def one(rgb: Pixels, k: int) -> Any:
         mask = np.zeros(rgb.shape[:2], np.uint8)
         cv2.fillPoly(mask, [np.int32(np.array(points) * rgb.shape[1::-1])], 255)
         weave = np.random.default_rng(3).normal(0, noise, rgb.shape[:2])[..., None]
@@ -345,7 +346,7 @@ def _squeezed(video: Video, codec: tuple[int, str, int] | None) -> Video:
     return replace(video, rgb=small, tissue=video.tissue[:, columns], tool=video.tool[..., columns])
 
 
-def _boxed(rgb: NDArray[np.uint8], k: int) -> Any:
+def _boxed(rgb: Pixels, k: int) -> Any:
     bar = rgb.shape[0] // 8
     inner = cv2.resize(rgb, (rgb.shape[1], rgb.shape[0] - 2 * bar), interpolation=cv2.INTER_AREA)
     return cv2.copyMakeBorder(inner, bar, bar, 0, 0, cv2.BORDER_CONSTANT, value=(16, 16, 16))
@@ -365,16 +366,16 @@ def _stated(**changes: Any) -> Change:
     )
 
 
-def _sensor(of: Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[Any, Any]]) -> Change:
+def _sensor(of: Callable[[Floats, Floats], tuple[Any, Any]]) -> Change:
     """A change of the sensor's times (N,) and forces (N, 3)."""
     return lambda video: replace(video, sensor=np.column_stack(of(video.sensor[:, 0], video.sensor[:, 1:])))
 
 
-def _clipped(force: NDArray[np.float64]) -> Any:
+def _clipped(force: Floats) -> Any:
     return np.clip(force, -0.4 * np.abs(force).max(), 0.4 * np.abs(force).max())
 
 
-def _stuck(force: NDArray[np.float64]) -> Any:
+def _stuck(force: Floats) -> Any:
     peak = int(np.linalg.norm(force, axis=1).argmax())
     return np.where((np.arange(len(force)) < peak)[:, None], force, force[peak])
 
