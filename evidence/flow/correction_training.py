@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import time
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,17 @@ from torch import Tensor
 
 from evidence import report
 from evidence.flow import scenes as drawn_scenes
-from evidence.flow.scenes import Recipe, inverse, jpeg, noise_field, pairs, pixels, sample
+from evidence.flow.scenes import (
+    Recipe,
+    dilated,
+    inside,
+    inverse,
+    jpeg,
+    noise_field,
+    pixels,
+    resampled,
+    sensed,
+)
 from evidence.study import Study
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
@@ -119,15 +128,14 @@ def _rendered(index: int) -> Frames:
 def _warped(index: int) -> Frames:
     """A pair with a pull under a tool, on drawn cortex."""
     rng = np.random.default_rng([77, index])
-    recipe = replace(
-        Recipe(),
+    recipe = Recipe(
         size=int(rng.choice([192, 224])),
         pull=float(rng.uniform(1, 14)),
         noise=float(rng.choice([0.5, 1.5, 3])),
         contrast=float(rng.uniform(0.4, 1)),
         highlights=float(rng.uniform(0, 0.08)),
     )
-    pair = next(pairs(recipe, 1, 9000 + index))
+    pair = next(drawn_scenes.pairs(recipe, 1, 9000 + index))
     hidden = np.stack([~pair.rest_usable, ~pair.now_usable])
     return _pair([pair.rest, pair.now], hidden, pair.flow, pair.inside, pair.hidden, pair.inside)
 
@@ -141,11 +149,7 @@ def _drawn(index: int) -> Frames:
     size = int(rng.choice([160, 192, 224]))
     texture, flow = _texture(2 * size, rng), _motion(size, rng)
     noise, quality = rng.choice([0.3, 1, 2, 4]), int(rng.choice([0, 0, 0, 92, 75]))
-    at = pixels(size, size)
-    before, after = (
-        np.stack([sample(texture[..., c], (places + 0.5) * 2 - 0.5) for c in range(3)], -1)
-        for places in (at, inverse(flow))
-    )
+    before, after = (resampled(texture, places) for places in (pixels(size, size), inverse(flow)))
     if rng.random() < 0.4:
         ramp = np.linspace(-1, 1, size, dtype=np.float32)[:, None]
         after = after * (1 + rng.uniform(-0.1, 0.1) * ramp + rng.uniform(-0.08, 0.08))
@@ -155,15 +159,10 @@ def _drawn(index: int) -> Frames:
         end = tip + 2 * size * np.array([np.cos(angle), np.sin(angle)])
         cv2.line(bar, tip.astype(int).tolist(), end.astype(int).tolist(), 1, int(rng.uniform(4, 20)))
         after = np.where(bar[..., None] > 0, rng.uniform(40, 200), after)
-    rgb = [
-        jpeg(np.clip(np.round(one + rng.normal(0, noise, one.shape)), 0, 255).astype(np.uint8), quality)
-        for one in (before, after)
-    ]
-    hidden = np.stack([np.zeros_like(bar), cv2.dilate(bar, np.ones((3, 3), np.uint8))]) > 0
-    inside = np.all((at + flow >= 0) & (at + flow <= size - 1), axis=-1)
-    there = (at + flow).astype(np.float32)
-    covered = cv2.remap(hidden[1].astype(np.float32), there[..., 0], there[..., 1], cv2.INTER_LINEAR) > 0.5
-    return _pair(rgb, hidden, flow, inside, covered, inside if rng.random() < 0.5 else np.ones_like(inside))
+    rgb = [jpeg(sensed(one, noise, rng), quality) for one in (before, after)]
+    hidden, there = np.stack([np.zeros_like(bar, bool), dilated(bar > 0, 3)]), inside(flow)
+    covered = drawn_scenes.at_rest(hidden[1], flow) > 0.5
+    return _pair(rgb, hidden, flow, there, covered, there if rng.random() < 0.5 else np.ones_like(there))
 
 
 def _drawn_depth(index: int) -> Frames:
@@ -182,18 +181,15 @@ def _drawn_depth(index: int) -> Frames:
     images, noise, nothing = {}, rng.choice([0.3, 1, 2, 4]), np.zeros_like(aside)
     for name, side in zip(_RGB, (0, 1), strict=True):
         shifts = -side * np.stack([aside, nothing], -1), flow - side * np.stack([moved, nothing], -1)
-        places = [(inverse(shift) + 0.5) * 2 - 0.5 for shift in shifts]
-        shown = [np.stack([sample(texture[..., c], one) for c in range(3)], -1) for one in places]
-        noisy = np.stack(shown) + rng.normal(0, noise, (2, size, size, 3))
-        images[name] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+        shown = np.stack([resampled(texture, inverse(shift)) for shift in shifts])
+        images[name] = sensed(shown, noise, rng)
     K, other = (np.array([[focal, 0, size / 2 + c], [0, focal, size / 2], [0, 0, 1]]) for c in (0, middle))
-    inside = np.all((pixels(size, size) + flow >= 0) & (pixels(size, size) + flow <= size - 1), axis=-1)
     free = np.zeros((2, size, size), bool)
     return images | {
         "tool": free,
         "tool_right": free,
         "tissue": np.ones((size, size), bool),
-        "visible": np.stack([inside, inside]),
+        "visible": np.stack(2 * [inside(flow)]),
         "pressed": free,
         "motion": np.stack([np.zeros_like(depth), depth])[..., None] * [0, 0, 1],
         "K": K,
@@ -204,15 +200,15 @@ def _drawn_depth(index: int) -> Frames:
     }
 
 
-def _pair(rgb: list[Any], hidden: Any, flow: Any, inside: Any, covered: Any, tissue: Any) -> Frames:
+def _pair(rgb: list[Any], hidden: Any, flow: Any, there: Any, covered: Any, tissue: Any) -> Frames:
     length = np.linalg.norm(flow, axis=-1)
-    pressed = (length > 0.7 * max(float(length.max()), 1e-6)) & inside
+    pressed = (length > 0.7 * max(float(length.max()), 1e-6)) & there
     return {
         "rgb": np.stack(rgb),
         "hidden": hidden,
         "tissue": tissue,
         "flow": np.stack([np.zeros_like(flow), flow]),
-        "visible": np.stack([inside, inside & ~covered]),
+        "visible": np.stack([there, there & ~covered]),
         "pressed": np.stack([pressed, pressed]),
     }
 
@@ -352,30 +348,25 @@ def _varied(frames: Frames, rng: np.random.Generator, again: int, depth: bool) -
             one = cv2.GaussianBlur(one, (0, 0), float(blur)) if blur else one
             one = np.clip(one.mean((0, 1)) + contrast * (one - one.mean((0, 1))), 0, 1)
             one = 255 * np.clip(gain * (1 + drift * t / 7) * balance * one**gamma, 0, 1)
-            one = np.clip(np.round(one + noise * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8)
+            final = jpeg(sensed(one, noise, rng), quality)
             corrupt = not depth and t and rng.random() < _CORRUPTED
-            shown[name].append(_corrupted(jpeg(one, quality), rng) if corrupt else jpeg(one, quality))
+            shown[name].append(_corrupted(final, rng) if corrupt else final)
     return frames | {name: np.stack(pictures) for name, pictures in shown.items()}
 
 
 def _resized(frames: Frames, share: float) -> Frames:
-    height, width = frames["tissue"].shape
-    size = round(width * share / 4) * 4, round(height * share / 4) * 4
+    old = np.array(frames["tissue"].shape[::-1])
+    size = [round(edge * share / 4) * 4 for edge in old.tolist()]
 
     def resize(stack: Any, how: int) -> Any:
-        images = stack if stack.ndim > 2 else stack[None]
-        images = images.astype(np.uint8) if stack.dtype == bool else images
-        made = np.stack([cv2.resize(one, size, interpolation=how) for one in images]).astype(stack.dtype)
-        return made if stack.ndim > 2 else made[0]
+        return np.stack([cv2.resize(one, size, interpolation=how) for one in stack])
 
-    small = {name: resize(a, cv2.INTER_NEAREST) for name, a in frames.items() if a.dtype == bool}
-    flow = resize(frames["flow"], cv2.INTER_LINEAR) * np.array(
-        [size[0] / width, size[1] / height], np.float32
-    )
-    return small | {
-        "flow": flow,
-        "rgb": resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC),
-    }
+    masks = {name: a for name, a in frames.items() if a.dtype == bool and a.ndim > 2}
+    small = {name: resize(a.astype(np.uint8), cv2.INTER_NEAREST) > 0 for name, a in masks.items()}
+    tissue = resize(frames["tissue"][None].astype(np.uint8), cv2.INTER_NEAREST)[0] > 0
+    flow = resize(frames["flow"], cv2.INTER_LINEAR) * np.float32(size / old)
+    rgb = resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC)
+    return small | {"tissue": tissue, "flow": flow, "rgb": rgb}
 
 
 def _corrupted(picture: Pixels, rng: np.random.Generator) -> Pixels:

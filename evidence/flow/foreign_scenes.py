@@ -15,10 +15,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 from skimage import data as photographs  # type: ignore[import-not-found, unused-ignore]
 
-from evidence.flow.scenes import jpeg, noise_field, pixels
+from evidence.flow.scenes import at_rest, dilated, jpeg, noise_field, pixels, sensed
 from synth.arrays import Array, Floats, Map, Mask, Pixels
 
 _FINE = 2  # samples of the source a pixel
+_RIM = 9  # px: masks are dilated by this square, so that soft rims and shadow edges are left out
 _MARGIN = 24  # px of the source beyond the image, which motion may bring into view
 _PHOTOGRAPHS = (
     "astronaut", "brick", "camera", "cell", "chelsea", "coffee", "coins", "grass", "gravel",
@@ -233,7 +234,7 @@ class _Stage:
         self.drift, self.angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
         blank = np.zeros((*shape, 3), np.float32)
         glare, tool = self._shine(blank, 0.0)[1], self._tool(blank, 0.0, blank[..., :2])[1]
-        self.rest_blocked = _near(glare | tool)
+        self.rest_blocked = dilated(glare | tool, _RIM)
 
     def shoot(self, amplitude: float, fault: str, rng: np.random.Generator) -> Frame:
         """One frame."""
@@ -265,10 +266,9 @@ class _Stage:
         if fault == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
         rgb = self._sense(np.asarray(picture, np.float32), rng)
-        free = scope & ~_near(glare | tool) & ~cover
-        at = grid + flow
-        visible = cv2.remap(free.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.99
-        return Frame(rgb, flow, visible & scope & ~self.rest_blocked, free, amplitude, fault)
+        free = scope & ~dilated(glare | tool, _RIM) & ~cover
+        visible = (at_rest(free, flow) > 0.99) & scope & ~self.rest_blocked
+        return Frame(rgb, flow, visible, free, amplitude, fault)
 
     def _shine(self, picture: Map, amplitude: float) -> tuple[Map, Mask]:
         """The image with highlights, which stay with the light, and their mask."""
@@ -320,12 +320,6 @@ class _Stage:
 
     def _sense(self, picture: Map, rng: np.random.Generator) -> Pixels:
         if self.recipe.mono:
-            picture = np.repeat(picture.mean(-1, keepdims=True), 3, -1)
-        noise = rng.normal(0, self.recipe.noise, picture.shape[:2] + ((1,) if self.recipe.mono else (3,)))
-        rgb = np.clip(np.round(255 * picture + noise), 0, 255).astype(np.uint8)
-        return jpeg(rgb, self.recipe.quality)
-
-
-def _near(mask: Mask) -> Mask:
-    """Mask (H, W) dilated by 4 px, so that soft rims and shadow edges are left out."""
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0, bool)
+            picture = picture.mean(-1, keepdims=True)
+        rgb = sensed(255 * picture, self.recipe.noise, rng)
+        return jpeg(np.repeat(rgb, 3 // rgb.shape[-1], -1), self.recipe.quality)

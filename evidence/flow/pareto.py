@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import torch
 
 from evidence import report
-from evidence.flow.measure import mean_error
+from evidence.flow.measure import mean_errors
 from evidence.flow.scenes import Recipe, pairs
 from evidence.study import Study
 from synth.flow.estimator import Estimator
@@ -23,17 +23,8 @@ def measure(count: int = 4, seed: int = 2613) -> dict[str, Any]:
     made = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
     for family, label, estimator, warm in _candidates():
-        error = mean_error(estimator, made, warm=warm)
-        about = {
-            "family": family,
-            "setting": label,
-            "estimator": "tvl1" if isinstance(estimator, Tvl1) else family,
-            "settings": asdict(estimator.settings) if isinstance(estimator, Tvl1) else None,
-            "corrected": isinstance(estimator, Tvl1) and estimator.correction is not None,
-            "warm": warm is not None,
-            "default": "(default)" in label,
-        }
-        rows.append(about | asdict(error))
+        about = {"family": family, "setting": label, "default": "(default)" in label}
+        rows.append(about | mean_errors(estimator, made, warm=warm))
     return {
         "on": "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread",
         "torch": torch.__version__,
@@ -57,10 +48,7 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
         "one lambda": replace(s, noise=0.0, steep=0.0),
         "no membrane": replace(s, hidden_huber=0.0),
     }
-    warm = {
-        "warm 3 warps": replace(s, warps=3),
-        "warm (default)": s,
-    }
+    warm = {"warm 3 warps": replace(s, warps=3), "warm (default)": s}
     theirs = {f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)}
     return [
         *(("tvl1", label, Tvl1(setting), None) for label, setting in ours.items()),

@@ -43,8 +43,6 @@ class Pair:
     flow: Map  # (H, W, 2) px, rest to now
     rest_usable: Mask  # (H, W): no highlight in the rest frame
     now_usable: Mask  # (H, W), on the current frame's pixels: neither tool nor highlight
-    tool: Mask  # (H, W), on the current frame's pixels
-    glare: Mask  # (H, W), on the current frame's pixels
     hidden: Mask  # (H, W): material points under the tool in the current frame, inside the image
     contact: Mask  # (H, W): within the dimple's radius of the contact
     inside: Mask  # (H, W): material points inside the current image
@@ -123,6 +121,34 @@ def inverse(flow: Map) -> Map:
     return source
 
 
+def inside(flow: Map) -> Mask:
+    """Pixels (H, W) of the rest frame that stay in the image under a flow (H, W, 2) px."""
+    at = pixels(*flow.shape[:2]) + flow
+    return np.asarray(np.all((at >= 0) & (at <= np.array(flow.shape[1::-1]) - 1), axis=-1))
+
+
+def at_rest(mask: Mask, flow: Map) -> Map:
+    """A mask (H, W) of the current frame on the rest frame's pixels, 0..1, by a flow (H, W, 2) px."""
+    at = pixels(*mask.shape) + flow
+    return np.asarray(cv2.remap(mask.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR))
+
+
+def dilated(mask: Mask, side: int) -> Mask:
+    """A mask (H, W) dilated by a square of `side` px."""
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
+
+
+def sensed(picture: Map, noise: float, rng: np.random.Generator) -> Pixels:
+    """A picture of 0..255 with Gaussian noise of a standard deviation [grey levels]."""
+    return np.clip(np.round(picture + rng.normal(0, noise, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def resampled(picture: Map, at: Map) -> Map:
+    """A picture (2H, 2W, 3), two samples a pixel, at places (..., 2) px by cubic splines: (..., 3)."""
+    where = (at + 0.5) * _FINE - 0.5
+    return np.stack([sample(picture[..., c], where) for c in range(3)], -1)
+
+
 def sample(field: Map, where: Map, order: int = 3) -> Map:
     """Field (H, W) at points (x, y), (..., 2), by cubic splines.
 
@@ -139,7 +165,7 @@ class Stage:
     """One surface under one light, which yields any frame of a pull."""
 
     recipe: Recipe
-    albedo: Map  # (2H, 2W, 3) or finer, in 0..1
+    albedo: Map  # (2H, 2W, 3), in 0..1
     wet: Map  # (H, W) field whose high values are highlights
     drift: Map  # (H, W) change of `wet` as the surface tilts
     field: Map = field(repr=False)  # (H, W, 2) px: displacement at full pull
@@ -157,8 +183,8 @@ class Stage:
     def rest(self, rng: np.random.Generator) -> tuple[Pixels, Mask]:
         """The rest frame and its highlights: (H, W, 3) uint8, (H, W) bool."""
         grid = pixels(self.recipe.size, self.recipe.size)
-        picture, glare = self._light(self._sample(grid), self.wet, 0.0)
-        return self._sense(picture, rng), glare
+        picture, glare = self._light(resampled(self.albedo, grid), self.wet, 0.0)
+        return sensed(255 * picture, self.recipe.noise, rng), glare
 
     def against(self, rest: tuple[Pixels, Mask], share: float, rng: np.random.Generator) -> Pair:
         """The rest frame and the frame at `share` of the full pull."""
@@ -166,34 +192,27 @@ class Stage:
         flow = np.asarray(share * self.field, np.float32)
         source = inverse(flow)
         # Highlights depend on light and slope: they stay nearly in place as the surface moves.
-        picture, glare = self._light(self._sample(source), self.wet + 0.5 * share * self.drift, share)
+        picture, glare = self._light(
+            resampled(self.albedo, source), self.wet + 0.5 * share * self.drift, share
+        )
         if recipe.blur > 0:
             picture = cv2.GaussianBlur(picture, (0, 0), recipe.blur)
         tool = self._tool(share)
         picture = np.where(tool[..., None], _metal(picture.shape[:2]), picture)
         soft = cv2.GaussianBlur(tool.astype(np.float32), (0, 0), 0.6)[..., None]
         picture = picture + np.where(tool[..., None], 0, soft * (0.1 - picture))
-        tool = cv2.dilate(tool.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-        at = pixels(recipe.size, recipe.size) + flow
-        inside = np.all((at >= 0) & (at <= recipe.size - 1), axis=-1)
-        covered = cv2.remap(tool.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 0.5
+        tool, there = dilated(tool, 3), inside(flow)
         length = np.hypot(self.field[..., 0], self.field[..., 1])
         return Pair(
             rest=rest[0],
-            now=self._sense(picture, rng),
+            now=sensed(255 * picture, recipe.noise, rng),
             flow=flow,
             rest_usable=~rest[1],
             now_usable=~(tool | glare),
-            tool=tool,
-            glare=glare & ~tool,
-            hidden=covered & inside,
-            contact=(length > 0.7 * length.max()) & inside,
-            inside=inside,
+            hidden=(at_rest(tool, flow) > 0.5) & there,
+            contact=(length > 0.7 * length.max()) & there,
+            inside=there,
         )
-
-    def _sample(self, at: Map) -> Map:
-        fine = self.albedo.shape[0] / self.recipe.size
-        return np.stack([sample(self.albedo[..., c], (at + 0.5) * fine - 0.5) for c in range(3)], -1)
 
     def _light(self, albedo: Map, wet: Map, share: float) -> tuple[Map, Mask]:
         recipe = self.recipe
@@ -223,10 +242,6 @@ class Stage:
             outline = np.array([start - 0.5 * sharp, start + 0.5 * sharp, end + sharp, end - sharp])
             cv2.fillConvexPoly(mask, np.round(outline * 16).astype(np.int32), 1, shift=4)
         return mask.astype(bool)
-
-    def _sense(self, picture: Map, rng: np.random.Generator) -> Pixels:
-        noisy = 255 * picture + rng.normal(0, max(self.recipe.noise, 0), picture.shape)
-        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
 def pairs(recipe: Recipe, count: int, seed: int) -> Iterator[Pair]:

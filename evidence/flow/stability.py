@@ -67,7 +67,6 @@ def _point(estimator: Estimator, pair: Pair, start: Map | None) -> dict[str, flo
     frame = bool(error[visible].mean() > _LOST_PX), not tracker.trusted
     return {
         "epe": float(error[visible].mean()),
-        "p95": float(np.percentile(error[visible], 95)),
         "frame_lost": float(frame[0]),
         "frame_flagged": float(frame[1]),
         "frame_hits": float(all(frame)),

@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates
 
 from evidence.flow import foreign
 from evidence.flow.foreign_scenes import Recipe, recipes, video
-from evidence.flow.measure import against, divergence
+from evidence.flow.measure import divergence, errors
 from evidence.flow.scenes import CLEAN, Pair, inverse, pairs, pixels, pull_field
 from evidence.flow.scenes import Recipe as Pull
 from evidence.flow.stereo import figures
@@ -14,24 +14,24 @@ from evidence.flow.stereo import figures
 
 def known(flow: np.ndarray, hidden: np.ndarray, contact: np.ndarray) -> Pair:
     every, picture = np.ones(hidden.shape, bool), np.zeros((*hidden.shape, 3), np.uint8)
-    return Pair(picture, picture, flow, every, every, ~every, ~every, hidden, contact, every)
+    return Pair(picture, picture, flow, every, every, hidden, contact, every)
 
 
 def test_error_of_a_known_offset() -> None:
     truth, none = np.zeros((20, 20, 2), np.float32), np.zeros((20, 20), bool)
     truth[..., 0] = 4.0
-    error = against(truth + np.array([0.0, 3.0], np.float32), known(truth, none, ~none), 0.0)
-    assert error.mean == pytest.approx(3.0)
-    assert error.magnitude == pytest.approx(0.25)  # |(4, 3)| = 5 against 4
-    assert np.isnan(error.hidden)
+    error = errors(truth + np.array([0.0, 3.0], np.float32), known(truth, none, ~none))
+    assert error["mean"] == pytest.approx(3.0)
+    assert error["magnitude"] == pytest.approx(0.25)  # |(4, 3)| = 5 against 4
+    assert np.isnan(error["hidden"])
 
     truth = np.zeros((4, 4, 2), np.float32)
     flow = truth.copy()
     flow[0, :, 0] = 8.0  # wrong under the tool only
     contact, hidden = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
     contact[:2], hidden[0] = True, True
-    error = against(flow, known(truth, hidden, contact), 0.0)
-    assert (error.contact, error.contact_visible, error.hidden) == (4.0, 0.0, 8.0)
+    error = errors(flow, known(truth, hidden, contact))
+    assert [error[part] for part in ("contact", "contact_visible", "hidden")] == [4.0, 0.0, 8.0]
 
 
 def test_divergence_of_a_linear_field() -> None:
