@@ -89,12 +89,6 @@ class Section:
     rows: Sequence[Mapping[str, Any]] = ()
     words: Sequence[str] = ()  # paragraphs; one that begins with "- " is an item of a list
 
-    @property
-    def columns(self) -> list[str]:
-        """Keys of all rows, without those of nested mappings."""
-        names = dict.fromkeys(name for row in self.rows for name in row)
-        return [name for name in names if not any(isinstance(row.get(name), Mapping) for row in self.rows)]
-
 
 @dataclass(frozen=True)
 class Page:
@@ -340,23 +334,24 @@ def _figures(row: Row) -> str:
     return f"{row.value:.4g} [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
 
 
-def mean_cell(values: Sequence[float], form: str = ".3g", factor: float = 1.0) -> str:
-    """A cell of a table: a mean and its interval, each times a factor; without an interval the mean alone."""
-    mean, low, high = (f"{factor * value:{form}}" for value in values)
-    return mean if math.isnan(values[1]) else f"{mean} [{low}, {high}]"
+def mean_cell(values: Sequence[float | None] | None, form: str = ".3g", factor: float = 1.0) -> str | None:
+    """A cell of a table: a mean and the known ends of its interval, each times a factor."""
+    if values is None:
+        return None
+    mean, *ends = (math.nan if value is None else factor * value for value in values)
+    known = ", ".join(f"{end:{form}}" for end in ends if not math.isnan(end))
+    return f"{mean:{form}} [{known}]" if known else f"{mean:{form}}"
 
 
 def percent(values: Sequence[float | None] | None) -> str | None:
-    """As `mean_cell`, of shares in percent; an end that is None is left out."""
-    if values is None:
-        return None
-    mean, *ends = (f"{100 * value:.0f}" for value in values if value is not None)
-    return f"{mean}% [{', '.join(ends)}]" if ends else f"{mean}%"
+    """As `mean_cell`, of shares in percent."""
+    return mean_cell(values, ".0%")
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """A table in Markdown; its columns are the keys of all rows."""
-    names = Section("", rows).columns
+    """A table in Markdown; its columns are the keys of all rows, without those of nested mappings."""
+    nested = {name for row in rows for name, value in row.items() if isinstance(value, Mapping)}
+    names = [name for name in dict.fromkeys(name for row in rows for name in row) if name not in nested]
     lines = [names, ["---"] * len(names), *([_cell(row.get(name)) for name in names] for row in rows)]
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 

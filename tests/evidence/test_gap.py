@@ -8,20 +8,19 @@ import numpy as np
 import pytest
 from made_clip import made_clip
 
-from evidence.gap import experiment, gap
+from evidence import gap
 from synth.errors import UserError
 
 
 def test_share_closed_of_known_errors() -> None:
     rng = np.random.default_rng(0)
     base = rng.uniform(0.9, 1.1, 30)
-    got = gap.closed(10 * base, 6 * base, 2 * base, rng)
-    assert got.share == pytest.approx(4 / 8, rel=1e-9)
-    assert got.interval == pytest.approx((0.5, 0.5), abs=1e-6)  # proportional pairs: no uncertainty
-    errors = rng.normal(5, 2, 20)
-    none = gap.closed(errors, errors - 1, errors + 0.3 * rng.normal(size=20), rng)
-    assert none.share is None
-    assert none.undefined
+    got = gap.closed(8 * base, 4 * base)
+    assert got["share"] == pytest.approx(4 / 8, rel=1e-9)
+    assert got["interval"] == pytest.approx([0.5, 0.5], abs=1e-6)  # proportional pairs: no uncertainty
+    none = gap.closed(-0.3 * rng.normal(size=20), np.ones(20))
+    assert none["share"] is None
+    assert none["undefined"]
 
 
 def test_fitted_noise_is_that_added() -> None:
@@ -47,11 +46,11 @@ def test_the_parts_share_no_anatomy() -> None:
         return [SimpleNamespace(group=f"{name}{k // 2}", content_hash=f"{name}{k}") for k in range(count)]
 
     ours, theirs = made("a", 60), made("b", 8)
-    split, tested = experiment.parts(ours, theirs)
+    split, tested = gap.parts(ours, theirs)
     assert split.test == tuple(range(60, 68))
     parts = [set(split.fit), set(split.select), set(tested)]
     assert set.union(*parts) == set(range(60))
     anatomies = [{i // 2 for i in part} for part in parts]
     assert sum(map(len, anatomies)) == len(set.union(*anatomies))
     with pytest.raises(UserError):
-        experiment.parts(ours, made("a", 4))
+        gap.parts(ours, made("a", 4))

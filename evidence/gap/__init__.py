@@ -1,1 +1,0 @@
-"""The sim-to-real gap."""
