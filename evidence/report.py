@@ -334,10 +334,8 @@ def _figures(row: Row) -> str:
     return f"{row.value:.4g} [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
 
 
-def mean_cell(values: Sequence[float | None] | None, form: str = ".3g", factor: float = 1.0) -> str | None:
+def mean_cell(values: Sequence[float | None], form: str = ".3g", factor: float = 1.0) -> str:
     """A cell of a table: a mean and the known ends of its interval, each times a factor."""
-    if values is None:
-        return None
     mean, *ends = (math.nan if value is None else factor * value for value in values)
     known = ", ".join(f"{end:{form}}" for end in ends if not math.isnan(end))
     return f"{mean:{form}} [{known}]" if known else f"{mean:{form}}"
@@ -345,7 +343,7 @@ def mean_cell(values: Sequence[float | None] | None, form: str = ".3g", factor: 
 
 def percent(values: Sequence[float | None] | None) -> str | None:
     """As `mean_cell`, of shares in percent."""
-    return mean_cell(values, ".0%")
+    return None if values is None else mean_cell(values, ".0%")
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -37,8 +37,7 @@ class Status:
         state = "unknown" if self.changed is None else "current"
         if self.changed:
             state = f"stale: {len(self.changed)} files"
-        command = self.command.partition("\n")[0]
-        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": command}
+        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": self.command.split("\n")[0]}
         return {"result": self.file, "state": state, **made}
 
 

@@ -1,4 +1,4 @@
-"""Learning curves: error of the force against fitted sequences, by model, displacement and cameras.
+"""Learning curves: error of the force against fitted sequences, by model and cameras.
 
 Every estimator is fitted on 30, 100, 300, ... sequences of one dataset and tested on held-out sequences of it
 and on whole datasets out of distribution. Each row is stored at once: an interrupted run continues.
@@ -24,8 +24,6 @@ from evidence.intervals import mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
-from learn.evaluation.evaluate import evaluate
-from learn.inference.predict import Predictor
 from learn.settings import TrainingSettings
 from learn.split import Split
 from synth.arrays import Floats
@@ -36,12 +34,8 @@ Estimate = Callable[[Clip], Floats]  # clip → force (T, 3) mN, camera axes
 
 RIDGE = "ridge"
 NETWORKS = {"d2fnet-s": {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0}}
-SOURCES = {
-    "recovered": {1: "recovered", 2: "motion"},
-    "exact": {1: "ideal", 2: "motion-ideal"},
-}
-"""Displacement for fitting and testing, by number of cameras: recovered, or the ground truth, whose remaining
-error is of what the surface doesn't show."""
+SOURCES = {1: "recovered", 2: "motion"}
+"""Displacement for fitting and testing, by number of cameras."""
 GRID = Grid(64)
 _COMPONENTS = 200  # principal components of displacement
 _BASIS = 150  # sequences that they are found on
@@ -58,18 +52,17 @@ class Estimator:
     """One point of a curve."""
 
     model: str
-    input: str
     cameras: int
     size: int  # sequences fitted on
 
     @property
     def slug(self) -> str:
-        return f"{self.model}-{self.input}-{self.cameras}-{self.size}"
+        return f"{self.model}-{self.cameras}-{self.size}"
 
     @property
     def source(self) -> str:
         """Name of its displacement in clips."""
-        return SOURCES[self.input][self.cameras]
+        return SOURCES[self.cameras]
 
 
 def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: int, work: Path) -> Estimate:
@@ -155,47 +148,33 @@ def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> d
     return row
 
 
-def map_figures(predictor: Predictor, part: Sequence[Clip], source: str) -> dict[str, Any]:
-    """R² of the force map over all cells, and the share of contact-free area with a force."""
-    known = evaluate(predictor, part, source).summary()
-    return {
-        "map_r2": round(known["map_r2_pooled"], 4),
-        "false_positives": round(known["false_positive_relative"], 5),
-    }
-
-
 def measure(
     datasets: list[Path],
     sizes: str = "30,100,300",
-    models: str = "ridge,d2fnet-s",
-    inputs: str = "recovered",
-    cameras: str = "1,2",
     steps: int = 4000,
     test: int = 56,
     select: int = 40,
     work: Path = Path("runs/curves"),
 ) -> dict[str, Any]:
-    """Error of the force against fitted sequences, by model, displacement and cameras.
+    """Error of the force against fitted sequences, by model and cameras.
 
     `datasets`: the first one's sequences test, select an epoch and are fitted on, in this order, so that
-    tested ones stay the same as it grows; the others are only tested on. `sizes`, `models`, `inputs`
-    (recovered, exact), `cameras`: comma-separated; `steps`: approximate number of training batches; `work`:
-    folder of packed sequences, networks and rows.
+    tested ones stay the same as it grows; the others are only tested on. `sizes`: comma-separated; `steps`:
+    approximate number of training batches; `work`: folder of packed sequences, networks and rows.
     """
     data, *ood = datasets
-    numbers, counted = ([int(n) for n in words.split(",")] for words in (sizes, cameras))
+    numbers = [int(n) for n in sizes.split(",")]
     if max(numbers) > (left := len(Dataset(data)) - test - select):
         raise UserError(f"--sizes: at most {left}: {data} has no more after --test and --select")
-    sources = [source for by_cameras in SOURCES.values() for source in by_cameras.values()]
-    clips, *others = (load_clips(root, GRID, sources, cache=work / "clips") for root in datasets)
+    clips, *others = (load_clips(root, GRID, SOURCES.values(), cache=work / "clips") for root in datasets)
     tests: Tests = {
         name: (part, [clip.membrane != "intact" for clip in part])
         for name, part in zip([SAME, *(root.name for root in ood)], [clips[:test], *others], strict=True)
     }
     spent = generation_cpu_s(data)
     rows = []
-    for size, model, source, count in product(numbers, models.split(","), inputs.split(","), counted):
-        one = Estimator(model, source, count, size)
+    for size, model, cameras in product(numbers, (RIDGE, *NETWORKS), SOURCES):
+        one = Estimator(model, cameras, size)
         rows += measure_estimator(one, clips[test:], select, tests, steps, spent, work)
     return {
         "data": status.data(*datasets),
@@ -271,17 +250,17 @@ def _verdict(group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _panel(rows: Sequence[Mapping[str, Any]], title: str) -> report.Panel:
     curves = []
-    for (model, source), own in report.grouped(rows, "model", "input").items():
+    for (model,), own in report.grouped(rows, "model").items():
         x, y = zip(*sorted((row["size"], row["whole"][0]) for row in own), strict=True)
-        curves.append(report.Curve(f"{model}, {source}", x, y))
+        curves.append(report.Curve(model, x, y))
     return report.Panel(title, "fitted sequences", "error of the force", tuple(curves), log_x=True)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]:
     return [
-        {"cameras": cameras, "model": model, "fitted on": source}
+        {"cameras": cameras, "model": model}
         | {f"{row['size']} sequences": report.percent(row[part]) for row in own}
-        for (cameras, model, source), own in report.grouped(rows, "cameras", "model", "input").items()
+        for (cameras, model), own in report.grouped(rows, "cameras", "model").items()
     ]
 
 

@@ -39,7 +39,8 @@ def build(model: str, fit: Sequence[Clip]) -> Estimate:
     x, force, group = samples(fit)
     live = np.abs(x).max(axis=0) > 0
     x = x[:, live]
-    regressor = fit_nearest(x, force) if model == NEAREST else fit_ridge(x, force, group)
+    nearest = KNeighborsRegressor(min(5, len(x)), algorithm="brute")
+    regressor = nearest.fit(x, force) if model == NEAREST else fit_ridge(x, force, group)
     return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
 
 
@@ -53,11 +54,6 @@ def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
     spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
     basis = posterior.load_basis(len(moved), TissueKind())
     return posterior.infer(basis, physics.observe(moved, spread, mask), np.zeros(len(moved))).force.mean
-
-
-def fit_nearest(x: Floats, force: Floats) -> Any:
-    """Regression by the mean of the five most similar samples."""
-    return KNeighborsRegressor(min(5, len(x)), algorithm="brute").fit(x, force)
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:

@@ -142,10 +142,7 @@ class Sequences:
         """CPU time [s] of a frame's masks and flow, 0 for ideal flow; requires `clips` first."""
         if flow == "ideal":
             return 0.0
-        return min(float(self._flow_cost(k, flow).read_text("utf-8")) for k in range(len(self._sequences)))
-
-    def _flow_cost(self, index: int, flow: str) -> Path:
-        return self._folder / f"flow-{flow}-{index:06d}.cpu_s"
+        return min(float(file.read_text("utf-8")) for file in self._folder.glob(f"flow-{flow}-*.cpu_s"))
 
     def _recover(self, index: int, flow: str) -> Clip:
         sequence = self._sequences[index]
@@ -157,7 +154,7 @@ class Sequences:
         masks_s = time.process_time() - began
         recovered, flow_s = datasets.recover_flow(sequence, clip, create(flow), hidden, GRID)
         spent = (masks_s + flow_s) / (clip.frames - 1)
-        write_whole(self._flow_cost(index, flow), str(spent), durable=False)
+        write_whole(self._folder / f"flow-{flow}-{index:06d}.cpu_s", str(spent), durable=False)
         return recovered
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -43,13 +42,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
 def overhead(name: str, count: int) -> dict[str, float | int]:
     """CPU time of a whole run (engine, store, index, preview, card) relative to its stages alone."""
     job = reader.load_job(name, [f"sequences={count}"])
-    alone = {
-        **os.environ,
-        **_path(),
-        **machine.environment(job, 1),
-        "OMP_NUM_THREADS": "1",
-        "NUMBA_NUM_THREADS": "1",
-    }
+    known = filter(None, [str(report.CHECKOUT), os.environ.get("PYTHONPATH")])
+    path = {"PYTHONPATH": os.pathsep.join(known)}  # this module is found in any working directory
+    threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    alone = os.environ | path | machine.environment(job, 1) | threads
     program = "import sys; from evidence.engine.speed import render_bare; render_bare(sys.argv[1])"
     with tempfile.TemporaryDirectory() as scratch, RunBars() as bars:
         before = _cpu()
@@ -97,23 +93,12 @@ def workers(name: str, count: int) -> dict[str, float | int]:
             began = time.perf_counter()
             run.run_job(job, Path(scratch) / "out", run.Options(workers=number), bars)
             seconds[number] = time.perf_counter() - began
-    return {
-        "sequences": count,
-        "seconds_1": seconds[1],
-        "seconds_2": seconds[2],
-        "ratio": seconds[1] / seconds[2],
-    }
-
-
-def _path() -> dict[str, str]:
-    """Environment with which a process finds this module in any working directory."""
-    known = filter(None, [str(report.CHECKOUT), os.environ.get("PYTHONPATH")])
-    return {"PYTHONPATH": os.pathsep.join(known)}
+    times = {f"seconds_{number}": spent for number, spent in seconds.items()}
+    return {"sequences": count, **times, "ratio": seconds[1] / seconds[2]}
 
 
 def _cpu() -> float:
-    mine, theirs = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return mine.ru_utime + mine.ru_stime + theirs.ru_utime + theirs.ru_stime
+    return sum(os.times()[:4])  # of this process and its children
 
 
 STUDY = Study(measure, "engine/speed.json", page)

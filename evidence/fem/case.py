@@ -9,10 +9,10 @@ import numpy as np
 
 from synth.arrays import Floats, Indices, Mask
 from synth.fem import equilibrium, surface_embedding, tool_gesture
-from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
+from synth.fem.tool_gesture import Gesture
 from synth.job import schema
 from synth.sequence import scenario
 
@@ -80,13 +80,14 @@ def error(u: Floats, exact: Floats, on: Patch) -> float:
     return float(np.linalg.norm((u - exact)[on.opening]) / np.linalg.norm(exact[on.opening]))
 
 
+def pull(fem: schema.FemSection) -> Gesture:
+    """A gesture of a job's physics on tissue of 1 kPa."""
+    return scenario.draw_gesture(fem, ANATOMY.craniotomy.radius_mm, 1.0, np.random.default_rng(0))
+
+
 def speed(case: Brain, load: float, way: str, frames: int = 60) -> float:
     """CPU milliseconds a frame of a pull with ramp, hold and release, including the surface's motion."""
-    fem, tissue = schema.FemSection(gestures=("pull",)), Tissue(1.0, 0.4, "linear")
-    gesture = scenario.draw_gesture(
-        fem, ANATOMY.craniotomy.radius_mm, tissue.young_kpa, np.random.default_rng(0)
-    )
-    part = tool_gesture.trajectory(gesture, frames).load
+    part = tool_gesture.trajectory(pull(schema.FemSection(gestures=("pull",))), frames).load
     loads = part[:, None, None] * case.load(load, way)
     start = time.process_time()
     path = equilibrium.solve_path(case.system, loads, load * part)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,20 +25,12 @@ Row = dict[str, Any]
 _OOD = report.CHECKOUT / "evidence/curves/mission-ood.yaml"
 
 
-def measure(
-    only: str = "warped,drift,contact,time", count: int = 6, frames: int = 200, seed: int = 2641
-) -> dict[str, Any]:
+def measure(count: int = 6, frames: int = 200, seed: int = 2641) -> dict[str, Any]:
     """Figures against their targets, on `count` pairs a source; seeds 4 and 5 were tuned on.
 
-    `only`: parts to run; `frames`: of the drift sequence, at least 60.
+    `frames`: of the drift sequence, at least 60.
     """
-    parts: dict[str, Callable[[], Iterator[Row]]] = {
-        "warped": lambda: _warped(count, seed),
-        "drift": lambda: _drift(frames, seed),
-        "contact": lambda: _contact(5 * count),
-        "time": lambda: _time(seed),
-    }
-    rows = [{"part": part} | row for part in only.split(",") for row in parts[part]()]
+    rows = [*_warped(count, seed), *_drift(frames, seed), *_contact(5 * count), *_time(seed)]
     return {"torch": torch.__version__, "opencv": cv2.__version__, "rows": rows}
 
 

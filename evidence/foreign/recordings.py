@@ -98,8 +98,18 @@ def record(
     """
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
-    specimen = draw_specimen(kind, rng)
-    contacts = specimen["contacts"]
+    young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
+    contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
+    specimen = {
+        "block_mm": (90.0, 50.0),
+        "elements": (12, 7),
+        "levels": 3,
+        "young_kpa": young,
+        "poisson": float(rng.uniform(0.42, 0.48)),
+        "membrane_mn_per_mm": float(rng.uniform(5, 40)) if kind == "membrane" else 0.0,
+        "pulse_mm": float(rng.uniform(0.15, 0.4)) if kind == "pulse" else 0.0,
+        "contacts": contacts,
+    }
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         surface = Surface.of(np.load(run(pythons[0], folder, "mechanics", specimen)), rng)
@@ -130,28 +140,12 @@ def record(
     about = {
         "stereo": {"calibration": "pair.yaml"},
         "scale_mm_per_px": _DISTANCE_MM / focal,
-        "young_kpa": specimen["young_kpa"],
+        "young_kpa": young,
         "specimen": name,
         "sensor": {"axes": "camera", "acts_on": "tissue", "free_s": [[0.1, _STILL_S - 0.2]]},
         "sync": {"method": "clock"},
     }
     writer.write_meta(part, about)
-
-
-def draw_specimen(kind: str, rng: np.random.Generator) -> dict[str, Any]:
-    """A specimen of a kind: its size, properties and contacts, as the worker's mechanics read them."""
-    young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
-    contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
-    return {
-        "block_mm": (90.0, 50.0),
-        "elements": (12, 7),
-        "levels": 3,
-        "young_kpa": young,
-        "poisson": float(rng.uniform(0.42, 0.48)),
-        "membrane_mn_per_mm": float(rng.uniform(5, 40)) if kind == "membrane" else 0.0,
-        "pulse_mm": float(rng.uniform(0.15, 0.4)) if kind == "pulse" else 0.0,
-        "contacts": contacts,
-    }
 
 
 def run(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
@@ -59,8 +59,8 @@ def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str,
     """Errors of `OTHERS`, trained with the loss and dropout of their preset, else as `base_settings`, fold 0.
 
     Returns:
-        By grid, width, stem and levels: `map_rmse` [mN/mm²] and `force_mae` [mN], means over sequences with
-        intervals; `against`, the difference of the map's error from the preset's, relative; `seeds`.
+        By grid, width, stem and levels: `map_rmse` [mN/mm²], mean over sequences with its interval, and
+        `against`, its difference from the preset's, relative.
     """
     job, found = reader.load_job(str(JOB)), {}
     for name, group in OTHERS.items():
@@ -72,13 +72,9 @@ def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str,
                 runs.setdefault(shape, []).append(carry_out(_run(name, shape, seed), clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
         for shape, own in runs.items():
-            rmse, force = by_sequence(own, "map_rmse"), by_sequence(own, "force_mae")
-            found[(preset.size, *shape)] = {
-                "map_rmse": mean_of(rmse),
-                "force_mae": mean_of(force),
-                "against": [value / float(base.mean()) for value in difference(base, rmse)],
-                "seeds": seeds,
-            }
+            rmse = by_sequence(own, "map_rmse")
+            against = [value / float(base.mean()) for value in difference(base, rmse)]
+            found[(preset.size, *shape)] = {"map_rmse": mean_of(rmse), "against": against}
     return found
 
 
@@ -127,12 +123,10 @@ def time_networks(
             "width": arch.width,
             "stem": arch.stem,
             "levels": arch.levels,
-            "parameters": parameters(D2FNet(arch)),
-            "gflop": cost / 1e9,
-            "ms_p50": float(np.quantile(own, 0.5)),
-            "ms_p95": float(np.quantile(own, 0.95)),
+            "parameters": sum(p.numel() for p in D2FNet(arch).parameters()),
+            "ms_p50": float(np.median(own)),
         }
-        for (size, arch), cost, own in zip(archs, costs, times, strict=True)
+        for (size, arch), own in zip(archs, times, strict=True)
     ]
 
 
@@ -162,11 +156,6 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
             torch.cuda.synchronize()
         if k >= 3:
             yield 1e3 * (clock() - start)
-
-
-def parameters(model: nn.Module) -> int:
-    """Number of trained parameters."""
-    return sum(p.numel() for p in model.parameters() if p.requires_grad)
 
 
 def flops(arch: Architecture, size: int) -> float:
@@ -214,11 +203,11 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
                 ends=tuple((100 * one["against"][1], 100 * one["against"][2]) for one in part),
             )
         )
+    if not curves:
+        return None
     title = f"Networks on {PRESETS[name].size}² and the preset {name}"
     error = "map RMSE, difference from the preset's [%]"
-    return (
-        report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True) if curves else None
-    )
+    return report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True)
 
 
 STUDY = Study(measure, "learn/pareto/pareto.json", page, ("--cache {work}/labels",))

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from evidence import report, status
-from evidence.curves.experiment import figures, map_figures
+from evidence.curves.experiment import figures
 from evidence.end_to_end import models
 from evidence.study import Study
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
+from learn.evaluation.evaluate import evaluate
 from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
@@ -70,7 +71,9 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     row["membrane_known"] = None
     if predictor.card.settings.arch.membrane:
         row["membrane_known"] = figures(partial(estimate, membrane_known=True), clips, bare)["whole"]
-    row |= map_figures(predictor, clips, source)
+    known = evaluate(predictor, clips, source).summary()
+    row["map_r2"] = round(known["map_r2_pooled"], 4)
+    row["false_positives"] = round(known["false_positive_relative"], 5)
     covered = next(one for one in cover(predictor, clips, source) if one.level == _LEVEL).as_dict()
     for part in ("size", "x", "y", "z"):
         row[f"covered_{part}"] = [covered[part][end] for end in ("mean", "low", "high")]
@@ -81,12 +84,7 @@ def _listed(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Figures for a model's card, by dataset."""
     listed = {}
     for row in own:
-        parts = {
-            "error of the force": "whole",
-            "membrane known": "membrane_known",
-            "of its size": "force_size",
-        }
-        errors = [f"{words} {report.percent(row[key])}" for words, key in parts.items() if row[key]]
+        errors = [f"{words} {report.percent(row[key])}" for words, key in _LISTED.items() if row[key]]
         coverage = f"coverage of 90% intervals {report.percent(row['covered_size'])}"
         listed[f"{row['data']}, {row['sequences']} held-out sequences"] = "; ".join([*errors, coverage])
     return listed
@@ -135,6 +133,7 @@ _WIDTHS = (
     "out_of_distribution",
     "distance",
 )
+_LISTED = {"error of the force": "whole", "membrane known": "membrane_known", "of its size": "force_size"}
 _PARTS = ("whole", "membrane_known", "across", "along", "force_size", "bare")
 _ERRORS = {key.removeprefix("force_").replace("_", " "): key for key in _PARTS}
 _ERRORS_ARE = (

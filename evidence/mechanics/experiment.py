@@ -150,9 +150,10 @@ def measure(
     rows = []
     for on, names in ((ON_PLAIN, [PLAIN] * fit), (ON_MIXTURE, mixed)):
         clips = [known.get((fitted, name, k)) for k, name in enumerate(names)]
-        estimate = build([clip for clip in clips if clip is not None])
+        # Cells of twice the size suffice for a linear rule.
+        ridge = models.build(RIDGE, [coarser(clip) for clip in clips if clip is not None])
         for name in CONDITIONS:
-            errors = _errors(estimate, [known.get((tested, name, k)) for k in range(test)])
+            errors = _errors(ridge, [known.get((tested, name, k)) for k in range(test)])
             rows.append({"model": RIDGE, "fit": on, "condition": name} | errors)
     return {
         "seed": seed,
@@ -164,16 +165,10 @@ def measure(
     }
 
 
-def build(fit: Sequence[Clip]) -> Estimate:
-    """Ridge on cells of twice the size, which suffice for a linear rule."""
-    ridge = models.build(RIDGE, [coarser(clip) for clip in fit])
-    return lambda clip: ridge(coarser(clip))
-
-
-def _errors(estimate: Estimate, clips: Sequence[Clip | None]) -> dict[str, Errors]:
+def _errors(ridge: Estimate, clips: Sequence[Clip | None]) -> dict[str, Errors]:
     found: dict[str, Errors] = {part: [] for part in PARTS}
     for clip in clips:
-        off = None if clip is None else models.errors([estimate(clip)], [clip.force])
+        off = None if clip is None else models.errors([ridge(coarser(clip))], [clip.force])
         for part, values in found.items():
             name = "errors" if part == "whole" else part
             values.append(None if off is None else round(100 * off[name][0], 1))
@@ -184,6 +179,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     """Errors of ridge fitted on plain tissue and fitted on the mixture, in each condition."""
     rows = {(row["model"], row["fit"], row["condition"]): row for row in found["rows"]}
     bars, sections, hurt = [], [], []
+
+    def more(usual: Errors, other: Errors) -> str:
+        return report.mean_cell(difference(usual, other), "+.0f")
+
     for part, what in PARTS.items():
         plain, table = rows[RIDGE, ON_PLAIN, PLAIN][part], []
         for name in CONDITIONS:
@@ -192,8 +191,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
                 {
                     "condition": name,
                     "fitted on plain [%]": report.mean_cell(mean_of(own), ".0f"),
-                    "difference from plain": None if name == PLAIN else _more(plain, own),
-                    "fitted on mixture, difference": _more(own, mixture),
+                    "difference from plain": None if name == PLAIN else more(plain, own),
+                    "fitted on mixture, difference": more(own, mixture),
                 }
             )
             for group, values in enumerate((own, mixture) if part == "across" else ()):
@@ -202,15 +201,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
                 if low > 0 and group == 0:
                     hurt.append(f"{name} ({mean:+.0f} points)")
         sections.append(report.Section(f"Error of {what}", table))
-    refused = [f"- {line}" for line in found["refused"]]
+    refused, unit = [f"- {line}" for line in found["refused"]], "difference from plain [% of the force]"
     return report.Page(
         "Mechanics: generalisation of a force estimator",
         found,
-        [
-            report.Chart(
-                "Error across the line of sight", "difference from plain [% of the force]", tuple(bars)
-            )
-        ],
+        [report.Chart("Error across the line of sight", unit, tuple(bars))],
         [*sections, *([report.Section("Refused", words=refused)] if refused else [])],
         (
             "**After fitting on plain tissue the error across the line of sight is larger with "
@@ -221,10 +216,6 @@ def page(found: Mapping[str, Any]) -> report.Page:
             "subtracted exactly. Default jobs are plain; `mission` mixes membrane, slip and ν.",
         ),
     )
-
-
-def _more(usual: Errors, other: Errors) -> str:
-    return report.mean_cell(difference(usual, other), "+.0f")
 
 
 STUDY = Study(measure, "mechanics/results.json", page, ("--work {work}/mechanics",))

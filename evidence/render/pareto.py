@@ -8,23 +8,19 @@ from inspect import signature
 from itertools import product
 from typing import Any
 
-import cv2
 import numpy as np
 
 from evidence import report
 from evidence.render.case import Case, case
 from evidence.study import Study
 from synth.arrays import Map, Mask
+from synth.flow.opencv import Dis
 from synth.job.schema import Job, RenderSection
 from synth.render.scene import Renderer
 
 _LIFT = 1.5
 _STAGE = signature(Renderer.stage).parameters
-_DEFAULT = (
-    RenderSection().spp,
-    _STAGE["integrator"].default,
-    RenderSection().size[0],
-)
+_DEFAULT = RenderSection().spp, _STAGE["integrator"].default, RenderSection().size[0]
 _INTEGRATORS = ("direct", "path3")
 
 
@@ -78,10 +74,8 @@ def measure_setting(ours: Case, spp: int, kind: str) -> dict[str, float]:
     tissue = renderer.rest.tissue & ~renderer.render(ours.state(), 0).tool
     truth = renderer.render(ours.state(_LIFT), 4)
     rest, now = (renderer.develop(picture, 9 + k) for k, picture in enumerate((one, three)))
-    estimator = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    grey = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (rest, now)]
-    flow = estimator.calc(grey[0], grey[1], np.zeros((*grey[0].shape, 2), np.float32))
-    inside = tissue & truth.visible
+    every, inside = np.ones_like(tissue), tissue & truth.visible
+    flow, _ = Dis().flow(rest, now, every, every)
     error = np.linalg.norm(flow - truth.flow, axis=-1)[inside]
     return {
         "cpu_s": float(np.median(spent)),
@@ -115,6 +109,7 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Flow error and noise against time."""
     panels = []
+    groups = report.grouped(found["rows"], "width", "integrator", "vertices")
     for key, unit in (
         ("flow_median_px", "flow error, median [px]"),
         ("noise", "noise / mean"),
@@ -122,15 +117,12 @@ def page(found: Mapping[str, Any]) -> report.Page:
     ):
         curves = tuple(
             report.curve(f"{kind}, {width} px, {vertices} vertices", own, "cpu_s", key, "{spp} spp")
-            for (width, kind, vertices), own in report.grouped(
-                found["rows"], "width", "integrator", "vertices"
-            ).items()
+            for (width, kind, vertices), own in groups.items()
         )
-        panels.append(
-            report.Panel(f"Render: {unit}", "CPU s a picture", unit, curves, True, True, front=True)
-        )
+        title = f"Render: {unit}"
+        panels.append(report.Panel(title, "CPU s a picture", unit, curves, True, True, front=True))
     tables = [report.Section("All settings", found["rows"])]
-    tables += [report.Section("A whole frame", [found["frame"]])] if "frame" in found else []
+    tables += [report.Section("A whole frame", [found["frame"]])]
     return report.Page("Rendering: flow error and noise against time", found, panels, tables)
 
 

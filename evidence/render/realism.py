@@ -38,22 +38,19 @@ def statistics(rgb: Pixels) -> dict[str, float]:
     """
     lab = _lab(rgb)
     found: dict[str, float] = {}
-    for k, name in enumerate("Lab"):
-        found[f"{name} mean"] = float(lab[..., k].mean())
-        found[f"{name} sd"] = float(lab[..., k].std())
+    for name, channel in zip("Lab", np.moveaxis(lab, -1, 0), strict=True):
+        found |= {f"{name} mean": float(channel.mean()), f"{name} sd": float(channel.std())}
+    slopes = np.concatenate([np.diff(lab[..., 0], axis=axis).ravel() for axis in (0, 1)]).astype(float)
     found["spectrum slope"] = _slope(lab[..., 0])
-    found["gradient kurtosis"] = _kurtosis(lab[..., 0])
-    found |= _highlights(lab[..., 0])
-    return found
+    found["gradient kurtosis"] = float(kurtosis(slopes, fisher=False))
+    return found | _highlights(lab[..., 0])
 
 
 def distances(rgb: Pixels, pooled: Pixels) -> dict[str, float]:
     """Earth mover's distance, in Lab, of a crop's histograms from those of pixels (M, 3)."""
-    found = {}
-    for k, name in enumerate("Lab"):
-        ours, theirs = (_lab(picture)[..., k].ravel() for picture in (rgb[::2, ::2], pooled[None]))
-        found[f"{name} histogram"] = float(wasserstein_distance(ours, theirs))
-    return found
+    ours, theirs = (_lab(picture).reshape(-1, 3).T for picture in (rgb[::2, ::2], pooled[None]))
+    pairs = zip("Lab", ours, theirs, strict=True)
+    return {f"{name} histogram": float(wasserstein_distance(*both)) for name, *both in pairs}
 
 
 def pool(crops: list[Pixels], count: int = 4000) -> Pixels:
@@ -96,11 +93,6 @@ def _slope(light: Map) -> float:
     bins = np.digitize(frequency.ravel(), edges)
     mean = np.array([power.ravel()[bins == k].mean() for k in range(1, len(edges))])
     return float(np.polyfit(np.log(np.sqrt(edges[1:] * edges[:-1])), np.log(mean), 1)[0])
-
-
-def _kurtosis(light: Map) -> float:
-    slopes = np.concatenate([np.diff(light, axis=0).ravel(), np.diff(light, axis=1).ravel()]).astype(float)
-    return float(kurtosis(slopes, fisher=False))
 
 
 def _highlights(light: Map) -> dict[str, float]:

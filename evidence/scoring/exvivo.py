@@ -65,8 +65,9 @@ def measure(
     folders = [recordings / f"{index:03d}" for index in range(count)]
     for index, folder in enumerate(folders):
         if not folder.exists():
-            with counting(f"recording {index}", int(seconds * fps)) as progress:
-                make(plan, index, folder, progress)
+            count_frames = counting(f"recording {index}", int(seconds * fps))
+            with count_frames as progress, checked_file.folder_of(folder) as part:
+                make(plan, index, part, progress)
     score_and_pool(folders, cameras, results / FOLDERS[cameras])
 
 
@@ -119,21 +120,15 @@ def job_of(plan: Plan) -> jobs.Job:
     )  # fmt: skip
 
 
-def make(plan: Plan, index: int, folder: Path, progress: Callable[[int], None] = lambda done: None) -> Path:
-    """Renders recording `index` of a plan into `folder`.
+def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = lambda done: None) -> None:
+    """Renders recording `index` of a plan into the folder `part`.
 
     Raises:
-        UserError: the folder exists, or the recording is shorter than its calibration; or from the rendering.
+        UserError: the recording is shorter than its calibration; or from the rendering.
     """
     if plan.seconds < _PRESS_S + 5:
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
-    with checked_file.folder_of(folder) as part:
-        _fill(plan, index, part, progress)
-    return folder
-
-
-def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -> None:
-    (part / "masks").mkdir()
+    (part / "masks").mkdir(parents=True)
     job = job_of(plan)
     scene = at_rest(job, index, ["pull"])
     case, surface = scene.scenario, scene.surface
@@ -142,28 +137,29 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
     gestures = [scenario.draw_gesture(job.fem, opening, young, rng) for _ in range(_GESTURES)]
     motions = [_moved(job, case, gesture, surface) for gesture in gestures]
     course = _course(plan, rng)
-    times = _frame_times(plan, rng)
+    steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
+    times = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
     renderer = scene.renderer
-    pictures: list[Pixels] = []
-    pictures_right: list[Pixels] = []
+    pictures: list[tuple[Pixels, Pixels | None]] = []
     for k, time in enumerate(times):
         at = int(np.searchsorted(course.time_s, time).clip(0, len(course.time_s) - 1))
         motion, gesture = motions[course.gesture[at]], gestures[course.gesture[at]]
         vertices, tips, shafts = _pose(scene.shape, motion, gesture, course, at, rng)
         shot = renderer.render(SceneState(vertices, tips, shafts), int(rng.integers(2**31)))
-        pictures.append(shot.rgb)
-        if shot.rgb_right is not None:
-            pictures_right.append(shot.rgb_right)
+        pictures.append((shot.rgb, shot.rgb_right))
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
     crf = int(rng.integers(18, 25))
-    writer.write_video(part / "video.mp4", iter(pictures), times, crf=crf)
+    writer.write_video(part / "video.mp4", (left for left, _ in pictures), times, crf=crf)
     if renderer.right is not None:
-        writer.write_video(part / "right.mp4", iter(pictures_right), times, crf=crf)
+        right = (one for _, one in pictures if one is not None)
+        writer.write_video(part / "right.mp4", right, times, crf=crf)
         writer.write_pair(part / _PAIR, scene.view, renderer.right)
     cv2.imwrite(str(part / "tissue.png"), scene.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
+    # Contact-free spans at both ends on the sensor's clock, as noted by an operator.
+    free_s = np.array([[0.1, _STILL_S - 0.1], [plan.seconds - 0.2, plan.seconds + 0.8]]) - lag
     about: dict[str, object] = {
         "scale_mm_per_px": float(scene.scale_mm_per_px * (1 + 0.02 * rng.normal())),
         "scale_uncertainty": 0.02,
@@ -171,7 +167,7 @@ def _fill(plan: Plan, index: int, part: Path, progress: Callable[[int], None]) -
         "specimen": f"calf {index}",
         "press_s": [_SYNC_S, _PRESS_S],
         "sync": {"method": "correlate", "calibration_s": [0.0, _SYNC_S], "search_s": 0.7},
-        "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": _free_spans(plan, lag)},
+        "sensor": {"axes": "sensor", "low_pass_hz": 10.0, "free_s": free_s.tolist()},
     }
     if renderer.right is not None:
         about["stereo"] = {"calibration": _PAIR}
@@ -193,21 +189,16 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
     """Presses of random height and duration, at rest during the first and the last seconds."""
     time = np.arange(0, plan.seconds + 1, 1 / _SENSOR_HZ)
     level, gesture, away = np.zeros_like(time), np.zeros(len(time), np.int64), np.ones_like(time)
-    start = _STILL_S + 0.3
-    turn = 0
+    start, turn = _STILL_S + 0.3, 0
     while start < plan.seconds - 3.5:
         rise, hold, fall = rng.uniform(0.4, 0.9), rng.uniform(0.2, 0.9), rng.uniform(0.3, 0.8)
-        press = ramp((time - start) / rise) * (1 - ramp((time - start - rise - hold) / fall))
-        inside = (time > start - 0.4) & (time < start + rise + hold + fall + 0.4)
+        end = start + rise + hold + fall
+        press = ramp((time - start) / rise) * ramp((end - time) / fall)
+        inside = (time > start - 0.4) & (time < end + 0.4)
         level = np.maximum(level, rng.uniform(0.4, 1.0) * press)
         gesture[time > start - 0.4] = turn % _GESTURES
-        away[inside] = np.minimum(
-            1,
-            np.maximum(
-                ramp((start - time[inside]) / 0.4), ramp((time[inside] - start - rise - hold - fall) / 0.4)
-            ),
-        )
-        start += rise + hold + fall + rng.uniform(0.9, 1.6)
+        away[inside] = np.maximum(ramp((start - time) / 0.4), ramp((time - end) / 0.4))[inside]
+        start = end + rng.uniform(0.9, 1.6)
         turn += 1
     tremor = 0.03 * np.sin(2 * np.pi * rng.uniform(8, 11) * time + rng.uniform(0, 6)) * level
     level = np.clip(level + tremor, 0, 1)
@@ -220,12 +211,6 @@ def _crept(time_s: Floats, level: Floats) -> Floats:
     for k in range(1, len(level)):
         late[k] = late[k - 1] + step / _LATE_S * (level[k] - late[k - 1])
     return np.asarray(np.clip((1 - _LATE) * level + _LATE * late, 0, 1), np.float64)
-
-
-def _frame_times(plan: Plan, rng: np.random.Generator) -> Floats:
-    """Times of frames whose intervals vary by a tenth."""
-    steps = (1 + 0.1 * rng.uniform(-1, 1, int(plan.seconds * plan.fps))) / plan.fps
-    return np.concatenate([[0.0], np.cumsum(steps)[:-1]])
 
 
 def _pose(
@@ -261,11 +246,6 @@ def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Gen
     measured = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + noise * rng.normal(size=force.shape)
     writer.write_force(part, course.time_s - lag, measured / 1000)
     return lag
-
-
-def _free_spans(plan: Plan, lag_s: float) -> list[list[float]]:
-    """Contact-free spans at both ends on the sensor's clock, as noted by an operator."""
-    return [[0.1 - lag_s, _STILL_S - 0.1 - lag_s], [plan.seconds - 0.2 - lag_s, plan.seconds + 0.8 - lag_s]]
 
 
 def ramp(s: Floats) -> Floats:

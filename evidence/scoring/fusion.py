@@ -89,17 +89,15 @@ def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:
 
 
 def _row(tissue: str, name: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    scores: dict[str, list[float]] = {"whole": [], "size": [], "bias": [], "coverage": [], "width": []}
+    scores: dict[str, list[float]] = {"whole": [], "bias": [], "coverage": []}
     for one in found:
         true, rows = np.array(one["true"]), np.array(one["estimated"][name], np.float64)
         force, low, high = rows[:, :3], rows[:, 3], rows[:, 4]
         size = np.linalg.norm(true, axis=1)
         off, peak = np.linalg.norm(force, axis=1) - size, size.max()
         scores["whole"].append(float(np.sqrt(np.square(force - true).sum() / np.square(true).sum())))
-        scores["size"].append(float(np.abs(off).mean() / peak))
         scores["bias"].append(float(off[size > _STRONG * peak].mean() / peak))
         scores["coverage"].append(float(((size >= low) & (size <= high)).mean()))
-        scores["width"].append(float((high - low).mean() / peak))
     row = {"tissue": tissue, "method": name, "sequences": len(found)}
     return row | {key: mean_of(values) for key, values in scores.items()}
 

@@ -121,14 +121,12 @@ def _written(video: Video, work: Path) -> Path:
     """Folder of the recording, in place of the previous one."""
     folder, meta = work / "degraded", dict(video.meta)
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
     for name, images in (("frames", video.rgb), ("right", video.right)):
         if images is not None and video.codec:
-            folder.mkdir(exist_ok=True)
             _encode(folder / f"{name.replace('frames', 'video')}.mp4", images, video.codec)
         elif images is not None:
-            (folder / name).mkdir(parents=True)
-            for k, rgb in enumerate(images):
-                cv2.imwrite(str(folder / f"{name}/{k:06d}.png"), np.ascontiguousarray(rgb[..., ::-1]))
+            writer.write_second(folder / name, range(len(images)), images)
     (folder / "masks").mkdir()
     for k, tool in enumerate(video.tool):
         if tool.any():

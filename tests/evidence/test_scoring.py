@@ -23,7 +23,8 @@ def test_a_stereo_stand_in_agrees_with_its_calibration(
     job_of, coarse = exvivo.job_of, {"fem.tets": 600, "anatomy.vertices": 4000}
     monkeypatch.setattr(exvivo, "job_of", lambda plan: changed(job_of(plan), coarse))
     plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72), cameras=2)
-    recording = open_recording(exvivo.make(plan, 0, tmp_path / "000"))
+    exvivo.make(plan, 0, tmp_path / "000")
+    recording = open_recording(tmp_path / "000")
     left, right = list(recording.frames()), list(recording.right_frames())
     assert len(left) == len(right) == 9
     settings = RecordingFlowSettings("dis", shrink=1, rate_hz=None, pulse=False)
