@@ -1,7 +1,5 @@
 """`python -m evidence STUDY`, `python -m evidence all`, `python -m evidence status`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import typer

@@ -6,8 +6,6 @@ Steps that have passed at this commit are skipped. The pretrained networks are f
 trained here.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Results and packed clips, cached in a folder by a key of all inputs: an interrupted run continues."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Sequences of studies: rendered where they are missing, flow recovered by any estimator, coarser grids."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from dataclasses import replace

@@ -3,8 +3,6 @@
 The last step makes labels and trains the paper's network on them: 256², 20,000 frames, 50 epochs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Means over sequences, and paired differences, with their 95% intervals, as lists for JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings scored by `bench score`, and pooled on a page by `bench pool`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Sequence

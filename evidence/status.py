@@ -1,7 +1,5 @@
 """What made every stored result, whether that has changed since, and what making it again costs."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json

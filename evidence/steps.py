@@ -1,7 +1,5 @@
 """Steps of a long run, one after another, each in a process of its own; passed ones are skipped."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -4,8 +4,6 @@ A module of `evidence` with a constant `STUDY` is one. `python -m evidence MODUL
 find it.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Mapping

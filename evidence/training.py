@@ -1,7 +1,5 @@
 """Networks of studies: cross-validation folds that share no anatomy, and stored trainings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Held-out AUC of a small network that distinguishes crops of renderings from those of a photograph."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ Every estimator is fitted on 30, 100, 300, ... sequences of one dataset and test
 and on whole datasets out of distribution. Each row is stored at once: an interrupted run continues.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass

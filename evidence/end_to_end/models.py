@@ -4,8 +4,6 @@ Force rotates with the image, so rules are fitted on every sequence in its eight
 which the network draws at random.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -8,8 +8,6 @@ One instrument pulls or pushes. The force along the line of sight is visible in 
 that tissue spreads under a push, so that the part across the line of sight is also reported by itself.
 """
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Overhead of the engine over the bare stages, and speed-up by a second worker. 10 CPU-minutes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

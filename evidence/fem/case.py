@@ -1,7 +1,5 @@
 """One contact on the procedural brain, for measurements of the physics."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

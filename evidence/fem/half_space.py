@@ -1,7 +1,5 @@
 """Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import product
 from typing import Any

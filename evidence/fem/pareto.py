@@ -1,7 +1,5 @@
 """Error of the physics against cost by law and mesh, error of each law by load, and cost of a sequence."""
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Mapping

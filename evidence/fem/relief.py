@@ -1,7 +1,5 @@
 """Discretisation error of default scenes: the default mesh against refined ones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -8,8 +8,6 @@ continues. Depth is corrected after flow, hence trained by a second run with `--
 card next to `synth.flow.correction` or `synth.flow.stereo.depth_correction`.
 """
 
-from __future__ import annotations
-
 import copy
 import time
 from functools import lru_cache

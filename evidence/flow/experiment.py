@@ -1,7 +1,5 @@
 """Flow: endpoint error, divergence, masks, drift and time against their targets."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Videos not made by this project's renderer, tracked as by `bench score`: masks, lost frames and error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

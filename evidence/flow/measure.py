@@ -1,7 +1,5 @@
 """Errors of a flow: endpoint error, magnitude, divergence."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Sequence
 

@@ -1,7 +1,5 @@
 """Flow's error against time for estimators and their settings, the default marked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

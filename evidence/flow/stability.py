@@ -1,7 +1,5 @@
 """Error of the flow under single disturbances of increasing size, and whether its confidence flags that."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Motion in three dimensions from stereo, as datasets store it: error, bias, z-scores and cost."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

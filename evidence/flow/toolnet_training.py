@@ -6,8 +6,6 @@ Writes `toolnet.pt` (half precision) and `toolnet.json` (command, seed, steps, a
 scenes of the network and of the rule without weights).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

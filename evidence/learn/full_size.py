@@ -1,7 +1,5 @@
 """Training of the paper's network at its size, 256², on 20,000 frames without images, for 50 epochs."""
 
-from __future__ import annotations
-
 import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial

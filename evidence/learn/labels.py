@@ -4,8 +4,6 @@ Ideal flow needs no rendering. Motion, camera and label are those of the pipelin
 numbers), a core-second a sequence. Recovered flow is not available.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 An hour on a core; without --cache only times.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@
 is tested once (350 core-seconds a training).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

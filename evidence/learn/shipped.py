@@ -3,8 +3,6 @@
 With `--pack` they are written into the package, each with a card of these figures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

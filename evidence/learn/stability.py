@@ -1,7 +1,5 @@
 """Divergence of trainings, and errors of a trained network with wrong motion, stiffness and scale."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as changed
 from itertools import product

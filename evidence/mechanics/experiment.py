@@ -4,8 +4,6 @@ Ridge is fitted on plain tissue and tested in every other condition, on scenes w
 same after fitting on the mixture of all. Each condition is compared with the plain one on the same scenes.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

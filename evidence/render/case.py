@@ -1,7 +1,5 @@
 """A sequence for measurements of the renderer alone: its renderer and a plain pull, without the physics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images of the gallery: families, instruments, lights, cameras and scenery side by side."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Noise and error of recovered flow against cost, by light paths, integrator, vertices and size."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from inspect import signature

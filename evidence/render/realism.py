@@ -1,7 +1,5 @@
 """Image statistics of renderings against a photograph, which is not stored."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Limits of the renderer: every case must yield a correct frame or a clear error, never a wrong label."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Time and memory of `bench score` on a synthetic recording of a minute."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

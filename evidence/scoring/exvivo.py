@@ -5,8 +5,6 @@ presses at several places, and a sensor with its own axes, clock, zero, drift an
 a real recording; they are scored by `bench score` and `bench pool`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

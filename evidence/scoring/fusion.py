@@ -5,8 +5,6 @@ the membrane unknown and stated. The constants of `bench.methods.fusion`, and th
 under a membrane, were set on sequences with even numbers; odd ones are reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Error of each method on pulsating tissue, with and without removal of the pulse."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ Silently wrong: the error, of the peak or over time, more than doubled and above
 message, and the force is outside the 90% interval. Also the messages on undegraded recordings.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections import Counter

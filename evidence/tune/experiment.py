@@ -1,7 +1,5 @@
 """Error and cost of jobs tuned by `synth tune`, on sequences that were not used for tuning."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
