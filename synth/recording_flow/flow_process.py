@@ -53,7 +53,7 @@ class FlowProcess(LocalFlow):
 
 @contextlib.contextmanager
 def open_flow_process(set_up: Callable[[], object]) -> Iterator[FlowProcess | None]:
-    """Opens a process for flow, which calls `set_up` first, and closes it at the end; None on a single core."""
+    """A process for flow, which calls `set_up` first, closed at the end; None on a single core."""
     if len(os.sched_getaffinity(0)) < 2:
         yield None
         return

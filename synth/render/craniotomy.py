@@ -18,7 +18,8 @@ from synth.render.appearance import light, reflection
 from synth.render.appearance.family import Appearance
 from synth.render.appearance.reflection import Theatre
 from synth.render.camera.camera import Camera
-from synth.render.content import Body, Coat, Metal, SceneContent, Wet
+from synth.render.content import SceneContent
+from synth.render.materials import Body, Coat, Metal, Wet
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves

@@ -17,7 +17,8 @@ from synth.render.appearance import light
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, right_camera
 from synth.render.camera.camera_sensor import CameraSensor
-from synth.render.content import Body, Metal, SceneContent, Wet
+from synth.render.content import SceneContent
+from synth.render.materials import Body, Metal, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised

@@ -31,8 +31,8 @@ def simulate(
 ) -> Scene:
     """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
 
-    Without `case`, `motions`, `mechanics` and `content` the scene is the one that `synth render` computes for that job
-    and index.
+    Without `case`, `motions`, `mechanics` and `content` the scene is the one that `synth render` computes for
+    that job and index.
 
     Args:
         job: the job, or its file or name as for `load_job`; its `sequences` only limits `index`.

@@ -22,7 +22,7 @@ from synth.render.anatomy.scenery import Patty
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
 from synth.render.appearance.family import Appearance
-from synth.render.content import Coat
+from synth.render.materials import Coat
 
 _AROUND, _OUT = 320, 42  # at most: points around the opening, rings outwards
 _SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is built anew every frame

@@ -20,7 +20,7 @@ from synth.render.anatomy import noise, tube
 from synth.render.anatomy.layers import Rgb, over, ridge, through
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance.family import Appearance
-from synth.render.content import Coat
+from synth.render.materials import Coat
 from synth.system import checked_file
 from synth.system.jit import vectorised
 

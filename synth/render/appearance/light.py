@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.arrays import Floats, Map
 from synth.render.camera.camera import Camera
-from synth.render.content import Lamp
+from synth.render.materials import Lamp
 
 _APART = 2.2  # between the lamps, round the optical axis [rad]
 _STEEPEST_DEG = 6.5

@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
-from synth.render.content import Lamp
+from synth.render.materials import Lamp
 
 _STEEL, _BLACK = 0.58, 0.045
 """Reflectance at right angles of machined steel and of the coating."""

@@ -22,7 +22,7 @@ from synth.arrays import Array, Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
-from synth.render.content import Body, Lamp, Metal, Wet
+from synth.render.materials import Body, Lamp, Metal, Wet
 from synth.render.mitsuba.direct_light import trace
 from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.lens import Compiled, Scalar
