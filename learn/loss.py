@@ -17,7 +17,7 @@ size; R² by frame makes up for that, as it divides an error by its own frame's 
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -45,18 +45,6 @@ def full(kind: Loss, progress: float) -> bool:
     return kind != "off-target" or progress >= RAMP[1]
 
 
-class Terms(NamedTuple):
-    """The weighted terms of the loss, dimensionless."""
-
-    error: Tensor
-    r2: Tensor
-    off_target: Tensor
-
-    @property
-    def sum(self) -> Tensor:
-        return self.error + self.r2 + self.off_target
-
-
 def loss(
     prediction: Tensor,
     target: Tensor,
@@ -65,7 +53,7 @@ def loss(
     unit: float,
     spread: float,
     progress: float = 1.0,
-) -> Terms:
+) -> Tensor:
     """The loss over all masked cells of a batch, at a point 0..1 of the run.
 
     `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: in
@@ -84,7 +72,7 @@ def loss(
     if kind == "off-target":
         weight = OFF_TARGET * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
         off_target = weight * off_target_force(prediction, target, mask, FREE * unit) / spread
-    return Terms((1 - share) * fit, share * r2, off_target)
+    return (1 - share) * fit + share * r2 + off_target
 
 
 def off_target_force(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:

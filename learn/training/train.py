@@ -181,17 +181,17 @@ def _epoch(
         predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
         unit, spread = scales.target, scales.spread
-        terms = loss(predicted, batch.target, batch.mask, settings.loss, unit, spread, progress)
+        error = loss(predicted, batch.target, batch.mask, settings.loss, unit, spread, progress)
         if i % CHECK_EVERY == 0:
-            _finite(float(terms.sum.detach()), epoch)
+            _finite(float(error.detach()), epoch)
         if settings.schedule == "cosine":
             for group in optimizer.param_groups:
                 group["lr"] = settings.learning_rate * cosine(progress)
         optimizer.zero_grad()
-        fabric.backward(terms.sum)
+        fabric.backward(error)
         fabric.clip_gradients(net, optimizer, max_norm=CLIP)
         optimizer.step()
-        mean.update(terms.sum.detach())
+        mean.update(error.detach())
         report(epoch * batches + i + 1, settings.epochs * batches)
     found = float(mean.compute())
     _finite(found, epoch)
@@ -259,7 +259,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    planned = len(sources(there.settings.input)) > 1 or there.settings.loss == "off-target"
+    planned = len(sources(there.settings.input)) > 1 or not full(there.settings.loss, 0.0)
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
