@@ -1,7 +1,7 @@
 """The list of all checks, and the findings of a recording by it, for `bench check` and `bench score`.
 
-A new check is a function in the file of its subject and an entry in one of these lists. What is found in the
-pictures themselves comes with the tracked video (`synth.recording_flow.picture_faults`), see `check_pictures`.
+A new check is a function in the file of its subject and an entry in one of these lists. Findings on pictures
+come with the tracked video (`synth.recording_flow.picture_faults`) and pass through `check_pictures`.
 """
 
 from __future__ import annotations
