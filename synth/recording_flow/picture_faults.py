@@ -1,4 +1,4 @@
-"""Detection of pictures that cannot be tracked, and of videos corrupted by recording or compression."""
+"""Faults of pictures: nothing to track, dark, noisy, out of focus, compressed, interlaced, repeated."""
 
 from __future__ import annotations
 

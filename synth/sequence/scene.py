@@ -199,7 +199,7 @@ def at_rest(
     gestures: Sequence[str] | None = None,
     *,
     case: Scenario | None = None,
-    content: Callable[[RestScene], SceneContent] = draw_craniotomy,
+    content: Callable[[RestScene], SceneContent] | None = None,
 ) -> RestScene:
     """Draws sequence `index` of a job and builds its surface and renderer.
 
@@ -210,7 +210,7 @@ def at_rest(
         index: number of the sequence.
         gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
         case: a scenario to use instead of the drawn one.
-        content: what is drawn.
+        content: what is drawn around the surface and of it; `draw_craniotomy` if None.
 
     Raises:
         UserError: the job's surface or calibration cannot be used.
@@ -226,7 +226,7 @@ def at_rest(
     surface, brain = _cortex(
         job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
     )
-    return RestScene(job, index, case, surface, view, brain, content)
+    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy)
 
 
 @lru_cache(maxsize=4)

@@ -14,7 +14,7 @@ from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
 from synth.sequence.scenario import Scenario
-from synth.sequence.scene import RestScene, Scene, at_rest, draw_craniotomy
+from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 
@@ -27,7 +27,7 @@ def simulate(
     case: Scenario | None = None,
     motions: Sequence[ToolMotion] = (),
     mechanics: Mechanics | None = None,
-    content: Callable[[RestScene], SceneContent] = draw_craniotomy,
+    content: Callable[[RestScene], SceneContent] | None = None,
 ) -> Scene:
     """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
 
@@ -43,7 +43,7 @@ def simulate(
             `at` like that of `CameraMotion`.
         motions: of its instruments, over T frames each, instead of the gestures' own trajectories.
         mechanics: what moves the surface instead of this package's finite elements; it has no `motions`.
-        content: what is drawn around the surface and of it.
+        content: as for `at_rest`.
 
     Raises:
         UserError: no such sequence, a job that cannot be carried out (surface, load, inverted element), or
@@ -60,4 +60,4 @@ def simulate(
         rest = at_rest(job, index, case=case, content=content)
     motion = (mechanics or FemMechanics(motions)).deform(rest, report, watch)
     check_deformation(motion, rest.shape, job.frames, len(rest.scenario.gestures))
-    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, content, motion)
+    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, rest.content, motion)

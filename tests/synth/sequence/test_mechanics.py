@@ -19,6 +19,7 @@ from synth.fem.pulse import Pulse
 from synth.geometry.brain_surface import load_brain, read_brain
 from synth.job.schema import CraniotomySection
 from synth.render.camera import camera as cameras
+from synth.sequence.scene import RestScene, draw_craniotomy
 
 TILTED = {"point": [20.0, 14.0, 12.0], "direction": [0.6, 0.4, 0.7], "radius_mm": 10.0}
 SMALL = {"sequences": 1, "frames": 4, "fem": {"tets": 400}, "render": {"size": (96, 72), "spp": 1}}
@@ -112,3 +113,16 @@ def test_an_invalid_result_is_refused_by_name(job: synth.Job, name: str) -> None
 def test_as_many_instruments_as_gestures_are_expected(job: synth.Job) -> None:
     with pytest.raises(synth.UserError, match="tip"):
         synth.simulate(job, mechanics=Springs())
+
+
+@pytest.mark.slow
+def test_content_of_ones_own_is_drawn_around_the_same_surface(job: synth.Job) -> None:
+    def without_instruments(rest: RestScene) -> synth.SceneContent:
+        return replace(draw_craniotomy(rest), instruments=None)
+
+    ours = synth.simulate(job)
+    other = synth.simulate(job, content=without_instruments)
+    one, two = ours.frame(2), other.frame(2)
+    assert one.tool.any()
+    assert not two.tool.any()
+    np.testing.assert_array_equal(one.flow, two.flow)
