@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
@@ -28,37 +29,33 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
-Backend = Annotated[str, typer.Option(help="Flow estimator, as in a job's flow.backend.")]
-Young = Annotated[float | None, typer.Option(help="Young's modulus of the tissue [kPa], if known.")]
-Phantom = Annotated[bool, typer.Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
+Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend.")]
+Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
+Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
 Masks = Annotated[
-    str, typer.Option(help="auto, none, glare, tool, both, or a folder of tool masks NNNNNN.png or mask.png.")
+    str, Option(help="auto, none, glare, tool, both, or a folder of tool masks NNNNNN.png or mask.png.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
 
-ScoredRecording = Annotated[
-    Path, typer.Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")
-]
+ScoredRecording = Annotated[Path, Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")]
 ScoredModel = Annotated[
     Path | None,
-    typer.Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
+    Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
 ]
 ScoreFolder = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
+    Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
 ]
 Shrink = Annotated[
-    int, typer.Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
+    int, Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
 ]
-Rate = Annotated[float, typer.Option(min=0.0, help="Largest number of frames a second; 0: all.")]
+Rate = Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")]
 Pulse = Annotated[
-    bool, typer.Option(help="Remove heartbeat and breathing from the motion before estimating force.")
+    bool, Option(help="Remove heartbeat and breathing from the motion before estimating force.")
 ]
-Train = Annotated[
-    Path | None, typer.Option(help="The model's training data, to fit the baselines on it too.")
-]
-Region = Annotated[str, typer.Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")]
+Train = Annotated[Path | None, Option(help="The model's training data, to fit the baselines on it too.")]
+Region = Annotated[str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")]
 
 
 @app.command(epilog="Example: bench score recording --model model --also other=other-model")
@@ -70,9 +67,9 @@ def score(
     shrink: Shrink = 0,
     rate: Rate = 10.0,
     pulse: Pulse = True,
-    title: Annotated[str, typer.Option(help="Heading of the report.")] = "",
+    title: Annotated[str, Option(help="Heading of the report.")] = "",
     train: Train = None,
-    also: Annotated[list[str] | None, typer.Option(help="A further model, as NAME=FOLDER.")] = None,
+    also: Annotated[list[str] | None, Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
     region: Region = "",
@@ -137,11 +134,9 @@ def _print_result(result: Result, folder: Path) -> None:
 
 @app.command(epilog="Example: bench pool a-score b-score --out pooled")
 def pool(
-    scores: Annotated[
-        list[Path], typer.Argument(help="Folders that `bench score` wrote, or their score.json.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pooled result.")],
-    by: Annotated[str, typer.Option(help="Command shown on the page; default: this one.")] = "",
+    scores: Annotated[list[Path], Argument(help="Folders that `bench score` wrote, or their score.json.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the pooled result.")],
+    by: Annotated[str, Option(help="Command shown on the page; default: this one.")] = "",
     json: Json = False,
 ) -> None:
     """Pools the scores of several recordings: means, intervals over specimens, one table and chart."""
@@ -153,7 +148,7 @@ def pool(
 
 
 @app.command(epilog="Example: bench init recording")
-def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it may exist.")]) -> None:
+def init(recording: Annotated[Path, Argument(help="Recording folder; it may exist.")]) -> None:
     """Writes a recording's meta.yaml with an explanation of every key."""
     from bench.recording.meta import commented
 
@@ -167,10 +162,10 @@ def init(recording: Annotated[Path, typer.Argument(help="Recording folder; it ma
 
 @app.command(epilog="Example: bench check recording")
 def check(
-    recording: Annotated[Path, typer.Argument(help="Recording folder.")],
+    recording: Annotated[Path, Argument(help="Recording folder.")],
     phantom: Phantom = False,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG to write: tissue, masks and flow on five frames.")
+        Path | None, Option(help="PNG to write: tissue, masks and flow on five frames.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -201,20 +196,20 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        typer.Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
+        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Recording folder to write.")],
-    scale: Annotated[str | None, typer.Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
+    scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
     young: Young = None,
     use: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, tip, fps; "
             "in a ROS bag also right, depth, calibration, right_calibration."
         ),
     ] = None,
     newtons: Annotated[
-        float, typer.Option(min=1e-6, help="Newtons per unit of force in the source: 0.001 for mN.")
+        float, Option(min=1e-6, help="Newtons per unit of force in the source: 0.001 for mN.")
     ] = 1.0,
     json: Json = False,
 ) -> None:
@@ -246,14 +241,14 @@ def import_(
     "from-dataset", epilog="Example: bench from-dataset out --out recordings --sequence 3 --footage mp4"
 )
 def from_dataset(
-    dataset: Annotated[Path, typer.Argument(help="A rendered dataset.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for one recording per sequence.")],
-    sequence: Annotated[int | None, typer.Option(help="Only this sequence.")] = None,
+    dataset: Annotated[Path, Argument(help="A rendered dataset.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for one recording per sequence.")],
+    sequence: Annotated[int | None, Option(help="Only this sequence.")] = None,
     unseen_by: Annotated[
         list[Path] | None,
-        typer.Option(help="Only the first sequence this model was not trained on; repeat for more models."),
+        Option(help="Only the first sequence this model was not trained on; repeat for more models."),
     ] = None,
-    footage: Annotated[Literal["png", "mp4"], typer.Option(help="Lossless pictures or H.264.")] = "png",
+    footage: Annotated[Literal["png", "mp4"], Option(help="Lossless pictures or H.264.")] = "png",
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored like real recordings."""
@@ -285,11 +280,9 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
     return named
 
 
-LiveModel = Annotated[
-    Path | None, typer.Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
-]
+LiveModel = Annotated[Path | None, Option("--model", "-m", help="Model folder, mono or stereo: forces too.")]
 LiveFolder = Annotated[
-    Path | None, typer.Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
+    Path | None, Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
 ]
 
 
@@ -297,17 +290,17 @@ LiveFolder = Annotated[
 def live(
     video: Annotated[
         Path,
-        typer.Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
+        Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
     ],
     model: LiveModel = None,
     scale: Annotated[
-        str | None, typer.Option(help="mm per pixel of the video, or unknown; needed with a model.")
+        str | None, Option(help="mm per pixel of the video, or unknown; needed with a model.")
     ] = None,
     young: Young = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[int, typer.Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
+    shrink: Annotated[int, Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
-    every: Annotated[bool, typer.Option("--every", help="Process every frame, however late.")] = False,
+    every: Annotated[bool, Option("--every", help="Process every frame, however late.")] = False,
     out: LiveFolder = None,
     json: Json = False,
 ) -> None:

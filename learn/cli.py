@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from typer import Argument, Option
 
 from synth.errors import UserError
 from synth.job.types import MembraneState
@@ -30,17 +31,17 @@ app = typer.Typer(
 )
 _console = Console(stderr=True)
 
-Root = Annotated[Path, typer.Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
-Cache = Annotated[Path | None, typer.Option(help="Folder for packed arrays, reused by later runs.")]
+Root = Annotated[Path, Argument(help="Dataset: a folder of NNNNNN.zarr stores.")]
+Cache = Annotated[Path | None, Option(help="Folder for packed arrays, reused by later runs.")]
 Input = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Displacement read from a store: ideal, recovered or noisy; of a stereo model motion or "
         "motion-ideal. Default: recovered; for intervals and `learn eval` as in training."
     ),
 ]
-Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: half the cores.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout instead of a table.")]
+Threads = Annotated[int | None, Option(help="CPU threads. Default: half the cores.")]
+Json = Annotated[bool, Option("--json", help="Print JSON on stdout instead of a table.")]
 
 
 @app.command(
@@ -52,18 +53,16 @@ def train_command(
     dataset: Root,
     changes: Annotated[
         list[str] | None,
-        typer.Argument(
+        Argument(
             help="Any setting of a model's config.json as KEY=VALUE or --KEY VALUE: --input mixed "
             "--epochs 30 loss=mse arch.width=32."
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the model.")] = Path("model"),
-    also: Annotated[
-        list[Path] | None, typer.Option(help="A further training dataset; repeat for more.")
-    ] = None,
-    preset: Annotated[str, typer.Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
-    accelerator: Annotated[str, typer.Option(help="cpu, cuda or auto.")] = "auto",
-    devices: Annotated[int, typer.Option(help="Number of GPUs; under torchrun of processes.")] = 1,
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
+    also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
+    preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
+    accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
+    devices: Annotated[int, Option(help="Number of GPUs; under torchrun of processes.")] = 1,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
@@ -143,13 +142,13 @@ def _log(numbers: Mapping[str, float]) -> None:
 
 @app.command("eval", epilog="Example: learn eval model out --against other-model")
 def eval_command(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: Annotated[Path, Argument(help="Model folder.")],
     dataset: Root,
     input: Input = None,
     against: Annotated[
-        Path | None, typer.Option(help="A second model, for paired tests on sequences new to both.")
+        Path | None, Option(help="A second model, for paired tests on sequences new to both.")
     ] = None,
-    all: Annotated[bool, typer.Option("--all", help="Print all scores, not just four.")] = False,
+    all: Annotated[bool, Option("--all", help="Print all scores, not just four.")] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
@@ -199,38 +198,34 @@ def eval_command(
 
 
 ModelOrSource = Annotated[
-    Path, typer.Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
+    Path, Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
 ]
 Source = Annotated[
     Path | None,
-    typer.Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
+    Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
 ]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")]
-Young = Annotated[float | None, typer.Option(help="Young's modulus [kPa], instead of the data's.")]
-Membrane = Annotated[
-    MembraneState, typer.Option(help="State of the membrane (pia), for a model with that input.")
-]
-Scale = Annotated[
-    str | None, typer.Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")
-]
+Out = Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")]
+Young = Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")]
+Membrane = Annotated[MembraneState, Option(help="State of the membrane (pia), for a model with that input.")]
+Scale = Annotated[str | None, Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")]
 Tissue = Annotated[
     Path | None,
-    typer.Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
+    Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
 ]
-Flow = Annotated[str, typer.Option(help="Flow estimator for a video, as in a job's flow.backend.")]
+Flow = Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")]
 Shrink = Annotated[
-    int, typer.Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns.")
+    int, Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns.")
 ]
-Rate = Annotated[float, typer.Option(min=0.0, help="Most frames per second read from a video; 0: all.")]
-Pulse = Annotated[bool, typer.Option(help="Subtract heartbeat and breathing from a video's motion first.")]
+Rate = Annotated[float, Option(min=0.0, help="Most frames per second read from a video; 0: all.")]
+Pulse = Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion first.")]
 Masks = Annotated[
     str,
-    typer.Option(
+    Option(
         help="Masks of a video: auto, none, glare, tool, both, or a folder of instrument masks "
         "NNNNNN.png or mask.png."
     ),
 ]
-Overlay = Annotated[bool, typer.Option(help="Also NAME.force.mp4, the force over the video.")]
+Overlay = Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")]
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
@@ -289,10 +284,10 @@ def predict_command(
 
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")
 def calibrate_command(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: Annotated[Path, Argument(help="Model folder.")],
     data: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             help="Presses of known force (NNNNNN.zarr stores or .npz with force_mn), or datasets: the "
             "training data and any with sequences that are new to the model."
         ),
@@ -300,7 +295,7 @@ def calibrate_command(
     input: Input = None,
     from_test: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--from-test",
             help="Use half of the datasets' test brains, which `learn eval` then leaves out.",
         ),
@@ -343,8 +338,8 @@ def calibrate_command(
 
 @app.command("export", epilog="Example: learn export model d2fnet.onnx")
 def export_command(
-    model: Annotated[Path, typer.Argument(help="Model folder, mono or stereo.")],
-    file: Annotated[Path, typer.Argument(help="ONNX file; FILE.json next to it describes its use.")],
+    model: Annotated[Path, Argument(help="Model folder, mono or stereo.")],
+    file: Annotated[Path, Argument(help="ONNX file; FILE.json next to it describes its use.")],
 ) -> None:
     """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export

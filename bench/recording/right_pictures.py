@@ -82,15 +82,9 @@ class RightPictures:
             return None
         if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
             return StereoQuality(**vars(found))
-        lag_s, from_s = self._timing.find_lag_s()
-        return StereoQuality(
-            **vars(found),
-            copied=self._copied,
-            frozen=self._frozen,
-            tool_behind_px=self._tool_behind_px(camera.stereo.rectified),
-            lag_s=lag_s,
-            lag_from_s=from_s,
-        )
+        numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
+        pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
+        return StereoQuality(*numbers, *pair, *self._timing.find_lag_s())
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
         """See `StereoQuality`."""

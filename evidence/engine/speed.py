@@ -13,7 +13,7 @@ from unittest import mock
 from evidence import report
 from evidence.study import Study
 from synth.dataset.store import Dataset
-from synth.engine import machine, run
+from synth.engine import child, run
 from synth.engine.journal import RunBars
 from synth.job import reader
 from synth.job.schema import Job
@@ -43,7 +43,7 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
     known = filter(None, [str(report.CHECKOUT), os.environ.get("PYTHONPATH")])
     path = {"PYTHONPATH": os.pathsep.join(known)}  # this module is found in any working directory
     threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    alone = os.environ | path | machine.environment(job, 1) | threads
+    alone = os.environ | path | child.environment(job, 1) | threads
     program = "import sys; from evidence.engine.speed import render_bare; render_bare(sys.argv[1])"
     with tempfile.TemporaryDirectory() as scratch, RunBars() as bars:
         before = _cpu()

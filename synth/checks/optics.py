@@ -11,6 +11,7 @@ import numpy as np
 from synth.arrays import Floats
 from synth.checks.measure import Measure, inner, truth
 from synth.dataset.store import Sequence
+from synth.errors import UserError
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera_motion import CameraMotion
 
@@ -65,11 +66,18 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 
 def camera_poses(sequence: Sequence) -> Floats:
-    """World to camera axes in every frame, (T, 4, 4) mm: as stored, else by the scenario's camera motion."""
+    """World to camera axes in every frame, (T, 4, 4) mm: as stored, else by the scenario's camera motion.
+
+    Raises UserError if they are not stored and the motion is not one of ours.
+    """
     if "camera" in sequence:
         return np.asarray(sequence["camera"][:])
-    at_rest, moves = camera_of(sequence), sequence.attrs.get("scenario", {}).get("camera_motion")
-    views = [CameraMotion(**moves).at(at_rest, float(t)) if moves else at_rest for t in sequence["time"][:]]
+    at_rest, moves = camera_of(sequence), (sequence.attrs.get("scenario") or {}).get("camera_motion")
+    try:
+        motion = CameraMotion(**moves) if moves else None
+    except TypeError:
+        raise UserError(f"{sequence.path}: its camera moves; store.extra=[camera] stores how") from None
+    views = [motion.at(at_rest, float(t)) if motion else at_rest for t in sequence["time"][:]]
     return np.stack([view.pose for view in views])
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_right
+from collections import OrderedDict
 from collections.abc import Sequence as Several
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
-from synth.fields import TIME
+from synth.fields import FIELDS, TIME
 
 _OPEN = 64  # stores that one process keeps open; opening one takes some milliseconds
 
@@ -36,6 +36,8 @@ class TorchDataset:
         Raises:
             UserError: not a dataset, or a sequence lacks a field.
         """
+        if unknown := [name for name in fields if name not in FIELDS]:
+            raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         self._ends: list[int] = []
@@ -44,6 +46,8 @@ class TorchDataset:
             if missing:
                 raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
             self._ends.append(len(self) + sequence.frames)
+        self._owner = os.getpid()
+        self._open: OrderedDict[int, tuple[Sequence, dict[str, FieldReader]]] = OrderedDict()
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -53,15 +57,20 @@ class TorchDataset:
             raise IndexError(item)
         which = bisect_right(self._ends, item)
         frame = item - (self._ends[which - 1] if which else 0)
-        sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)
+        sequence, readers = self._readers(self._chosen[which])
         values = {name: one[frame] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
         return {"index": sequence.index, "frame": frame, **values}
 
+    def _readers(self, position: int) -> tuple[Sequence, dict[str, FieldReader]]:
+        if self._owner != os.getpid():  # forked: the parent's handles must not be used
+            self._owner, self._open = os.getpid(), OrderedDict()
+        if position not in self._open:
+            sequence = self._dataset[position]
+            self._open[position] = (sequence, {name: sequence[name] for name in self._fields})
+            if len(self._open) > _OPEN:
+                self._open.popitem(last=False)
+        self._open.move_to_end(position)
+        return self._open[position]
 
-@lru_cache(_OPEN)
-def _open(
-    process: int, dataset: Dataset, position: int, fields: tuple[str, ...]
-) -> tuple[Sequence, dict[str, FieldReader]]:
-    """A sequence and its fields, for one process: a forked one must not use its parent's handles."""
-    sequence = dataset[position]
-    return sequence, {name: sequence[name] for name in fields}
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_open": OrderedDict()}

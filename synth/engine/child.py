@@ -1,4 +1,4 @@
-"""The engine's side of a worker process: starts it, sends it sequences, monitors and replaces it."""
+"""The engine's side of a worker process: its resources, its start, its sequences, and its replacement."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import synth
+from synth.errors import UserError
+from synth.job.schema import Job
+from synth.system import gpu, llvm
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
@@ -188,3 +191,37 @@ def _ending(code: int) -> str:
     name = signal.Signals(-code).name
     hint = " (the system may have run out of memory)" if name == "SIGKILL" else ""
     return f"the process died of {name}{hint}"
+
+
+def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
+    """Names of the GPUs that workers share, for CUDA_VISIBLE_DEVICES; None: it is not set.
+
+    `chosen`: `auto`, `none` or names separated by commas; `wanted`: the job renders on a GPU, else `auto`
+    sets nothing. UserError for a GPU that does not exist.
+    """
+    if chosen == "none":
+        return ()
+    if chosen == "auto":
+        return (gpu.visible() or None) if wanted else None
+    named, here = tuple(word.strip() for word in chosen.split(",")), gpu.visible()
+    missing = [name for name in named if name not in here]
+    if missing:
+        raise UserError(f"--gpus {', '.join(missing)}: this machine has {', '.join(here) or 'none'}")
+    return named
+
+
+def environment(job: Job, workers: int) -> dict[str, str]:
+    """Environment of all workers of a machine: the number of threads of each, and the renderer's LLVM."""
+    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
+    return {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or ""}
+
+
+def share_of_memory(workers: int) -> int | None:
+    """Bytes of the available memory for each of `workers` processes; None if unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:  # a system without /proc
+        return None
+    fields = dict(line.split(":") for line in lines)
+    return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import provenance
-from synth.engine import machine
-from synth.engine.child import Attempt, Child, Setup, Slot
+from synth.engine.child import Attempt, Child, Setup, Slot, environment, share_of_memory
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import checked_file
@@ -112,9 +111,9 @@ def _child(setup: Setup, threads: int) -> Child:
     if getattr(_thread, "setup", None) != setup:
         if hasattr(_thread, "child"):
             _thread.child.close()
-        here = machine.environment(Job.model_validate(setup.job), threads)
+        here = environment(Job.model_validate(setup.job), threads)
         here.update(setup.environment or {})
-        local = replace(setup, environment=here, memory_bytes=machine.share_of_memory(threads))
+        local = replace(setup, environment=here, memory_bytes=share_of_memory(threads))
         _thread.setup, _thread.child = setup, Child(local)
     child: Child = _thread.child
     return child
@@ -180,4 +179,6 @@ def read_slurm(path: Path) -> dict[str, Any]:
     found = checked_file.read_yaml(path)
     if not isinstance(found, dict) or not isinstance(found.get("jobs"), int) or found["jobs"] < 1:
         raise UserError(f"{path}: must contain `jobs`, the number of jobs to submit")
+    if missing := {"cores", "memory"} - found.keys():
+        raise UserError(f"{path}: must contain {' and '.join(sorted(missing))} of a job")
     return dict(found)

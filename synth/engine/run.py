@@ -14,8 +14,7 @@ from typing import Any
 
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
-from synth.engine import machine
-from synth.engine.child import Attempt, Child, Setup, Slot
+from synth.engine.child import Attempt, Child, Setup, Slot, choose_gpus, environment, share_of_memory
 from synth.engine.journal import Journal, RunBars, Watcher
 from synth.errors import UserError
 from synth.job.reader import as_job
@@ -91,11 +90,11 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         KeyboardInterrupt: after the workers have ended; sealed sequences stay, the next run continues.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
-    share = machine.share_of_memory(workers) if memory is None else int(memory * 1e9)
+    share = share_of_memory(workers) if memory is None else int(memory * 1e9)
     if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)
     cameras.refuse_unfit(job.render)
-    gpus = machine.gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
+    gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = folder.sealed(), folder.failures()
         todo = sorted(set(range(job.sequences)) - set(finished) - set(failures))
@@ -112,7 +111,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             memory_bytes=share,
             stall_s=options.stall_s,
             lock_fd=folder.lock_fd,
-            environment={**machine.environment(job, workers), **options.environment},
+            environment={**environment(job, workers), **options.environment},
             turn=folder.turn,
             turn_file=folder.turn_file.resolve(),
         )

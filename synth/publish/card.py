@@ -29,7 +29,7 @@ _FEWEST_DRAWN = 5  # a histogram of fewer sequences adds nothing to the table of
 
 def write_card(folder: Folder) -> Path:
     """Writes README.md and its pictures, from the index and the sequences. Returns its path."""
-    about = facts(folder)
+    about = facts(folder, index.read_index(folder.root).to_pylist())
     done, pictures = about["done"], folder.root / "card"
     charts = _charts(done)
     pictures.mkdir(exist_ok=True)
@@ -63,7 +63,7 @@ def write_card(folder: Folder) -> Path:
 
 def write_page(root: Path, target: Path) -> Path:
     """Writes a self-contained HTML page about the dataset in `root`. Returns its path."""
-    about = facts(Folder(root))
+    about = facts(Folder(root), index.read_index(root).to_pylist())
     done = about["done"]
     chosen = np.unique(np.linspace(0, max(len(done) - 1, 0), _THUMBNAILS).astype(int))[: len(done)]
     thumbnails = [found for k in chosen if (found := _thumbnail(root, done[k])) is not None]
@@ -73,9 +73,9 @@ def write_page(root: Path, target: Path) -> Path:
     return target
 
 
-def facts(folder: Folder) -> dict[str, Any]:
-    """Values for the templates of all descriptions, from the dataset's job and index."""
-    rows, job = index.read_index(folder.root).to_pylist(), folder.job()
+def facts(folder: Folder, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Values for the templates of all descriptions, from the dataset's job and the rows of an index."""
+    job = folder.job()
     described, stored = folder.described(), split.read_stored(folder.root)
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]

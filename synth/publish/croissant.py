@@ -30,7 +30,7 @@ def write_croissant(folder: Folder) -> Path:
 
 def describe(folder: Folder) -> dict[str, Any]:
     """The description, JSON-LD, from the dataset and the card in its job."""
-    facts = card.facts(folder)
+    facts = card.facts(folder, index.read_index(folder.root).to_pylist())
     job, about, (width, height) = facts["job"], facts["card"], facts["job"].render.size
     summary = (
         f"{len(facts['done'])} rendered sequences of {job.frames} frames ({width} x {height} px) of a brain "

@@ -91,7 +91,7 @@ class Decoder:
         self._footage, self._watch, self._progress = footage, watch, progress
         self._rate_hz = settings.rate_hz
         self._period_s = 0.0 if settings.rate_hz is None else 1 / settings.rate_hz
-        self._due_s = self._last_s = -math.inf
+        self._due_s = self._last_s = -math.inf  # of the next frame at the given rate; of the last one
         self.decoded: list[tuple[int, float | None]] = []  # number and time [s] of every picture so far
         self.left_out = Counter[str]()  # number of frames that are not tracked, by reason
         self._pictures = self._decode()
@@ -105,7 +105,7 @@ class Decoder:
         for picture in self._pictures:
             if picture.time_s is not None:
                 self.faults.add_decoded(picture.index, picture.time_s, picture.rgb)
-            if reason := self._reason(picture):
+            if reason := self._leave_out(picture):
                 self.left_out[reason] += 1
             else:
                 yield picture
@@ -137,7 +137,7 @@ class Decoder:
     def _find_rest(self) -> Picture:
         """The first frame to be tracked; the stated rest frame may lack a time."""
         for picture in self._pictures:
-            if not (reason := self._reason(picture)):
+            if not (reason := self._leave_out(picture)):
                 return picture
             self.left_out[reason] += 1
             if picture.time_s is None and picture.index == self._footage.rest_frame:
@@ -147,8 +147,8 @@ class Decoder:
         rest = self._footage.rest_frame
         raise UserError(f"{self._footage.name}: rest_frame {rest}, but {len(self.decoded)} frames")
 
-    def _reason(self, picture: Picture) -> str:
-        """Why a picture is not tracked; empty if it is."""
+    def _leave_out(self, picture: Picture) -> str:
+        """Why a picture is not tracked; empty if it is, which sets when the next one is due."""
         time_s = picture.time_s
         if picture.index < self._footage.rest_frame:
             return "before the rest frame"

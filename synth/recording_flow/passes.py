@@ -121,6 +121,7 @@ class VideoPass:
         self.decoder = Decoder(footage, settings, self.watch, progress)
         self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
+        self.found: PulseSearch | None = None  # by `search`
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
         self._mask = ProposeMasks(rest, settings.masks, footage.tool)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
@@ -241,8 +242,8 @@ class VideoPass:
         """
         if self._gather is not None:
             with self.watch.stage("pulse"):
-                self.known = self._gather.search(free_s, self._fills_picture)
-        return None if self._gather is None else self.known
+                self.found = self._gather.search(free_s, self._fills_picture)
+        return self.found
 
     @property
     def findings(self) -> list[Finding]:
@@ -266,5 +267,6 @@ class VideoPass:
         shrunk = [f"pictures are downsampled {shrink} times for flow"] if shrink > 1 else []
         count = len(decoder.decoded)
         left = [f"left out: {n} of {count} frames {why}" for why, n in decoder.left_out.items()]
-        missed = "" if self.known is None or first_fault(self.findings) else self.known.describe()
+        searched = self.known or self.found
+        missed = "" if searched is None or first_fault(self.findings) else searched.describe()
         return shrunk + left + ([missed] if missed else [])

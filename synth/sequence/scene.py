@@ -85,8 +85,11 @@ class RestScene:
     @cached_property
     def renderer(self) -> Renderer:
         """Renderer of this scene for any state of its surface and instruments."""
-        sensor, job = self.scenario.appearance.sensor, self.job
-        return Renderer(self.content(self), self.view, sensor, job.render, job.store.extra)
+        sensor, job, content = self.scenario.appearance.sensor, self.job, self.content(self)
+        drawn, own = content.tissue.shape, self.shape
+        if not (np.array_equal(drawn.faces, own.faces) and np.array_equal(drawn.vertices, own.vertices)):
+            raise UserError("content: its tissue must have the vertices and faces of the scene's surface")
+        return Renderer(content, self.view, sensor, job.render, job.store.extra)
 
     @property
     def tissue(self) -> Mask:
@@ -216,7 +219,7 @@ def at_rest(
         UserError: the job's surface or calibration cannot be used.
     """
     case = case or scenario.draw_scenario(job, index)
-    if gestures is not None:
+    if gestures is not None and case.gestures:
         case = replace(case, gestures=tuple(replace(case.gestures[0], kind=kind) for kind in gestures))
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:

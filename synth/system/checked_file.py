@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -26,6 +27,8 @@ LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 
 """Size limits of files by kind [bytes]."""
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
+_NESTED = re.compile(r"[\[{]|<\w|[-?] +(?=[-?] )|\w: +(?=\w+: )")
+_MOST_NESTED = 1000  # values within values of an OpenCV file
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
@@ -120,6 +123,9 @@ def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
 
     text = read_text(path, largest)
     with as_user_error(f"{path}: is not an OpenCV calibration"):
+        # OpenCV's parser calls itself for every level and ends the process when the stack is full.
+        if len(_NESTED.findall(text)) > _MOST_NESTED:
+            raise ValueError(f"more than {_MOST_NESTED} nested values")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()  # it and its nodes live as long as the storage
         nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is not a dict

@@ -49,13 +49,14 @@ class ConfigFile:
             at: Loc = tuple(key.strip().split("."))
             if not equals or not all(at):
                 raise UserError(f"{text}: an override is written section.key=value")
-            block: Any
-            for block in (self.values, self._tree):
+            new = checked_file.load_yaml(value, text)
+            for tree in (self.values, self._tree):
+                block: Any = tree
                 for step in at[:-1]:
                     if not isinstance(block.get(step), dict):
                         block[step] = type(block)()
                     block = block[step]
-                block[at[-1]] = checked_file.load_yaml(value, text)
+                block[at[-1]] = new
             self.changes[at] = text
 
     def dump(self) -> str:

@@ -1,4 +1,4 @@
-"""NVIDIA GPUs, found by the driver's nvidia-smi, and why the renderer can't use one."""
+"""NVIDIA GPUs, found by the driver's own libraries, and why the renderer can't use one."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import os
 import re
 import subprocess
 from dataclasses import dataclass
+from pathlib import Path
 
 _LEAST_DRIVER = 535
 _BROKEN_DRIVERS = range(565, 570)
 """Releases whose OptiX compiler fails on Dr.Jit's kernels (Dr.Jit's notes on versions)."""
 _LEAST_CAPABILITY = (7, 5)
+_MAJOR, _MINOR = 75, 76  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_*
 
 
 @dataclass(frozen=True)
@@ -26,35 +28,35 @@ class Gpu:
 
 
 def visible() -> tuple[str, ...]:
-    """Names of the GPUs in CUDA_VISIBLE_DEVICES, else of all."""
+    """Names of the GPUs in CUDA_VISIBLE_DEVICES, else of all that nvidia-smi lists."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is not None:
         return tuple(name.strip() for name in named.split(",") if name.strip())
-    return tuple(map(str, range(len(_devices()))))
-
-
-def probe() -> Gpu | None:
-    """The GPU of this machine; None if there is no driver or no visible device."""
-    devices, names = _devices(), visible()
-    if not devices or not names:
-        return None
     try:
-        optix = bool(ctypes.CDLL("libnvoptix.so.1"))
-    except OSError:
-        optix = False
-    return Gpu(len(names), *devices[0], optix)
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, timeout=30).stdout
+    except (OSError, subprocess.TimeoutExpired):  # no driver, or it does not respond
+        return ()
+    return tuple(str(k) for k in range(len(re.findall("^GPU ", listed, re.MULTILINE))))
 
 
 @functools.cache
-def _devices() -> list[tuple[str, tuple[int, int]]]:
-    """The driver's version and the compute capability of each GPU; empty without a driver that responds."""
-    words = ["nvidia-smi", "--query-gpu=driver_version,compute_cap", "--format=csv,noheader"]
+def probe() -> Gpu | None:
+    """The GPU of this machine; None if there is no driver or device."""
+    cuda, count, parts = _library("libcuda.so.1"), ctypes.c_int(0), []
+    if not cuda or cuda.cuInit(0) or cuda.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
+        return None
+    for attribute in (_MAJOR, _MINOR):
+        value = ctypes.c_int(0)
+        cuda.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0)
+        parts.append(value.value)
+    return Gpu(count.value, _driver(), (parts[0], parts[1]), _library("libnvoptix.so.1") is not None)
+
+
+def _library(name: str) -> ctypes.CDLL | None:
     try:
-        listed = subprocess.run(words, capture_output=True, text=True, timeout=30).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return []
-    found = re.findall(r"^([\d.]*).*, (\d+)\.(\d+)$", listed, re.MULTILINE)
-    return [(driver, (int(major), int(minor))) for driver, major, minor in found]
+        return ctypes.CDLL(name)
+    except OSError:
+        return None
 
 
 def obstacle(gpu: Gpu | None) -> str | None:
@@ -72,3 +74,12 @@ def obstacle(gpu: Gpu | None) -> str | None:
     if gpu.capability < _LEAST_CAPABILITY:
         return f"compute capability {'.'.join(map(str, gpu.capability))}: 7.5 or more is needed"
     return None
+
+
+def _driver() -> str:
+    try:
+        text = Path("/proc/driver/nvidia/version").read_text("utf-8")
+    except OSError:
+        return ""
+    found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text)
+    return found[0] if found else ""

@@ -30,7 +30,8 @@ from synth.errors import UserError
 from synth.job import identity, reader
 from synth.job.laws import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
-from synth.system import cache
+from synth.render.mitsuba import adapter
+from synth.system import cache, packages
 from synth.system.config_file import ConfigFile, override
 from synth.tune.probe import Probe
 
@@ -66,7 +67,8 @@ class Measurements:
         explicit = changed(job, {"fem.law": job.fem.chosen_law[0]})
         self.own: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
         self.full: Settings = {key: settings[0] for key, settings in self.grid.items()}
-        self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()}"
+        here = packages.machine(), adapter.pick(job.render.variant)  # costs are of this machine
+        self._made_by = f"{crc32(job.model_dump_json().encode())} {provenance.fingerprint()} {here}"
         self._probes: dict[int, tuple[Job, Probe]] = {}
 
     def evaluate(self, settings: Settings, sequences: Sequence[int]) -> Evaluation:

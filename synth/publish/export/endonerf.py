@@ -47,7 +47,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
     are those of frame 0's camera. `scene.json` contains unit, focal length, baseline and force.
 
     Raises:
-        UserError: a sequence has no depth.
+        UserError: a sequence has no depth, or its camera moved in a way that is not stored.
     """
     for sequence in dataset:
         if "depth" not in sequence:

@@ -81,8 +81,10 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
         )
         names = [column.name for column in about]
         _write(target / "sequences", side, each, (_sequence(dataset[k], frameless, names) for k in positions))
+    # Of the sequences that were written: the index may be missing, or older.
+    rows = [{**index.row_of(dataset[k]), "split": side} for side, found in sides.items() for k in found]
     text = card.template("export/hugging_face.md.jinja").render(
-        **card.facts(Folder(dataset.root)),
+        **card.facts(Folder(dataset.root), rows),
         sides=list(sides),
         row_columns=_ROWS,
         framed=[FIELDS[name] for name in framed],

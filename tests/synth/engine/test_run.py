@@ -12,7 +12,7 @@ from fake_run import Silent, options, start, wait_for
 from synth.cli import app
 from synth.dataset import index, provenance, size_forecast
 from synth.dataset.folder import Folder
-from synth.engine import machine, status
+from synth.engine import child, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup
 from synth.engine.journal import Journal
@@ -86,13 +86,13 @@ def test_workers_take_gpus_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_gpus_are_those_left_visible(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
-    assert machine.gpus("auto", True) == ("0", "1")
-    assert machine.gpus("auto", False) is None
+    assert child.choose_gpus("auto", True) == ("0", "1")
+    assert child.choose_gpus("auto", False) is None
     with pytest.raises(UserError, match="2"):
-        machine.gpus("0,2", True)
+        child.choose_gpus("0,2", True)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setenv("PATH", "")
-    assert machine.gpus("auto", True) is None, "no driver"
+    assert child.choose_gpus("auto", True) is None, "no driver"
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from synth.fit import fitting
-from synth.fit.colours import fit_colours
+from synth.fit.fitting import fit_colours
 from synth.fit.photograph import Compression, Photograph, measure
 from synth.render.camera.camera_sensor import processed
 from synth.render.camera.colour_processing import CAMERAS, encoded

@@ -102,3 +102,12 @@ def test_a_folder_without_space_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), checked_file.made_folder(tmp_path / "a/b"):
         raise ZeroDivisionError
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["a: " + "[" * 500_000, '{"a": ' + "[" * 500_000, "%YAML:1.0\na: " + "- " * 300_000]
+)
+def test_nesting_that_would_exhaust_the_parser_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(UserError, match="nested"):
+        checked_file.read_storage(tmp_path / "camera.yaml", 1 << 24)
