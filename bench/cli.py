@@ -357,7 +357,8 @@ def _open_footage(path: Path, masks: MaskFiles | None) -> Footage:
 def _print_frame(frame: LiveFrame) -> None:
     force = "" if frame.force_mn is None else f"  {frame.force_mn:8.2f} mN"
     mark = "" if frame.trusted else "  not trusted"
-    print(f"frame {frame.index:5}  {1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px{force}{mark}")
+    took = f"{1e3 * frame.latency_s:7.1f} ms  {frame.largest_px:6.2f} px"
+    print(f"frame {frame.index:5}  {took}{force}{mark}", flush=True)
 
 
 def _rectangle(text: str) -> tuple[int, int, int, int] | None:

@@ -148,6 +148,7 @@ def publish(
     folder: Path, file: str, found: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page]
 ) -> None:
     """Writes data and the page drawn from them, as `save`, and prints its text."""
+    save(folder, file, found)  # so that a page that can't be drawn loses no measurement
     drawn = page(found)
     save(folder, file, found, drawn)
     print(drawn.text())

@@ -168,6 +168,8 @@ def _find_weights(folder: Path, card: ModelCard) -> Path:
             with checked_file.open_file(file, _LARGEST_WEIGHTS) as opened:
                 if hashlib.file_digest(opened, _digest).hexdigest() == card.weights_hash:
                     return file
+    if not (folder / _WEIGHTS).is_file():
+        raise UserError(f"{folder / _WEIGHTS}: no such file")
     raise UserError(f"{folder / _WEIGHTS}: not the weights that config.json was written for, or damaged")
 
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from bench.checks.judgement import judge
-from bench.checks.scale import check_scale
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.recording.tracking_picture import draw_tracking
 from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.errors import UserError
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import Finding, by_severity, first_fault
+from synth.recording_flow.finding import Finding, by_severity
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.system.checked_file import write_picture
 
@@ -31,18 +31,19 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         recording = open_recording(folder, phantom)
     except UserError as error:
         return [Finding("error", "recording", str(error))]
-    if first_fault(check_scale(recording)):
-        return judge(recording, _decode(recording))
+    mm_per_px, failed = 0.0, list[Finding]()
+    with suppress(UserError):  # `check_scale` reports it
+        mm_per_px = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px
     try:
-        return judge(recording, _track_some(recording, picture))
+        tracked = _track_some(recording, mm_per_px or 1.0, picture)
     except UserError as error:
-        failed = Finding("error", "tracking", str(error))
-        return by_severity([failed, *judge(recording, _decode(recording))])
+        failed, tracked = [Finding("error", "tracking", str(error))], _decode(recording)
+    tracked.scale_mm_per_px = mm_per_px
+    return by_severity([*failed, *judge(recording, tracked)])
 
 
-def _track_some(recording: Recording, picture: Path | None) -> TrackedRecording:
+def _track_some(recording: Recording, mm_per_px: float, picture: Path | None) -> TrackedRecording:
     """Decodes every picture, and tracks a few as `bench score` does. UserError: as `track_recording`."""
-    mm_per_px = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px
     first = recording.meta.rest_frame
     numbers = [number for number in recording.numbers() or range(_TRIED) if number >= first] or [first]
     only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _TRIED).astype(int))

@@ -38,6 +38,7 @@ def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Findi
     first, last = force.time_s[0] + offset - margin, force.time_s[-1] + offset + margin
     share = max(min(t[-1], last) - max(t[0], first), 0.0) / (t[-1] - t[0])
     message = f"the sensor covers {100 * share:.0f}% of the video"
+    message += "" if share else ": are both clocks in seconds?"
     return [Finding("ok" if share > _COVERED else "warning", "clocks", message)]
 
 

@@ -53,8 +53,7 @@ def check_quality(recording: Recording, tracked: TrackedRecording) -> list[Findi
 def check_scale(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on a stated scale that differs from that of the right or depth camera."""
     stereo, stated = tracked.stereo, tracked.scale_mm_per_px
-    off = 0.0 if stereo is None else abs(np.log(stereo.mm_per_px / stated))
-    if stereo is None or off <= _OTHER_SCALE:
+    if stereo is None or not stated or (off := abs(np.log(stereo.mm_per_px / stated))) <= _OTHER_SCALE:
         return []
     message = f"{stated:.4g} mm/px is stated, but stereo gives {stereo.mm_per_px:.4g}"
     for unit, times in _UNITS_MM.items():

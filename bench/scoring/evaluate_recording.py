@@ -102,6 +102,8 @@ def _select_frames(meta: Meta, tracked: TrackedRecording, sensor: AlignedSensor)
             inside = _within(time_s, span)
             scored &= ~inside
             notes.append(f"{inside.sum()} frames of the {what} ({describe_span(span)}) are not scored")
+    if lost := tracked.trusted.count(False):
+        notes.append(f"tracking was lost in {lost} of {len(time_s)} frames: they are not scored")
     again = _repeated(tracked, sensor.size_mn)
     if again.any():
         notes.append(f"{again.sum()} frames show an earlier one again, frozen or repeated: not scored")

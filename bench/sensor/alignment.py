@@ -44,8 +44,10 @@ def align_sensor(
     Raises UserError as `force_sensor.process_force`.
     """
     force, sensor = recording.force, recording.meta.sensor
-    if force is None or clocks.find_other_unit(time_s, force.time_s):
+    if force is None:
         return AlignedSensor()
+    if other := clocks.find_other_unit(time_s, force.time_s):
+        return AlignedSensor(notes=(f"{other}: nothing is scored",))
     offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
     rotation, notes = None, list[str]()
     if sensor.turn_s is not None:
@@ -59,7 +61,7 @@ def align_sensor(
     processed = force_sensor.process_force(force, sensor, offset_s)
     axes = force_sensor.force_at(processed, time_s)
     covered = int(np.isfinite(axes).all(axis=1).sum())
-    if covered < len(time_s):
+    if 0 < covered < len(time_s):
         notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
     about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
     return AlignedSensor(axes if covered else None, *about)

@@ -108,7 +108,8 @@ class Intervals:
                 raise ValueError(f"an error model doesn't have {frame} features")
             if spread.factors.keys() != {str(level) for level in LEVELS}:
                 raise ValueError(f"levels are not {', '.join(map(str, LEVELS))}")
-        if {len(row) for row in (self.distribution.mean, *self.distribution.precision)} != {count}:
+        rows = self.distribution.mean, *self.distribution.precision
+        if [len(row) for row in rows] != [count] * (count + 1):
             raise ValueError(f"the distribution doesn't have {count} features")
 
     def bound(self, predicted: Prediction, level: float = LEVEL) -> Band:

@@ -77,16 +77,9 @@ class Decoder:
         watch: Stopwatch,
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
-        """Decodes the video up to its rest frame.
+        """Decodes the video up to its rest frame; arguments as for `passes`.
 
-        Args:
-            footage: the video.
-            settings: of the tracking.
-            watch: collects the time spent.
-            progress: called after every decoded picture with their number.
-
-        Raises:
-            UserError: unreadable video, no rest frame in it, or a tissue mask without tissue.
+        Raises UserError: unreadable video, no rest frame in it, or a tissue mask without tissue.
         """
         self._footage, self._watch, self._progress = footage, watch, progress
         self._rate_hz = settings.rate_hz

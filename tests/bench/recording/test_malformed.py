@@ -72,6 +72,7 @@ def test_a_broken_recording_is_reported(intact: Path, tmp_path: Path, name: str)
     CASES[name](folder)
     findings = check_recording(folder)
     assert any(finding.severity in ("warning", "error") for finding in findings)
+    assert "scale" not in {finding.cause for finding in findings if finding.severity == "error"}
     try:
         notes: tuple[str, ...] = scored(folder, backend="dis").notes
     except UserError as error:

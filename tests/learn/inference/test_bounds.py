@@ -101,10 +101,12 @@ def test_the_force_at_rest_is_subtracted_and_a_size_is_not_negative() -> None:
     assert net_force(density[0, :, :1], density[1, :, :1], grid)[0, 0] == 0
 
 
-@pytest.mark.parametrize("wrong", [("force_unit", -1.0), ("features", ("log motion",))])
+@pytest.mark.parametrize(
+    "wrong", [("force_unit", -1.0), ("features", ("log motion",)), ("precision", ((1.0, 0.0),))]
+)
 def test_invalid_intervals_are_refused(vector: Path, wrong: tuple[str, Any]) -> None:
     intervals = fake_intervals.make()
-    object.__setattr__(intervals, *wrong)
+    object.__setattr__(intervals.distribution if wrong[0] == "precision" else intervals, *wrong)
     fake_intervals.give(vector, intervals)
     with pytest.raises(UserError, match=r"config\.json.*intervals"):
         read_card(vector)
