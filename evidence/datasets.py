@@ -1,7 +1,6 @@
-"""Sequences of studies: rendered where they are missing, flow recovered by any estimator, coarser grids."""
+"""Sequences of studies: rendered where they are missing, and on coarser grids."""
 
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +8,10 @@ import numpy as np
 
 from evidence import cache
 from learn.data.clips import Clip
-from learn.data.grid import Grid, GridView, settled
-from synth.arrays import Map, Mask
+from learn.data.grid import settled
+from synth.arrays import Map
 from synth.dataset import location
 from synth.dataset.store import Sequence, open_sequence
-from synth.flow.estimator import Estimator
-from synth.flow.track import track
 from synth.job import identity
 from synth.job.schema import Job
 from synth.sequence import pipeline
@@ -33,27 +30,6 @@ def render(job: Job, index: int, folder: Path) -> Sequence:
         shutil.rmtree(store.with_suffix(".zarr.part"), ignore_errors=True)
         pipeline.render_sequence(job, index, folder, lambda stage, done, of: None)
     return open_sequence(store)
-
-
-def recover_flow(
-    sequence: Sequence, clip: Clip, estimator: str | Estimator, blocked: Mask, grid: Grid
-) -> tuple[Clip, float]:
-    """Clip with the recovered flow of its rendered sequence, and the CPU time of all frames' flow [s].
-
-    `blocked`: (T, H, W) masked pixels: tool, specular highlights.
-    """
-    tissue = sequence["tissue"][:].astype(bool)
-    scale = float(sequence.attrs["scale_mm_per_px"])
-    view = GridView(tissue, scale, grid)
-    moved, confidence = np.zeros_like(clip.displacement["ideal"]), np.ones_like(clip.confidence)
-    rgb, began = sequence["rgb"][: clip.frames], time.process_time()
-    followed = track(estimator, rgb, blocked[: clip.frames], tissue)
-    spent = time.process_time() - began
-    for t in range(1, clip.frames):
-        moved[t] = view.mean(followed.flow[t].transpose(2, 0, 1) * scale) * clip.mask
-        confidence[t] = view.mean(followed.confidence[t]) * clip.mask
-    found = {**clip.displacement, "recovered": moved}
-    return replace(clip, displacement=found, confidence=confidence), spent
 
 
 def coarser(clip: Clip, times: int = 2) -> Clip:

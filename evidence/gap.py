@@ -97,16 +97,6 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
     return Split(fit, select, tuple(range(len(clips), len(number)))), tuple(sorted(aside))
 
 
-def with_noise(clips: Sequence[Clip], noise: Noise, seed: int) -> list[Clip]:
-    """Clips with recovered flow replaced by ideal flow plus noise."""
-    made = []
-    for k, clip in enumerate(clips):
-        rng = np.random.default_rng([seed, k])
-        noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
-        made.append(replace(clip, displacement={**clip.displacement, "recovered": noisy}))
-    return made
-
-
 def errors(
     kind: str,
     clips: Sequence[Clip],
@@ -120,9 +110,13 @@ def errors(
     name = f"{kind}-seed{settings.seed}"
 
     def compute() -> Errors:
-        own = clips
+        own = list(clips)
         if kind == "N":
-            own = with_noise(clips, fit_noise([clips[i] for i in split.fit]), settings.seed)
+            noise = fit_noise([clips[i] for i in split.fit])
+            for k, clip in enumerate(clips):
+                rng = np.random.default_rng([settings.seed, k])
+                noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
+                own[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
         predictor = training.fit(name, own, split, settings, work / "models")
         found = {test: evaluate(predictor, part, source).per_clip() for test, (part, source) in tests.items()}
         return {test: [row[_KEY] for row in rows] for test, rows in found.items()}

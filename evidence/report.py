@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -124,8 +124,10 @@ class Page:
             write_whole(folder / name, text, durable=False)
 
 
-def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = None) -> None:
-    """Writes data and page into a folder.
+def save(
+    folder: Path, file: str, found: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page] | None = None
+) -> None:
+    """Writes data and the page drawn from them into a folder, and prints the page's text.
 
     Floats are rounded to six digits. `command`, `commit`, `machine` and `cpu_hours` (of this process and its
     children: less than the total where a cache held parts) are put before the data, unless these have them.
@@ -141,17 +143,9 @@ def save(folder: Path, file: str, found: Mapping[str, Any], page: Page | None = 
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / file, _json(found) + "\n", durable=False)
     if page is not None:
-        replace(page, found=found).write(folder)
-
-
-def publish(
-    folder: Path, file: str, found: Mapping[str, Any], page: Callable[[Mapping[str, Any]], Page]
-) -> None:
-    """Writes data and the page drawn from them, as `save`, and prints its text."""
-    save(folder, file, found)  # so that a page that can't be drawn loses no measurement
-    drawn = page(found)
-    save(folder, file, found, drawn)
-    print(drawn.text())
+        drawn = page(found)
+        drawn.write(folder)
+        print(drawn.text())
 
 
 def command() -> str:
@@ -319,20 +313,14 @@ def _scale(axis: Any, log: bool) -> None:
 def _intervals(axes: Axes, chart: Chart) -> None:
     rows = chart.rows
     at = np.arange(len(rows))
-    colours = [_COLOURS[row.group % len(_COLOURS)] for row in rows]
     low, high = np.array([row.interval for row in rows], float).reshape(-1, 2).T
+    colours = [_COLOURS[row.group % len(_COLOURS)] for row in rows]
     axes.hlines(at, low, high, color=colours, linewidth=2)
     axes.scatter(np.array([row.value for row in rows], float), at, 26, colours)
     axes.axvline(0, color="#c9ced6", linewidth=0.8, zorder=0)
     axes.set(title=chart.title, xlabel=chart.unit, ylim=(len(rows) - 0.4, -0.6))
-    axes.set_yticks(at, [f"{row.name}   {_figures(row)}" for row in rows])
+    axes.set_yticks(at, [f"{row.name}   {mean_cell((row.value, *row.interval), '.4g')}" for row in rows])
     axes.grid(visible=False, axis="y")
-
-
-def _figures(row: Row) -> str:
-    if not math.isfinite(row.interval[0]):
-        return f"{row.value:.4g}"
-    return f"{row.value:.4g} [{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
 
 
 def mean_cell(values: Sequence[float | None], form: str = ".3g", factor: float = 1.0) -> str:

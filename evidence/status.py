@@ -5,7 +5,7 @@ import hashlib
 import json
 import re
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import cache
@@ -44,12 +44,12 @@ def gather(results: Path, modules: Mapping[str, str], home: Path = CHECKOUT) -> 
 
     `modules`: the study that makes the files of a pattern, relative to the folder.
     """
-    found = []
-    for file in sorted(results.rglob("*.json")):
-        name = str(file.relative_to(results))
-        module = next((one for pattern, one in modules.items() if fnmatch(name, pattern)), "")
-        found.append(_status(file, module, home))
-    return found
+
+    def module(name: str) -> str:
+        return next((one for pattern, one in modules.items() if fnmatch(name, pattern)), "")
+
+    files = sorted(results.rglob("*.json"))
+    return [_status(file, module(str(file.relative_to(results))), home) for file in files]
 
 
 def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
@@ -82,10 +82,10 @@ def content(path: Path) -> str:
 
 def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
     """Content hashes by path in the checkout, or by name for data elsewhere; results store them."""
-    found = {}
-    for path in map(Path.resolve, paths):
-        found[str(path.relative_to(home)) if path.is_relative_to(home) else path.name] = content(path)
-    return found
+    return {
+        str(path.relative_to(home)) if path.is_relative_to(home) else path.name: content(path)
+        for path in map(Path.resolve, paths)
+    }
 
 
 def _status(file: Path, module: str, home: Path) -> Status:
@@ -94,40 +94,34 @@ def _status(file: Path, module: str, home: Path) -> Status:
     name, command = str(file.relative_to(home)), str(found.get("command", ""))
     commit = str(found.get("commit") or _git(home, "log", "-1", "--format=%h", "--", name)).strip()
     changed = None
-    if module and _git(home, "cat-file", "-t", commit.rstrip("+")):
+    base = commit.rstrip("+")
+    if module and _git(home, "cat-file", "-t", base):
         files = closure(module, home) | (closure("bench.cli", home) if _SCORED.search(command) else set())
         ours = {str(one.relative_to(home)) for one in files}
         read = {path: word for path, word in found.get("data", {}).items() if (home / path).exists()}
         other = {path for path, word in read.items() if content(home / path) != word}
-        changed = tuple(sorted(ours & _differing(home, commit.rstrip("+")) | other))
+        new = _git(home, "ls-files", "--others", "--exclude-standard")
+        differing = {*_git(home, "diff", "--name-only", base).splitlines(), *new.splitlines()}
+        changed = tuple(sorted(ours & differing | other))
     return Status(name, command, commit, changed, found.get("cpu_hours"))
 
 
 @cache
 def _imported(file: Path, _changed_ns: int) -> list[str]:
-    return list(_names(ast.parse(file.read_text("utf-8"))))
-
-
-def _names(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+    names = []
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         elif isinstance(node, ast.Constant) and (known := _OURS.match(str(node.value))):
-            yield known[0]
+            names.append(known[0])
+    return names
 
 
 def _file(module: str, home: Path) -> Path | None:
     at = home.joinpath(*module.split("."))
     return next((one for one in (at.with_suffix(".py"), at / "__init__.py") if one.is_file()), None)
-
-
-def _differing(home: Path, commit: str) -> set[str]:
-    """Files that differ from a commit's, those not committed included."""
-    new = _git(home, "ls-files", "--others", "--exclude-standard")
-    return {*_git(home, "diff", "--name-only", commit).splitlines(), *new.splitlines()}
 
 
 def _git(home: Path, *words: str) -> str:

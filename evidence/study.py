@@ -67,7 +67,7 @@ def command(name: str) -> Any:
             study.measure(**options)
             return
         folder = options.pop("out")
-        report.publish(folder, result.name, study.measure(**options) or {}, study.page)
+        report.save(folder, result.name, study.measure(**options) or {}, study.page)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     app = typer.Typer(add_completion=False)

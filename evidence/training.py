@@ -1,11 +1,13 @@
-"""Networks of studies: cross-validation folds that share no anatomy, and stored trainings."""
+"""Networks of studies: cross-validation folds that share no anatomy, stored trainings, export."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 
-from evidence import cache
+from evidence import cache, report
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
@@ -43,3 +45,13 @@ def fit(
     model = folder / f"{name}-{cache.key(settings.model_dump(), used)}"
     train(clips, split, settings, model)
     return load_model(model)
+
+
+def export(net: torch.nn.Module, weights: Path, card: Mapping[str, Any]) -> None:
+    """Writes the weights of a network at half precision, and next to them its card as JSON."""
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    state = net.state_dict().items()
+    torch.save({name: v.half() if v.is_floating_point() else v for name, v in state}, weights)
+    card = {**card, "parameters": sum(p.numel() for p in net.parameters()), "torch": torch.__version__}
+    report.save(weights.parent, f"{weights.stem}.json", card)
+    print(card)

@@ -21,6 +21,7 @@ from synth.errors import UserError
 from synth.fit.fitting import fit_camera
 from synth.fit.photograph import Photograph, read_photograph
 from synth.job.schema import Job
+from synth.tune.search import changed
 
 SIDE_PX = 128
 _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
@@ -48,10 +49,10 @@ def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) ->
 def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
     """Crops of tissue in the first frame of each sequence, without instruments; and their sequence (N,)."""
     field = job.render.size[0] * MM_PER_PX
-    keys = job.model_dump()
-    keys["render"] |= {"tool": False, "field_mm": (field, field)}
-    keys["sensor"]["bitrate_mbps"] = None  # `taken` applies the codec
-    bare = Job.model_validate(keys)
+    # `taken` applies the codec.
+    bare = changed(
+        job, {"render.tool": False, "render.field_mm": (field, field), "sensor.bitrate_mbps": None}
+    )
     pictures, of = [], []
     for index in range(job.sequences):
         rgb, inside, _ = bare_picture(bare, index)
@@ -80,8 +81,7 @@ def read_job(sections: dict[str, Any], frames: int, seed: int, width_mm: float) 
     if not sections:
         return job
     share = min(1.0, job.render.size[0] * MM_PER_PX / width_mm)
-    sensor = job.sensor.model_copy(update={"vignette": job.sensor.vignette * share**2})
-    return job.model_copy(update={"sensor": sensor})
+    return changed(job, {"sensor.vignette": job.sensor.vignette * share**2})
 
 
 def taken(rgb: Pixels, seed: int) -> Pixels:

@@ -68,7 +68,21 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
     selected by `select`; or ridge."""
     if one.model == RIDGE:
         return _by_components(one, fit)
-    settings = network_settings(one, steps, sum(clip.frames for clip in fit))
+    frames = sum(clip.frames for clip in fit)
+    arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
+    settings = TrainingSettings.model_validate(
+        {
+            "size": GRID.size,
+            "arch": arch | {"depth": one.cameras == 2},
+            "loss": "mse-frame",
+            "input": one.source,
+            "epochs": int(np.clip(round(steps * _BATCH / frames), _LEAST, _MOST)),
+            "batch": _BATCH,
+            "learning_rate": 2e-3,
+            "schedule": "cosine",
+            "seed": 0,
+        }
+    )
     split = Split(tuple(range(len(fit))), tuple(range(len(fit), len(fit) + len(select))), ())
     predictor = training.fit(one.slug, [*fit, *select], split, settings, work)
     return partial(models.read_force, predictor, source=one.source)
@@ -91,24 +105,6 @@ def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
     return lambda clip: (
         clip.young_kpa
         * np.asarray(regressor.predict(basis.transform(models.rows(coarser(clip), one.source))))
-    )
-
-
-def network_settings(one: Estimator, steps: int, frames: int) -> TrainingSettings:
-    """Training settings of a network: about `steps` batches over a training set of `frames` frames."""
-    arch = NETWORKS[one.model] | {"output": "vector", "confidence": True, "relative": True}
-    return TrainingSettings.model_validate(
-        {
-            "size": GRID.size,
-            "arch": arch | {"depth": one.cameras == 2},
-            "loss": "mse-frame",
-            "input": one.source,
-            "epochs": int(np.clip(round(steps * _BATCH / frames), _LEAST, _MOST)),
-            "batch": _BATCH,
-            "learning_rate": 2e-3,
-            "schedule": "cosine",
-            "seed": 0,
-        }
     )
 
 

@@ -17,7 +17,7 @@ from bench.methods import baselines, physics, posterior
 from bench.methods.compliance import TissueKind
 from bench.methods.protocol import Field
 from learn.data.clips import Clip
-from learn.inference.predict import Predictor
+from learn.inference.predict import Predictor, total_force
 from learn.training import batches
 from synth.arrays import Array, Floats
 from synth.flow.confidence import deviation
@@ -101,7 +101,7 @@ def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bo
     moved = np.asarray(clip.displacement[source])
     membrane = clip.membrane if membrane_known else "unknown"
     density = predictor.density(moved, clip.mask, clip.young_kpa, clip.confidence_of(source), membrane)
-    return np.asarray(density.astype(np.float64).sum(axis=(2, 3)) * predictor.grid.pitch_mm**2)
+    return total_force(density, predictor.grid)
 
 
 def errors(predicted: Sequence[Floats], true: Sequence[Floats]) -> dict[str, list[float]]:

@@ -25,9 +25,10 @@ from evidence.intervals import difference, mean_of
 from evidence.study import Study
 from learn.data import clips as data
 from learn.data.clips import Clip
+from learn.data.grid import GridView
 from synth.dataset.folder import write_whole
 from synth.flow import mask_detection
-from synth.flow.estimator import create
+from synth.flow.track import track
 from synth.job.schema import FemSection, FlowSection, Job, RenderSection
 
 FRAMES, SIZE, VERTICES, LOAD, GESTURES = 8, (256, 192), 8000, (0.05, 0.2), ("pull", "push")
@@ -92,10 +93,6 @@ class Pipeline:
         """Whether rendering and flow are the defaults; a job doesn't specify the model."""
         return self.rendering == default_rendering() and self.flow == FlowSection().backend
 
-    def as_row(self) -> dict[str, Any]:
-        """Settings that identify it in a row of results."""
-        return asdict(self.rendering) | {"flow": self.flow, "model": self.model, "default": self.default}
-
 
 def chosen() -> list[Pipeline]:
     """Defaults, changes of one setting at a time, all settings at their cheapest, and those of `FINE`."""
@@ -147,13 +144,17 @@ class Sequences:
         clip = data.read_clip(sequence, GRID, ("ideal",))
         if flow == "ideal":
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
+        rgb, tool, tissue = (sequence[name][:] for name in ("rgb", "tool", "tissue"))
         began = time.process_time()
-        hidden = mask_detection.hidden(sequence["rgb"][...], sequence["tool"][...].astype(bool))
-        masks_s = time.process_time() - began
-        recovered, flow_s = datasets.recover_flow(sequence, clip, create(flow), hidden, GRID)
-        spent = (masks_s + flow_s) / (clip.frames - 1)
+        found = track(flow, rgb, mask_detection.hidden(rgb, tool), tissue)
+        spent = (time.process_time() - began) / (clip.frames - 1)
         write_whole(self._folder / f"flow-{flow}-{index:06d}.cpu_s", str(spent), durable=False)
-        return recovered
+        scale = float(sequence.attrs["scale_mm_per_px"])
+        view = GridView(tissue, scale, GRID)
+        moved = np.stack([view.mean(flow.transpose(2, 0, 1) * scale) * clip.mask for flow in found.flow])
+        confidence = np.stack([view.mean(sure) * clip.mask for sure in found.confidence])
+        confidence[0] = 1  # of the rest frame
+        return replace(clip, displacement=clip.displacement | {"recovered": moved}, confidence=confidence)
 
 
 def errors(one: Pipeline, made: Sequences, tested: Sequences, work: Path) -> dict[str, Any]:
@@ -191,7 +192,8 @@ def measure(
     made = {one: Sequences(one, one.job(seed, fit), work) for one in renderings}
     rows: list[dict[str, Any]] = []
     for one in pipelines:
-        row = one.as_row() | errors(one, made[one.rendering], tested, work)
+        row = asdict(one.rendering) | {"flow": one.flow, "model": one.model, "default": one.default}
+        row |= errors(one, made[one.rendering], tested, work)
         flow_s = made[default_rendering()].flow_s(one.flow)
         costs = {"data_s": made[one.rendering].data_s(), "flow_s": flow_s}
         rows.append(row | costs | {"cpu_s": sum(costs.values()) + row["estimate_s"]})

@@ -11,6 +11,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.fem.tool_gesture import Gesture
+from synth.geometry.triangles import grid_faces
 from synth.job import schema
 from synth.sequence import scenario
 
@@ -34,10 +35,8 @@ def patch(vertices: int = 40_000, extent: float = 46.0) -> Patch:
     """A square grid on the dome."""
     n = round(vertices**0.5)
     x = np.linspace(-extent / 2, extent / 2, n)
-    xy = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
-    i = np.arange(n * n).reshape(n, n)
-    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
-    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int32)
+    xy = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    faces = np.concatenate(grid_faces(n, n))
     at = np.column_stack([xy, tetrahedra.dome(xy, ANATOMY.dome_mm)])
     inside = np.hypot(*xy.T) < ANATOMY.craniotomy.radius_mm
     return Patch(at, faces, surface_embedding.vertex_area(at, faces), inside)

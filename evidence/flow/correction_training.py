@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evidence import report
+from evidence import training
 from evidence.flow import scenes as drawn_scenes
 from evidence.flow.scenes import (
     Recipe,
@@ -70,26 +70,22 @@ def measure(
     examples.mkdir(parents=True, exist_ok=True)
     sources = _sources(scenes, closed, drawn, depth)
     describe, before = (depth_example, "depth_") if depth else (example, "")
-    files = [examples / f"{before}{name}.npz" for name, _ in sources]
-    for file, (_, make) in zip(files, sources, strict=True):
+    found = []
+    for name, make in sources:
+        file = examples / f"{before}{name}.npz"
         if not file.exists():
             np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
             (examples / "part.npz").rename(file)
-    found = [dict(np.load(file)) for file in files]
-    weights = depth_correction.WEIGHTS if depth else correction.WEIGHTS
+        found.append(dict(np.load(file)))
     net, steps = fit(found, depth, minutes, seed)
-    torch.save({k: v.half() for k, v in net.state_dict().items()}, weights)
     drawings = f"{drawn} drawn pairs" if depth else f"{closed} pulls, {drawn} drawn pairs"
     card = {
         "trained_on": f"sequences {_FIRST} to {_FIRST + scenes - 1} of mission, {drawings}",
         "frames": sum(len(one["x"]) for one in found),
         "cpu_minutes": minutes,
         "steps": steps,
-        "parameters": sum(p.numel() for p in net.parameters()),
-        "torch": torch.__version__,
     }
-    report.save(weights.parent, f"{weights.stem}.json", card)
-    print(card)
+    training.export(net, depth_correction.WEIGHTS if depth else correction.WEIGHTS, card)
 
 
 def _sources(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
@@ -108,11 +104,8 @@ def _sources(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[st
 @lru_cache(1)
 def _rendered(index: int) -> Frames:
     """Images, tool masks and calibration of both cameras; true `flow`, `visible`, `motion`, `pressed`."""
-    job = reader.load_job("mission")
     baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
-    scene = simulate(
-        job.model_copy(update={"render": job.render.model_copy(update={"stereo_mm": baseline_mm})}), index
-    )
+    scene = simulate(reader.load_job("mission", [f"render.stereo_mm={baseline_mm}"]), index)
     shots = list(scene.frames())
     frames = {name: np.stack([getattr(f, name) for f in shots]) for name in _STORED}
     size = np.linalg.norm(np.stack([f.traction for f in shots]), axis=-1)

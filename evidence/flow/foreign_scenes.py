@@ -192,11 +192,6 @@ class Field:
             return np.asarray(np.stack([-radial[..., 1], radial[..., 0]], -1), np.float32)
         return np.asarray(radial if self.motion == "press from behind" else -radial, np.float32)
 
-    def steepest(self, size: int) -> float:
-        """Largest derivative of the displacement, at least 1e-6."""
-        slopes = np.gradient(self.at(pixels(size, size)), axis=(0, 1))
-        return max(1e-6, *(float(np.abs(slope).max()) for slope in slopes))
-
 
 def video(recipe: Recipe, size: int = 192, frames: int = 16) -> Iterator[Frame]:
     """Frames of a recipe, the rest frame first."""
@@ -228,7 +223,9 @@ class _Stage:
         self.recipe, self.size, shape = recipe, size, (size, size)
         self.skin = _surface(recipe.surface, size, rng)
         self.field = Field.draw(recipe.motion, size, rng)
-        self.peak_px = min(recipe.peak_px, 0.5 / self.field.steepest(size)) * size / 192
+        slopes = np.gradient(self.field.at(pixels(size, size)), axis=(0, 1))
+        steepest = max(1e-6, *(float(np.abs(slope).max()) for slope in slopes))
+        self.peak_px = min(recipe.peak_px, 0.5 / steepest) * size / 192
         # High values of `wet` are highlights; `drift` is their change with the surface's tilt.
         self.wet = noise_field(shape, size / 14, rng) + noise_field(shape, size / 4, rng)
         self.drift, self.angle = noise_field(shape, size / 5, rng), rng.uniform(0, 2 * np.pi)
@@ -265,7 +262,9 @@ class _Stage:
             picture = np.zeros_like(picture)
         if fault == "defocus":
             picture = cv2.GaussianBlur(picture, (0, 0), 0.03 * size)
-        rgb = self._sense(np.asarray(picture, np.float32), rng)
+        picture = picture.mean(-1, keepdims=True) if recipe.mono else picture
+        rgb = sensed(255 * np.asarray(picture, np.float32), recipe.noise, rng)
+        rgb = jpeg(np.repeat(rgb, 3 // rgb.shape[-1], -1), recipe.quality)
         free = scope & ~dilated(glare | tool, _RIM) & ~cover
         visible = (at_rest(free, flow) > 0.99) & scope & ~self.rest_blocked
         return Frame(rgb, flow, visible, free, amplitude, fault)
@@ -317,9 +316,3 @@ class _Stage:
         shadow = 1 - 0.25 * cv2.GaussianBlur(np.roll(mask, 4, 0).astype(np.float32), (0, 0), 3)[..., None]
         lit = picture * shadow * (1 - soft) + soft * colour
         return np.asarray(lit, np.float32), mask.astype(bool)
-
-    def _sense(self, picture: Map, rng: np.random.Generator) -> Pixels:
-        if self.recipe.mono:
-            picture = picture.mean(-1, keepdims=True)
-        rgb = sensed(255 * picture, self.recipe.noise, rng)
-        return jpeg(np.repeat(rgb, 3 // rgb.shape[-1], -1), self.recipe.quality)

@@ -25,10 +25,13 @@ def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
     for root in data:
         sequences = list(Dataset(root))[:count]
         height, width = sequences[0].size
+        flow_s, stereo_s = (
+            sum(one.attrs["timings"][stage]["cpu_s"] for one in sequences) for stage in ("flow", "stereo")
+        )
         rows.append(
             {"data": root.name, "size": f"{width} x {height}", "sequences": len(sequences)}
             | figures([sample for one in sequences for sample in _samples(one)])
-            | {"cost_ratio": _cost_ratio(sequences)}
+            | {"cost_ratio": float((flow_s + stereo_s) / flow_s)}
         )
     return {"data": status.data(*data), "rows": rows}
 
@@ -65,14 +68,6 @@ def _samples(sequence: Sequence) -> list[Sample]:
         true, found, deviation, pressed = (np.asarray(field)[here][::_EVERY] for field in fields)
         samples.append((true, found, deviation, pressed))
     return samples
-
-
-def _cost_ratio(sequences: list[Sequence]) -> float:
-    """CPU time of flow and stereo relative to that of flow."""
-    spent = {
-        stage: sum(s.attrs["timings"][stage]["cpu_s"] for s in sequences) for stage in ("flow", "stereo")
-    }
-    return float(sum(spent.values()) / spent["flow"])
 
 
 _TARGETS = (

@@ -7,7 +7,6 @@ scenes of the network and of the rule without weights).
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -16,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from evidence import report
+from evidence import training
 from evidence.study import Study
 from synth.arrays import Floats, Mask, Pixels
 from synth.flow import mask_detection, toolnet
@@ -25,21 +24,13 @@ from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 
+Frame = tuple[Pixels, Mask]  # an image (H, W, 3) sRGB and its instrument mask (H, W)
 FRAMES = 6  # frames a scene; the last shows no instrument
 _FAMILIES = ("healthy", "pale", "hyperaemic", "oedematous", "calf")
 _GESTURES = ("pull", "push", "slide", "retract")  # together they use every instrument
 _AWAY_MM = 300.0  # outside every view
 _HELD_OUT, _FIRST = range(13), 26  # scenes to test on, and the first to train on
 _BATCH, _RATE = 8, 3e-3
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One image and its instrument mask."""
-
-    scene: int
-    rgb: Pixels  # (H, W, 3) sRGB
-    tool: Mask  # (H, W)
 
 
 def frames_of(scenes: range, seed: int) -> Iterator[Frame]:
@@ -70,7 +61,7 @@ def _scene(job: Job, index: int) -> Iterator[Frame]:
         if k == FRAMES - 1:
             tips = tips + np.array([0.0, 0.0, _AWAY_MM])
         shot = scene.renderer.render(SceneState(vertices, tips, shafts), seed)
-        yield Frame(index, shot.rgb, shot.tool)
+        yield shot.rgb, shot.tool
 
 
 def _pose(vertices: Floats, radius_mm: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -88,36 +79,34 @@ def _pose(vertices: Floats, radius_mm: float, rng: np.random.Generator) -> tuple
 
 def measure(out: Path = toolnet.WEIGHTS.parent, scenes: int = 39, steps: int = 700, seed: int = 0) -> None:
     """Renders `scenes` scenes, trains for `steps` steps of AdamW, writes weights and card."""
-    training = list(frames_of(range(_FIRST, _FIRST + scenes), seed))
-    net = fit(training, steps, seed)
-    out.mkdir(parents=True, exist_ok=True)
-    state = {k: v.half() if v.is_floating_point() else v for k, v in net.state_dict().items()}
-    torch.save(state, out / "toolnet.pt")
+    rendered = list(frames_of(range(_FIRST, _FIRST + scenes), seed))
+    net = fit(rendered, steps, seed)
     held = list(frames_of(_HELD_OUT, seed))
-    found = {
-        "frames": len(training),
+    card = {
+        "frames": len(rendered),
         "held_out_frames": len(held),
         "held_out_iou": overlap(held, lambda rgb: toolnet.probability(net, rgb) > 0.5),
         "held_out_iou_with_the_rule": overlap(held, lambda rgb: mask_detection.both(rgb, net)),
         "held_out_iou_of_the_rule": overlap(held, mask_detection.grey_bodies),
-        "parameters": sum(p.numel() for p in net.parameters()),
-        "torch": torch.__version__,
     }
-    report.save(out, "toolnet.json", found)
-    print(found)
+    training.export(net, out / "toolnet.pt", card)
 
 
-def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
+def fit(frames: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
     """A network trained from random weights; one-cycle learning rate, one thread."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    batches = _batches(training, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
     net = toolnet.ToolNet()
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
     net.train()
-    for _, (pictures, masks) in zip(range(steps), batches, strict=False):
-        loss = _loss(net(pictures), masks)
+    for _ in range(steps):
+        chosen = [_vary(*frames[int(k)], rng) for k in rng.integers(len(frames), size=_BATCH)]
+        pictures = torch.from_numpy(np.stack([toolnet.prepare(picture) for picture, _ in chosen]))
+        masks = torch.from_numpy(np.stack([mask for _, mask in chosen]))[:, None].float()
+        small = F.interpolate(masks, size=(toolnet.SIDE, toolnet.SIDE), mode="area")
+        loss = _loss(net(pictures), F.avg_pool2d(small, 2))
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
@@ -128,21 +117,11 @@ def fit(training: Sequence[Frame], steps: int, seed: int) -> toolnet.ToolNet:
 def overlap(frames: Sequence[Frame], find: Callable[[Pixels], Mask]) -> float:
     """Intersection over union of detected and true tool pixels, pooled over all frames."""
     both = either = 0
-    for frame in frames:
-        found = find(frame.rgb)
-        both += int(np.count_nonzero(found & frame.tool))
-        either += int(np.count_nonzero(found | frame.tool))
+    for rgb, tool in frames:
+        found = find(rgb)
+        both += int(np.count_nonzero(found & tool))
+        either += int(np.count_nonzero(found | tool))
     return both / max(either, 1)
-
-
-def _batches(frames: Sequence[Frame], rng: np.random.Generator) -> Iterator[tuple[Tensor, Tensor]]:
-    while True:
-        drawn = [frames[int(k)] for k in rng.integers(len(frames), size=_BATCH)]
-        chosen = [_vary(frame.rgb, frame.tool, rng) for frame in drawn]
-        pictures = torch.from_numpy(np.stack([toolnet.prepare(picture) for picture, _ in chosen]))
-        masks = torch.from_numpy(np.stack([mask for _, mask in chosen]))[:, None].float()
-        small = F.interpolate(masks, size=(toolnet.SIDE, toolnet.SIDE), mode="area")
-        yield pictures, F.avg_pool2d(small, 2)
 
 
 def _vary(picture: Pixels, mask: Mask, rng: np.random.Generator) -> tuple[Pixels, Mask]:

@@ -19,7 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import KroghInterpolator, RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 
 from bench.recording import writer
@@ -68,20 +68,14 @@ def measure(
                 record(part, both.name, kind, rng, (seconds, fps, spp), (mechanics_python, pictures_python))
         if not left.exists():
             with checked_file.folder_of(left) as part:
-                copy_left_camera(both, part)
+                right = shutil.ignore_patterns("right.mp4", "pair.yaml")
+                shutil.copytree(both, part, ignore=right, dirs_exist_ok=True)
+                meta = read_meta(both / "meta.yaml")
+                writer.write_meta(part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"}))
         folders[2].append(both)
         folders[1].append(left)
     for cameras, of in folders.items():
         score_and_pool(of, cameras, results / FOLDERS[cameras])
-
-
-def copy_left_camera(recording: Path, part: Path) -> None:
-    """Copies a recording without its right camera into a folder."""
-    shutil.copytree(
-        recording, part, ignore=shutil.ignore_patterns("right.mp4", "pair.yaml"), dirs_exist_ok=True
-    )
-    meta = read_meta(recording / "meta.yaml")
-    writer.write_meta(part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"}))
 
 
 def record(
@@ -225,11 +219,7 @@ class Surface:
         out = pulse * self.pulse
         for contact, level in zip(self.moved, levels, strict=True):
             if level > 0:
-                weights = [
-                    np.prod([(level - known[j]) / (known[i] - known[j]) for j in range(len(known)) if j != i])
-                    for i in range(1, len(known))
-                ]
-                out = out + np.tensordot(weights, contact, axes=1)
+                out = out + KroghInterpolator(known, [np.zeros_like(contact[0]), *contact])(level)
         return np.asarray(out, np.float64)
 
 

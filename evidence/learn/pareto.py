@@ -5,6 +5,7 @@ An hour on a core; without --cache only times.
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -64,24 +65,20 @@ def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str,
     for name, group in OTHERS.items():
         preset = PRESETS[name]
         clips = labels.clips(pictured(job, preset.size), Grid(preset.size), cache)
+        usual = replace(base_settings(), size=preset.size, loss=preset.loss)
         runs: dict[tuple[int, int, int], list[dict[str, Any]]] = {}
-        for shape in group:
-            for seed in range(seeds):
-                runs.setdefault(shape, []).append(carry_out(_run(name, shape, seed), clips, cache))
+        for shape, seed in product(group, range(seeds)):
+            width, stem, levels = shape
+            arch = {"width": width, "stem": stem, "levels": levels, "dropout": preset.arch.dropout}
+            settings = replace(usual, arch=replace(usual.arch, **arch), seed=seed)
+            run = Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
+            runs.setdefault(shape, []).append(carry_out(run, clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
         for shape, own in runs.items():
             rmse = by_sequence(own, "map_rmse")
             against = [value / float(base.mean()) for value in difference(base, rmse)]
             found[(preset.size, *shape)] = {"map_rmse": mean_of(rmse), "against": against}
     return found
-
-
-def _run(name: str, shape: tuple[int, int, int], seed: int) -> Run:
-    preset, base = PRESETS[name], base_settings()
-    width, stem, levels = shape
-    arch = replace(base.arch, width=width, stem=stem, levels=levels, dropout=preset.arch.dropout)
-    settings = replace(base, size=preset.size, loss=preset.loss, arch=arch, seed=seed)
-    return Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
 
 
 def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:

@@ -29,6 +29,7 @@ from learn.split import Split
 from synth.arrays import Floats
 from synth.job import reader
 from synth.job.schema import Job
+from synth.tune.search import changed
 
 JOB = report.RESULTS / "learn/data/labels.yaml"
 LOSSES: tuple[Loss, ...] = ("mse", "antighost", "off-target")
@@ -145,8 +146,7 @@ def pictured(job: Job, size: int) -> Job:
     """The job with images of at least one pixel a cell of a grid of `size`, so that a fine grid has more
     information than a coarse one."""
     times = -(-size // job.render.size[0])
-    wider = job.render.model_copy(update={"size": tuple(times * edge for edge in job.render.size)})
-    return job.model_copy(update={"render": wider})
+    return changed(job, {"render.size": [times * edge for edge in job.render.size]})
 
 
 def _split(run: Run, clips: Sequence[Clip]) -> Split:

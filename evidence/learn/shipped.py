@@ -113,16 +113,12 @@ def page(found: Mapping[str, Any]) -> report.Page:
         f"{report.percent(row['whole'])} with {row['model']} on {row['data']}" for row in found["rows"]
     )
     words = (f"**Error of the force: {worst}.** All sequences are held out from training and calibration.",)
-    charts = [_chart(found["rows"], *which) for which in _CHARTS]
+    charts = []
+    for title, key in _CHARTS:
+        known = {f"{row['model']}: {row['data']}": np.array(row[key], float) for row in found["rows"]}
+        bars = tuple(report.Row(name, mean, (low, high)) for name, (mean, low, high) in known.items())
+        charts.append(report.Chart(title, "share", bars))
     return report.Page("The pretrained networks", found, charts, sections, words)
-
-
-def _chart(rows: Sequence[Mapping[str, Any]], title: str, key: str) -> report.Chart:
-    bars = []
-    for row in rows:
-        mean, low, high = (np.nan if value is None else value for value in row[key])
-        bars.append(report.Row(f"{row['model']}: {row['data']}", mean, (low, high)))
-    return report.Chart(title, "share", tuple(bars))
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Coverage of 90% intervals", "covered_size"))

@@ -141,9 +141,8 @@ def scaled(clip: Clip, factor: float) -> Clip:
 
 def still(clip: Clip) -> Clip:
     """The clip without motion and load."""
-    nothing = 0 * np.asarray(clip.displacement["ideal"])
-    empty = changed(clip, density=0 * np.asarray(clip.density), force=0 * clip.force)
-    return changed(empty, displacement={"ideal": nothing})
+    moved = {"ideal": 0 * np.asarray(clip.displacement["ideal"])}
+    return changed(clip, density=0 * np.asarray(clip.density), force=0 * clip.force, displacement=moved)
 
 
 STUDY = Study(measure, "learn/stability/stability.json", page, ("{work}/labels",))

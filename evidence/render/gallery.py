@@ -18,8 +18,9 @@ from synth.render.instrument import Kind
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
+from synth.tune.search import changed
 
-Settings = dict[str, Any]
+Settings = dict[str, Any]  # values of a job's dotted keys
 
 _GESTURES: dict[Kind, str] = {
     "forceps": "pull",
@@ -29,16 +30,16 @@ _GESTURES: dict[Kind, str] = {
     "spatula": "retract",
 }
 _LIGHTS: dict[str, Settings] = {
-    "few highlights": {"light": {"glare": 0.0}},
-    "many highlights": {"light": {"glare": 0.8}},
-    "tilted lamp": {"light": {"tilt_deg": 30.0, "main": 0.9}},
-    "narrow spot": {"light": {"even": 0.22}},
+    "few highlights": {"light.glare": 0.0},
+    "many highlights": {"light.glare": 0.8},
+    "tilted lamp": {"light.tilt_deg": 30.0, "light.main": 0.9},
+    "narrow spot": {"light.even": 0.22},
 }
 _CAMERAS: dict[str, Settings] = {
     "default": {},
-    "noisy": {"sensor": {"full_well": 900.0, "read_noise": 25.0, "sharpening": 1.2}},
-    "soft": {"sensor": {"blur_px": 1.2}},
-    "wide": {"render": {"field_mm": 46.0, "tilt_deg": 28.0, "distortion": (-0.25, 0, 0, 0, 0)}},
+    "noisy": {"sensor.full_well": 900.0, "sensor.read_noise": 25.0, "sensor.sharpening": 1.2},
+    "soft": {"sensor.blur_px": 1.2},
+    "wide": {"render.field_mm": 46.0, "render.tilt_deg": 28.0, "render.distortion": (-0.25, 0, 0, 0, 0)},
 }
 _SCENERY: dict[str, Kind] = {
     "bone": "forceps",
@@ -56,19 +57,16 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
     """
     size = (width, width * 3 // 4)
     families = [
-        [_tile({"appearance": {"families": (family,)}}, kind, size, seed + row, f"{family}, {kind}")
+        [_tile({"appearance.families": (family,)}, kind, size, seed + row, f"{family}, {kind}")
          for kind in get_args(Kind)]
         for row, family in enumerate(get_args(Family))
     ]  # fmt: skip
     views = [
-        [
-            _tile(_merged(lamp, lens), "forceps", size, seed, f"{lit}; {name}")
-            for name, lens in _CAMERAS.items()
-        ]
+        [_tile(lamp | lens, "forceps", size, seed, f"{lit}; {name}") for name, lens in _CAMERAS.items()]
         for lit, lamp in _LIGHTS.items()
     ]
     around = [
-        _tile({"render": {"scenery": (part,)}}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
+        _tile({"render.scenery": (part,)}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
     ]
     out.mkdir(parents=True, exist_ok=True)
     for name, rows in (("gallery-appearances", families), ("gallery-views", [*views, around])):
@@ -78,17 +76,8 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
 
 def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
-    job = Job.model_validate(
-        _merged(
-            {
-                "seed": seed,
-                "fem": {"gestures": (_GESTURES[kind],)},
-                "render": {"size": size, "spp": 16},
-                "anatomy": {"vertices": 20_000},
-            },
-            settings,
-        )
-    )
+    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000}
+    job = changed(Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],)} | settings)
     rest = at_rest(job)
     case = rest.scenario
     appearance = replace(
@@ -106,14 +95,6 @@ def _seed_of(kind: Kind, gesture: str) -> int:
     """The first rim seed for which a gesture uses that instrument."""
     taken = (instrument.choose([gesture], np.random.default_rng([seed, 2])) for seed in itertools.count())
     return next(seed for seed, kinds in enumerate(taken) if kinds == (kind,))
-
-
-def _merged(*parts: Settings) -> Settings:
-    """Merged sections of a job; later ones override earlier ones."""
-    whole: Settings = {}
-    for name, value in itertools.chain.from_iterable(part.items() for part in parts):
-        whole[name] = {**whole.get(name, {}), **value} if isinstance(value, dict) else value
-    return whole
 
 
 STUDY = Study(measure)

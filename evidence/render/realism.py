@@ -18,7 +18,8 @@ from synth.job.schema import Job
 # A highlight is lighter than its surroundings by this much, and nearly white.
 _BRIGHTER_L = 12.0
 _WHITE_L = 88.0
-_SIDE, _STEP = 160, 40
+_SIDE, _STEP = 160, 40  # px, of crops
+_POOLED = 4000  # pixels of the photograph that histograms are compared with
 OUTLINE = (
     "0.2,0.56 0.29,0.31 0.39,0.19 0.52,0.16 0.6,0.29 0.67,0.42 0.71,0.6 0.67,0.73 0.6,0.86 0.47,0.91"
     " 0.37,0.86 0.28,0.76"
@@ -51,12 +52,6 @@ def distances(rgb: Pixels, pooled: Pixels) -> dict[str, float]:
     return {f"{name} histogram": float(wasserstein_distance(*both)) for name, *both in pairs}
 
 
-def pool(crops: list[Pixels], count: int = 4000) -> Pixels:
-    """Pixels (count, 3) at equal distances over crops."""
-    pixels = np.concatenate([crop.reshape(-1, 3) for crop in crops])
-    return pixels[np.linspace(0, len(pixels) - 1, count).astype(np.int64)]
-
-
 def spread(crops: list[Pixels], pooled: Pixels) -> dict[str, tuple[float, float, float]]:
     """Smallest, median and largest of each statistic over crops; histograms against those of `pooled`."""
     rows = [statistics(crop) | distances(crop, pooled) for crop in crops]
@@ -66,13 +61,13 @@ def spread(crops: list[Pixels], pooled: Pixels) -> dict[str, tuple[float, float,
     }
 
 
-def tiles(rgb: Pixels, inside: Mask, side: int, step: int) -> list[Pixels]:
-    """Square crops of `side` px wholly inside a mask, every `step` px."""
-    return [rgb[y : y + side, x : x + side] for x, y in corners(inside, side, step)]
+def tiles(rgb: Pixels, inside: Mask) -> list[Pixels]:
+    """Square crops of 160 px wholly inside a mask, every 40 px."""
+    return [rgb[y : y + _SIDE, x : x + _SIDE] for x, y in corners(inside, _SIDE, _STEP)]
 
 
 def corners(inside: Mask, side: int, step: int) -> list[tuple[int, int]]:
-    """Upper left corners (x, y) of the crops of `tiles`."""
+    """Upper left corners (x, y) of square crops of `side` px wholly inside a mask, every `step` px."""
     summed = cv2.integral(inside.astype(np.uint8))
     covered = summed[side:, side:] - summed[:-side, side:] - summed[side:, :-side] + summed[:-side, :-side]
     return [(int(x * step), int(y * step)) for y, x in np.argwhere(covered[::step, ::step] == side * side)]
@@ -133,8 +128,9 @@ def measure(
     crops, pixel = _rendered(frames, family, seed)
     photograph = scaled_photograph(photo, width_mm / pixel)
     inside = outlined(outline, photograph.shape[:2])
-    reference = tiles(photograph, inside, _SIDE, _STEP)
-    pooled = pool(reference)
+    reference = tiles(photograph, inside)
+    pixels = np.concatenate([crop.reshape(-1, 3) for crop in reference])
+    pooled = pixels[np.linspace(0, len(pixels) - 1, _POOLED).astype(np.int64)]  # at equal distances
     theirs, ours = spread(reference, pooled), spread(crops, pooled)
     rows = [
         {
@@ -162,7 +158,7 @@ def _rendered(frames: int, family: str, seed: int) -> tuple[list[Pixels], float]
     crops, pixels = [], []
     for index in range(frames):
         picture, inside, mm_per_px = bare_picture(job, index)
-        crops += tiles(picture, inside, _SIDE, _STEP)
+        crops += tiles(picture, inside)
         pixels.append(mm_per_px)
     return crops, float(np.median(pixels))
 

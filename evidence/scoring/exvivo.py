@@ -11,6 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from bench.recording import writer
@@ -205,9 +206,8 @@ def _course(plan: Plan, rng: np.random.Generator) -> _Course:
 
 def _crept(time_s: Floats, level: Floats) -> Floats:
     """Quasi-linear creep with one time constant (Fung): part of the response has a first-order lag."""
-    late, step = np.zeros_like(level), time_s[1] - time_s[0]
-    for k in range(1, len(level)):
-        late[k] = late[k - 1] + step / _LATE_S * (level[k] - late[k - 1])
+    share = (time_s[1] - time_s[0]) / _LATE_S
+    late = lfilter([share], [1, share - 1], level)
     return np.asarray(np.clip((1 - _LATE) * level + _LATE * late, 0, 1), np.float64)
 
 

@@ -6,6 +6,7 @@ under a membrane, were set on sequences with even numbers; odd ones are reported
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -40,18 +41,15 @@ def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, 
     for cameras, stated in product((1, 2), (False, True)):
         model = Model(find_model(PRETRAINED[cameras]))
         case = {"cameras": cameras, "membrane_stated": stated}
-        found = [_cached(one, case, model, work) for one in Dataset(data) if one.index % 2 == every]
+        found = []
+        for one in (one for one in Dataset(data) if one.index % 2 == every):
+            key = cache.key(one.attrs["content_hash"], case, model.identity)
+            compute = partial(_estimated, one, case, model)
+            found.append(cache.result(work, f"fusion-{one.index}", key, compute))
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [case | _row(tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
     return {"data": status.data(data), "rows": rows}
-
-
-def _cached(sequence: Stored, case: Case, model: Model, work: Path) -> dict[str, Any]:
-    key = cache.key(sequence.attrs["content_hash"], case, model.identity)
-    return dict(
-        cache.result(work, f"fusion-{sequence.index}", key, lambda: _estimated(sequence, case, model))
-    )
 
 
 def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:

@@ -7,7 +7,7 @@ message, and the force is outside the 90% interval. Also the messages on undegra
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -78,8 +78,13 @@ def measure(work: Path, seed: int = 35, only: str = "") -> dict[str, Any]:
             row = {"change": what, "scene": f"{name} {index}", "cameras": cameras}
             rows.append(row | _judged(after, before, cause))
     found: dict[str, Any] = {"seed": seed, "changes": _summary(rows), "undegraded": [], "points": rows}
-    if not only:
-        found["undegraded"] = list(_alarms(work, seed + 1000))
+    for name in () if only else _JOBS:  # recordings that were not tuned on
+        videos, causes = _rendered(work, name, seed + 1000, _CLEAN), Counter[str]()
+        for video in videos:
+            messages = _scored(_written(video, work), 1.0)["messages"]
+            causes.update({one.split(":")[0] for one in messages} or {"none"})
+        line = ", ".join(f"{k}: {n}" for k, n in causes.items())
+        found["undegraded"].append({"scenes": name, "count": len(videos), "messages on": line})
     return found
 
 
@@ -213,17 +218,6 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             }
         )
     return lines
-
-
-def _alarms(work: Path, seed: int) -> Iterator[dict[str, Any]]:
-    """Messages on undegraded recordings, which were not tuned on."""
-    for name in _JOBS:
-        videos, causes = _rendered(work, name, seed, _CLEAN), Counter[str]()
-        for video in videos:
-            messages = _scored(_written(video, work), 1.0)["messages"]
-            causes.update({one.split(":")[0] for one in messages} or {"none"})
-        line = ", ".join(f"{k}: {n}" for k, n in causes.items())
-        yield {"scenes": name, "count": len(videos), "messages on": line}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

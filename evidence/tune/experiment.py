@@ -42,15 +42,18 @@ def measure(
         for budget in map(search.parse_budget, budgets.split(",")):
             tuned = search.tune(measurements, budget, probes, checks)
             others = range(probes + checks, probes + checks + fresh)
-            whole = {"full": tuned.full, "own": tuned.own, "best": tuned.best}
-            again = {
-                kind: measurements.evaluate(one.settings, others)
-                for kind, one in zip(("full", "before", "after"), whole.values(), strict=True)
-            }
+            whole = (
+                ("full", "full", tuned.full),
+                ("own", "before", tuned.own),
+                ("best", "after", tuned.best),
+            )
             changes = dict(differences(tuned.best.settings, tuned.own.settings))
-            described = {kind: _described(one) for kind, one in whole.items()}
-            checked = {kind: _described(one) for kind, one in again.items()}
-            rows.append({"scene": scene, "budget": budget, "changes": changes, **described, "fresh": checked})
+            row: dict[str, Any] = {"scene": scene, "budget": budget, "changes": changes}
+            row |= {name: _described(one) for name, _, one in whole}
+            row["fresh"] = {
+                name: _described(measurements.evaluate(one.settings, others)) for _, name, one in whole
+            }
+            rows.append(row)
     return {"rows": rows}
 
 
@@ -115,8 +118,7 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _mean(values: list[float | None]) -> float:
     """Mean, NaN if a sequence failed."""
-    known = [value for value in values if value is not None]
-    return sum(known) / len(values) if len(known) == len(values) else float("nan")
+    return float(np.mean(np.array(values, float)))
 
 
 def _over(values: list[float | None]) -> str:

@@ -67,9 +67,7 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 def camera_poses(sequence: Sequence) -> Floats:
     """World to camera axes in every frame, (T, 4, 4) mm: as stored, else by the scenario's camera motion.
-
-    Raises UserError if they are not stored and the motion is not one of ours.
-    """
+    Raises UserError if they are not stored and the motion is not one of ours."""
     if "camera" in sequence:
         return np.asarray(sequence["camera"][:])
     at_rest, moves = camera_of(sequence), (sequence.attrs.get("scenario") or {}).get("camera_motion")

@@ -42,12 +42,11 @@ def visible() -> tuple[str, ...]:
 @functools.cache
 def probe() -> Gpu | None:
     """The GPU of this machine; None if there is no driver or device."""
-    cuda, count, parts = _library("libcuda.so.1"), ctypes.c_int(0), []
+    cuda, count, parts = _library("libcuda.so.1"), ctypes.c_int(), list[int]()
     if not cuda or cuda.cuInit(0) or cuda.cuDeviceGetCount(ctypes.byref(count)) or not count.value:
         return None
     for attribute in (_MAJOR, _MINOR):
-        value = ctypes.c_int(0)
-        cuda.cuDeviceGetAttribute(ctypes.byref(value), attribute, 0)
+        cuda.cuDeviceGetAttribute(ctypes.byref(value := ctypes.c_int()), attribute, 0)
         parts.append(value.value)
     return Gpu(count.value, _driver(), (parts[0], parts[1]), _library("libnvoptix.so.1") is not None)
 

@@ -20,7 +20,12 @@ ROWS = [{"law": "<linear>", "error": 0.0123456}, {"law": "stable", "error": None
 
 def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["x", "/some/where.csv", "--cache=/a/b", "-o", "/tmp/o", "--seeds", "3"])
-    report.save(tmp_path, "found.json", {"third": 1 / 3, "rows": ROWS}, Page("Title", {}, [PANEL, CHART]))
+    report.save(
+        tmp_path,
+        "found.json",
+        {"third": 1 / 3, "rows": ROWS},
+        lambda found: Page("Title", found, [PANEL, CHART]),
+    )
     found = json.loads((tmp_path / "found.json").read_text())
     assert list(found) == ["command", "commit", "machine", "cpu_hours", "third", "rows"]
     assert found["command"].endswith("where.csv --cache=b --seeds 3")
