@@ -73,7 +73,7 @@ def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fau
     job = monocular if fault == "recovered_rest" else JOB.model_copy(update={"sequences": 1})
     in_process(job, tmp_path / "out", fake_work.wrong(fault))
     found = next(one for one in verify.verify_dataset(tmp_path / "out").checks if one.name == check)
-    assert not found.good
+    assert found.bad
     assert found.offender.startswith("000000.zarr: ")
     assert found.cpu_s > 0
     # Checks of integrity pass, as the files are as they were written.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from fake_recording import texture
 
+from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
@@ -22,7 +23,7 @@ from synth.video.read import Picture
 
 @pytest.fixture
 def elsewhere() -> Iterator[FlowProcess]:
-    with closing(FlowProcess()) as flow:
+    with closing(FlowProcess(set_threads)) as flow:
         yield flow
 
 
