@@ -312,7 +312,7 @@ def live(
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
     from synth.recording_flow.decode import RecordingFlowSettings
-    from synth.recording_flow.flow_process import open_flow_process
+    from synth.recording_flow.flow import open_flow_process
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
 

@@ -22,10 +22,10 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     """The recording's video; `mm_per_px`: scale of its own pixels."""
     depth: RightVideo | DepthVideo | None = None
     if recording.right:
-        depth = RightVideo(recording.right_frames, lambda size: _rig(recording, size), str(recording.folder))
+        depth = RightVideo(recording.right_frames, lambda size: _rig(recording, size), mm_per_px)
     elif recording.depths:
         depth = DepthVideo(
-            lambda frame, size: _depth(recording, frame, size), lambda size: _K(recording, size)
+            lambda frame, size: _depth(recording, frame, size), lambda size: _K(recording, size), mm_per_px
         )
     return Footage(
         recording.frames,
@@ -34,7 +34,6 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
         recording.masks.read if recording.masks else None,
         recording.meta.rest_frame,
         depth=depth,
-        mm_per_px=mm_per_px,
     )
 
 

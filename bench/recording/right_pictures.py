@@ -57,10 +57,9 @@ class RightPictures:
         camera, left, right = self._video.stereo, frame.rgb, frame.right
         if right is None or not isinstance(camera, RightCamera) or camera.stereo is None:
             return
-        tissue = self._video.rest.tissue
-        masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
+        masked = frame.hidden
         if self._timing is None:
-            self._timing = StereoTiming(camera.stereo, left, right, tissue & ~masked)
+            self._timing = StereoTiming(camera.stereo, left, right, self._video.rest.tissue & ~masked)
         else:
             self._timing.add(left, right, frame.time_s or 0.0)
         # A flat surface may look the same in both cameras, but not in every frame.

@@ -25,8 +25,8 @@ from learn import Predictor
 from learn.inference.shipped import choose_model, find_model
 from learn.training.threads import set_threads
 from synth.errors import UserError, as_path
-from synth.recording_flow import flow_process
 from synth.recording_flow.decode import RecordingFlowSettings
+from synth.recording_flow.flow import open_flow_process
 from synth.system import checked_file
 from synth.system.terminal import counting
 
@@ -82,7 +82,7 @@ def score(
         flow = None
         if own_process and (frames or _LONG) >= _LONG:
             # The process takes seconds to start, during which the baselines are fitted.
-            flow = stack.enter_context(flow_process.open_flow_process(set_threads))
+            flow = stack.enter_context(open_flow_process(set_threads))
         chosen = _choose_methods(model, methods or {}, recording.has_stereo, baselines, train)
         scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
         used, about = settings or Settings(), _describe(chosen)

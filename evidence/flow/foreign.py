@@ -70,9 +70,8 @@ def _follow(shown: Sequence[Frame], masks: str) -> tuple[Array, ...]:
     rows = []
     for one, found in zip(shown, flow.frames(), strict=True):
         if not found.is_rest:
-            blocked = np.zeros_like(one.free) if found.masked is None else found.masked
-            error, covered = _mean(epe(found.flow, one.flow), one.visible), _mean(1.0 * blocked, one.free)
-            rows.append((error, found.trusted, covered))
+            error = _mean(epe(found.flow, one.flow), one.visible)
+            rows.append((error, found.trusted, _mean(1.0 * found.hidden, one.free)))
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 

@@ -1,4 +1,4 @@
-"""First stage of a video: its frames from the rest frame on, those to be tracked, downsampled."""
+"""The first stage of a video: its frames from the rest frame on, those to be tracked, downsampled."""
 
 from __future__ import annotations
 
@@ -64,7 +64,6 @@ class Footage:
     rest_frame: int = 0
     only: Container[int] | None = None  # numbers of the frames to track, with the rest frame; None: all
     depth: RightVideo | DepthVideo | None = None  # right camera or depth camera, if any
-    mm_per_px: float = 1.0  # scale of its pixels, with a right or depth camera
 
 
 class Decoder:

@@ -1,4 +1,4 @@
-"""Last stage of a video: pulsation of the tissue, found in a first pass and subtracted in a second."""
+"""The last stage of a video: pulsation of the tissue, found in a first pass and subtracted in a second."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class GatherMotion:
     """Gathers the motion of the tissue in a first pass, in which pulsation is then searched."""
 
     def __init__(self, rest: RestFrame, mm_per_px: float) -> None:
-        """`mm_per_px`: of the flow's pixels, which motion in three dimensions is converted with."""
+        """`mm_per_px`: of the flow's pixels, for motion in three dimensions; without it not used."""
         self._rest, self._mm_per_px = rest, np.float32(mm_per_px)
         self._surface = SurfaceMotion(rest.tissue)
         self._depth_weights: list[float] = []

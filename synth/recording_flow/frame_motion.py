@@ -56,6 +56,11 @@ class FrameMotion:
     masking_s: float = 0.0  # wall time of downsampling, masking and the estimate of camera motion
     peak_bytes: int = 0  # memory of the flow process, if there is one
 
+    @property
+    def hidden(self) -> Mask:
+        """(h, w) mask of the picture, also if it is empty."""
+        return np.zeros(self.confidence.shape, bool) if self.masked is None else self.masked
+
 
 @dataclass(eq=False)
 class TrackingSummary:

@@ -1,4 +1,4 @@
-"""Second stage of a video: mask proposals for instruments and highlights of each frame."""
+"""A stage of a video: mask proposals for instruments and highlights of each frame."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.picture_faults import find_fault
 from synth.video.read import shrink_mask
 
+_WITHOUT_GLARE, _WITHOUT_TOOL = ("none", "tool"), ("none", "glare")  # of `MASKS`
+
 
 class ProposeMasks:
     """Proposes masks, from pictures or from given masks; flow selects among them."""
@@ -28,17 +30,16 @@ class ProposeMasks:
         return replace(frame, proposal=self._propose(frame), trusted=trusted)
 
     def _propose(self, frame: FrameMotion) -> Proposal:
-        rgb, nothing = frame.rgb, np.zeros(frame.rgb.shape[:2], bool)
-        glare = nothing if self._kind in ("none", "tool") else mask_detection.glare(rgb)
-        tool = known = nothing
-        if self._kind not in ("none", "glare"):
-            if self._tool is None:
-                tool = mask_detection.tool(rgb)
-            elif (given := self._tool(frame.index, self._rest.size)) is not None:
-                known = shrink_mask(given, self._rest.shrink, 0)
-                if frame.camera is not None:
-                    known = frame.camera.undo(known.astype(np.uint8) * 255) > 127
+        known = nothing = np.zeros(frame.rgb.shape[:2], bool)
+        glare, tool = _glare(frame.rgb, self._kind), nothing
+        if self._tool is None:
+            tool = _tool(frame.rgb, self._kind)
+        elif self._kind not in _WITHOUT_TOOL:
+            given = self._tool(frame.index, self._rest.size)
+            known = nothing if given is None else shrink_mask(given, self._rest.shrink, 0)
         if frame.camera is not None:
+            if known.any():
+                known = frame.camera.undo(known.astype(np.uint8) * 255) > 127
             known = known | frame.camera.outside(known.shape)
         if self._kind == "auto":
             return Proposal(glare, tool, known)
@@ -50,8 +51,16 @@ def mask_right(rgb: Pixels, kind: str, left: Mask) -> Mask:
 
     `kind`: one of `MASKS`; with `auto` nothing is masked unless something is masked in the left picture.
     """
-    nothing = np.zeros(rgb.shape[:2], bool)
-    if kind == "none" or (kind == "auto" and not left.any()):
-        return nothing
-    glare = nothing if kind == "tool" else mask_detection.glare(rgb)
-    return glare if kind == "glare" else glare | mask_detection.tool(rgb)
+    if kind == "auto" and not left.any():
+        return np.zeros(rgb.shape[:2], bool)
+    return _glare(rgb, kind) | _tool(rgb, kind)
+
+
+def _glare(rgb: Pixels, kind: str) -> Mask:
+    """Highlights (H, W), empty if the `kind` of masks has none."""
+    return np.zeros(rgb.shape[:2], bool) if kind in _WITHOUT_GLARE else mask_detection.glare(rgb)
+
+
+def _tool(rgb: Pixels, kind: str) -> Mask:
+    """Instruments (H, W), empty if the `kind` of masks has none."""
+    return np.zeros(rgb.shape[:2], bool) if kind in _WITHOUT_TOOL else mask_detection.tool(rgb)

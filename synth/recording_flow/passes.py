@@ -33,7 +33,7 @@ from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.mask import ProposeMasks
 from synth.recording_flow.pulse import PulseEstimate, PulseSearch
 from synth.recording_flow.register_camera import RegisterCamera, RegisterOnTissue
-from synth.recording_flow.stereo import open_camera
+from synth.recording_flow.stereo import DepthCamera, RightCamera, RightVideo
 from synth.system.stopwatch import Stopwatch
 from synth.video.read import Picture
 
@@ -127,16 +127,18 @@ class VideoPass:
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
         path, pulse = (None, None) if known is None else (known.camera, known.pulse)
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
-        self.stereo = None if footage.depth is None else open_camera(footage.depth, rest, settings.masks)
-        self._foreground: ForegroundSearch | None = None
-        if pace is None and not rest.fault:
-            self._foreground = ForegroundSearch(rest.tissue, rest.shrink)
-        mm_per_px = footage.mm_per_px * rest.shrink
+        self.stereo: RightCamera | DepthCamera | None = None
+        if isinstance(footage.depth, RightVideo):
+            self.stereo = RightCamera(footage.depth, rest, settings.masks, footage.name)
+        elif footage.depth is not None:
+            self.stereo = DepthCamera(footage.depth, rest)
+        searched = pace is None and not rest.fault
+        self._foreground = ForegroundSearch(rest.tissue, rest.shrink) if searched else None
+        mm_per_px = 1.0 if footage.depth is None else footage.depth.mm_per_px * rest.shrink
         self._gather = GatherMotion(rest, mm_per_px) if settings.pulse and known is None else None
         self._detrend = None if pulse is None else Detrend(pulse, mm_per_px)
-        self._on_tissue: RegisterOnTissue | None = None
-        if self._fills_picture and self._gather is None and known is None:
-            self._on_tissue = RegisterOnTissue(rest)
+        no_second_pass = self._gather is None and known is None
+        self._on_tissue = RegisterOnTissue(rest) if self._fills_picture and no_second_pass else None
 
     @property
     def removed(self) -> PulseEstimate | None:

@@ -1,4 +1,4 @@
-"""Fourth stage of a video: motion in three dimensions, from a right camera or a depth camera."""
+"""A stage of a video: motion in three dimensions, from a right camera or a depth camera."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class RightVideo:
 
     pictures: Callable[[], Iterable[Picture]]  # in order, with the numbers of the left camera's frames
     rig: Callable[[Size], StereoRig]  # of pictures of that size
-    name: str  # for messages
+    mm_per_px: float  # stated scale of the video's pixels
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class DepthVideo:
 
     read: Callable[[FrameMotion, Size], Map | None]  # depth (H, W) mm of a frame, 0: unknown; None: missing
     K: Callable[[Size], Floats]  # (3, 3) of pictures of that size
+    mm_per_px: float  # stated scale of the video's pixels
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,9 @@ class StereoQuality:
 class RightCamera:
     """Motion in three dimensions from a right camera."""
 
-    def __init__(self, source: RightVideo, rest: RestFrame, kind: str) -> None:
-        """Reads nothing yet; `kind`: of masks, one of `MASKS`."""
-        self._source, self._rest, self._kind, self._name = source, rest, kind, source.name
+    def __init__(self, source: RightVideo, rest: RestFrame, kind: str, name: str) -> None:
+        """Reads nothing yet; `kind`: of masks, one of `MASKS`; `name`: of the video, for messages."""
+        self._source, self._rest, self._kind, self._name = source, rest, kind, name
         self._pictures: Iterator[Picture] = iter(source.pictures())
         self.stereo: StereoTracker | None = None  # from the rest frame on
         self._camera: CameraTracker | None = None  # motion of the right camera
@@ -78,7 +79,7 @@ class RightCamera:
         if not frame.trusted or (right := self._right(frame)) is None:
             return _lost(frame)
         tissue = self._rest.tissue
-        masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
+        masked = frame.hidden
         if self.stereo is None or self._camera is None:
             self._pair = frame.rgb, right
             hidden = mask_right(right, self._kind, masked)
@@ -158,7 +159,7 @@ class DepthCamera:
             return _lost(frame)
         tissue, depth = self._rest.tissue, _shrink_depth(large, self._rest.shrink)
         self._last = np.where(depth > 0, depth, np.nan).astype(np.float32)
-        masked = np.zeros_like(tissue) if frame.masked is None else frame.masked
+        masked = frame.hidden
         if self._tracker is None:
             K = smaller_K(self._source.K(self._rest.size), self._rest.shrink)
             self._tracker = DepthTracker(K, depth, masked, tissue)
@@ -170,11 +171,6 @@ class DepthCamera:
     def depth_mm(self) -> Map | None:
         """Depth (h, w) in the last frame, NaN where unknown; None: unknown."""
         return self._last
-
-
-def open_camera(source: RightVideo | DepthVideo, rest: RestFrame, kind: str) -> RightCamera | DepthCamera:
-    """The stage for a video with this rest frame; `kind`: of masks, which depth does not need."""
-    return RightCamera(source, rest, kind) if isinstance(source, RightVideo) else DepthCamera(source, rest)
 
 
 def smaller_K(K: Floats, shrink: int) -> Floats:

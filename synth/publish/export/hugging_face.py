@@ -75,14 +75,16 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
     each = [_plain(column.name, str(column.type).replace("double", "float64")) for column in about]
     each += [*(_field(first, name) for name in frameless), _plain("attributes", "string")]
+    # Of the sequences that are written: the stored index may be missing, or older.
+    rows = [index.row_of(one) for one in dataset]
     for side, positions in sides.items():
-        _write(
-            target / "frames", side, frames, (row for k in positions for row in _frames(dataset[k], framed))
-        )
+        shown = (row for k in positions for row in _frames(dataset[k], framed))
+        _write(target / "frames", side, frames, shown)
         names = [column.name for column in about]
-        _write(target / "sequences", side, each, (_sequence(dataset[k], frameless, names) for k in positions))
-    # Of the sequences that were written: the index may be missing, or older.
-    rows = [{**index.row_of(dataset[k]), "split": side} for side, found in sides.items() for k in found]
+        whole = (_sequence(dataset[k], {name: rows[k][name] for name in names}, frameless) for k in positions)
+        _write(target / "sequences", side, each, whole)
+        for k in positions:
+            rows[k]["split"] = side
     text = card.template("export/hugging_face.md.jinja").render(
         **card.facts(Folder(dataset.root), rows),
         sides=list(sides),
@@ -126,10 +128,9 @@ def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
         yield {"sequence": sequence.index, "frame": t, **cells}
 
 
-def _sequence(sequence: Sequence, frameless: list[str], columns: list[str]) -> dict[str, Any]:
-    row = index.row_of(sequence)
+def _sequence(sequence: Sequence, row: dict[str, Any], frameless: list[str]) -> dict[str, Any]:
     cells = {name: _cell(name, sequence[name][:]) for name in frameless}
-    return {**{name: row[name] for name in columns}, **cells, "attributes": json.dumps(sequence.attrs)}
+    return {**row, **cells, "attributes": json.dumps(sequence.attrs)}
 
 
 def _cell(name: str, values: Array) -> Any:

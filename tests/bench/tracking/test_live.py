@@ -23,8 +23,7 @@ from learn.training.threads import set_threads
 from synth.arrays import Pixels
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.flow_process import FlowProcess
+from synth.recording_flow.flow import FlowProcess, LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture, read_video

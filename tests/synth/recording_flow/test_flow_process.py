@@ -16,7 +16,7 @@ from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.flow_process import FlowProcess
+from synth.recording_flow.flow import FlowProcess
 from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
 
@@ -51,7 +51,7 @@ def test_errors_and_the_end_of_the_process_are_reported(elsewhere: FlowProcess) 
 @pytest.mark.slow
 def test_the_process_ends_when_its_parent_is_killed() -> None:
     script = (
-        "import os, time; from synth.recording_flow.flow_process import FlowProcess; flow = FlowProcess(int);"
+        "import os, time; from synth.recording_flow.flow import FlowProcess; flow = FlowProcess(int);"
         "print(flow._pool.submit(os.getpid).result(), flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
