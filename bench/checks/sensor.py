@@ -46,7 +46,7 @@ def check_samples(recording: Recording) -> list[Finding]:
     t, most = force.time_s, float(np.nanmax(np.linalg.norm(force.force_mn, axis=1)))
     rate = (len(t) - 1) / (t[-1] - t[0])
     found = [Finding("ok", "sensor", f"{len(t)} samples at {rate:.4g} Hz, up to {most:.3g} mN")]
-    if most > _SURGICAL_MN and recording.meta.tissue == "brain":
+    if most > _SURGICAL_MN and recording.meta.tissue != "phantom":
         message = f"{most / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
         found.append(Finding("warning", "sensor", message))
     if not recording.meta.sensor.free_s:

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import ndtri, softmax
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Ints
 
 _DRAWS = 400  # by hand: 20 draws lie below a quantile of 0.05
 _SURELY = 6.25  # 90% quantile of chi-squared with 3 degrees of freedom; below it 0 is in the interval
@@ -23,6 +23,7 @@ class ForceMixture:
     force: Floats  # (M, 3), mN or, over E, mN/kPa
     covariance: Floats  # (M, 3, 3)
     common: float = 0.0  # relative standard deviation common to all components, not in `covariance`
+    world: Ints | None = None  # (M,) assumption on the tissue of each component; None: the same
 
     @property
     def mean(self) -> Floats:
@@ -32,6 +33,12 @@ class ForceMixture:
     def times(self, factor: float) -> ForceMixture:
         """The distribution of forces `factor` times as large."""
         return replace(self, force=factor * self.force, covariance=factor**2 * self.covariance)
+
+    def within(self, world: int) -> ForceMixture:
+        """The distribution under one assumption on the tissue."""
+        of = self.world == world
+        weight = np.maximum(self.weight[of], 1e-300)
+        return ForceMixture(weight / weight.sum(), self.force[of], self.covariance[of], self.common)
 
     def with_gain(self, gain: float) -> ForceMixture:
         """The distribution with a further relative standard deviation `gain` of every force."""
@@ -54,22 +61,29 @@ class ForceMixture:
         )
 
 
-def mix(parts: Sequence[ForceMixture], weight: Floats) -> ForceMixture:
-    """The mixture of distributions with weights of sum 1."""
+def mix(parts: Sequence[ForceMixture], weight: Floats, worlds: Sequence[int]) -> ForceMixture:
+    """The mixture of distributions with weights of sum 1, each under an assumption `worlds`."""
     return ForceMixture(
         np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
         np.concatenate([one.force for one in parts]),
         np.concatenate([one.covariance for one in parts]),
+        world=np.repeat(worlds, [len(one.weight) for one in parts]),
     )
 
 
 def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[float, float]:
     """90% interval of the force's magnitude, in its unit, by reproducible draws.
 
-    `gain`: relative standard deviation of all forces, in addition to `found.common`. The interval starts at 0
-    if 0 is in the 90% region; with one camera it then ends at the 98th percentile, because pressing along the
-    optical axis, which hardly shows in the picture, is a small part of the distribution.
+    It holds the interval under each assumption on the tissue, however unlikely: evidence between them is
+    not reliable. `gain`: relative standard deviation of all forces, in addition to `found.common`. An
+    interval starts at 0 if 0 is in the 90% region; with one camera it then ends at the 98th percentile,
+    because pressing along the optical axis, which hardly shows in the picture, is a small part of the
+    distribution.
     """
+    if found.world is not None and len(worlds := np.unique(found.world)) > 1:
+        size = float(np.linalg.norm(found.mean))
+        ends = [size_interval(found.within(one), gain, cameras) for one in worlds]
+        return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
     gain = float(np.hypot(gain, found.common))
     size = float(np.linalg.norm(found.mean))  # may be less than most drawn magnitudes
     weight = found.weight / found.weight.sum()

@@ -1,7 +1,9 @@
 """Fusion of network and physics, each weighted by its stated error.
 
 The estimate of physics is a mixture over contacts and tissues. The network's estimate is a further
-observation of the same force: it shifts each component, and components that contradict it lose weight.
+observation of the same force: it shifts each component, and components that contradict it lose weight. What
+physics can't exclude the network can't exclude either, as it knows no more of the tissue: the interval of
+physics stays in that of the fusion.
 """
 
 from __future__ import annotations
@@ -13,10 +15,12 @@ import numpy as np
 
 from bench.methods.force_mixture import size_interval
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext, widen_small_forces
+from synth.arrays import Floats
 from synth.errors import UserError
 
 # Both are chosen on even sequences of mission-ood; for the odd ones see docs/results/scoring/fusion.
 _COMMON = 0.3  # relative standard deviation of the two methods' common error
+_MOST = 100.0  # largest factor of an interval that fails where the force is known
 _CAUTION = 1.5  # factor of the network's stated deviation: recordings differ from its training data
 
 
@@ -33,13 +37,21 @@ class Fusion:
         raise UserError(f"a fusion of {' and '.join(self.parts)} needs their estimates: score it with them")
 
     def fuse(
-        self, estimates: Sequence[Mapping[str, ForceEstimate]], scene: MethodContext, cameras: int
+        self,
+        estimates: Sequence[Mapping[str, ForceEstimate]],
+        scene: MethodContext,
+        cameras: int,
+        known_mn: Floats | None = None,
     ) -> list[ForceEstimate]:
         """Forces of a video's frames from the estimates by name of all other methods.
 
-        The network's estimate alone where one of the two states no error. `cameras`: 1 monocular, 2 stereo.
+        The network's estimate alone where one of the two states no error. `cameras`: 1 monocular, 2 stereo;
+        `known_mn`: (T,) the force where it is known, in free spans and a separate press, else NaN: a method
+        whose interval fails there loses weight.
         """
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
+        known = np.full(len(estimates), np.nan) if known_mn is None else known_mn
+        cautions = [_widening([frame[name] for frame in estimates], known) for name in self.parts]
         found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in estimates:
             network, physics = (frame[name] for name in self.parts)
@@ -47,12 +59,15 @@ class Fusion:
                 found.append(replace(network, likely=None))
                 self._alone += 1
                 continue
-            spread = _CAUTION**2 * network.likely.covariance[0]
-            both = physics.likely.observe(network.likely.mean, spread)
-            found.append(ForceEstimate(both.mean, None, *size_interval(both, gain, cameras)))
+            spread = (_CAUTION * cautions[0]) ** 2 * network.likely.covariance[0]
+            prior = replace(physics.likely, covariance=cautions[1] ** 2 * physics.likely.covariance)
+            both = prior.observe(network.likely.mean, spread)
+            low, high = size_interval(both, gain, cameras)
+            low, high = min(low, physics.low_mn), max(high, physics.high_mn)
+            found.append(ForceEstimate(both.mean, None, low, high))
             off = network.force_mn - physics.force_mn
             pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
-        self._share = pulled / apart if apart else 0.0
+        self._share = float(np.clip(pulled / apart, 0, 1)) if apart else 0.0
         return widen_small_forces(found)
 
     @property
@@ -62,3 +77,13 @@ class Fusion:
         if self._alone:
             return [f"{self._alone} frames use {network} alone: one of the two methods states no error"]
         return [f"weights where they differ: {network} {self._share:.0%}, {physics} {1 - self._share:.0%}"]
+
+
+def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:
+    """Factor of at least 1 by which a method's 90% intervals hold 90% of the known forces (T,) [mN]."""
+    needed = []
+    for one, true in zip(estimates, known_mn, strict=True):
+        side = one.high_mn - one.size_mn if true > one.size_mn else one.size_mn - one.low_mn
+        if np.isfinite(true) and np.isfinite(side):
+            needed.append(abs(true - one.size_mn) / max(side, 1e-9))
+    return float(np.clip(np.quantile(needed, 0.9), 1, _MOST)) if needed else 1.0

@@ -37,11 +37,17 @@ class TissueConstants:
     thin_mm: float = 5.0  # on another mesh bare tissue is taken for a membrane of up to this (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
+    cut: float = (
+        0.25  # share of the tissue's outline on the picture's border, from which the edge is not known
+    )
     wide: float = 1.2  # radius of the visible tissue, in openings, above which no skull edge is assumed
     temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
     strongest: int = 8  # frames that weight the tissues, every third
     stronger: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
-    least: float = 0.05  # weight from which a second tissue is used
+    living_mm: float = 0.4  # own motion of living tissue, half of 0.8 mm peak to peak (Faria 2014)
+    quiet: float = 0.2  # least share of the frames that shows the tissue's own motion
+    unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
+    breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
     stiffness: float = 0.5
     """The same from a membrane's stiffness; from even sequences of mission-ood (evidence.scoring.fusion)."""
@@ -57,6 +63,7 @@ class TissueWeights:
     tissues: tuple[TissueKind, ...]
     weight: Floats  # of each tissue, with sum 1
     own_mm: Floats  # (C,) size of the tissue's own motion
+    assumed: bool  # whether that is a bound on what is not known, so that it may be 0
     membrane: float  # probability of a membrane that is not thin, over all candidate tissues
 
 
@@ -73,7 +80,8 @@ class Physics:
         self._contact_free = 0
         self._weighed_mm = 0.0  # motion at the last weighting
         first, still = candidate_tissues(scene)[:1], np.zeros(components)
-        self._weights = TissueWeights(first, np.ones(1), still, TISSUES.intact)
+        self._times = list[float]()
+        self._weights = TissueWeights(first, np.ones(1), still, False, TISSUES.intact)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
@@ -88,6 +96,7 @@ class Physics:
         moved, spread = (self._view.mean(field.transpose(2, 0, 1)) for field in (moved, spread))
         observed = observe(moved, spread, self._view.mask)
         self._frames.append(observed)
+        self._times.append(frame.time_s or 0.0)
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
         if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
@@ -98,10 +107,15 @@ class Physics:
     def revise(self, contact_free: Mask) -> list[ForceEstimate]:
         """See `Revising`."""
         assert self._scene is not None
-        own = [one for one, free in zip(self._frames, contact_free, strict=True) if free and one.size_mm > 0]
-        components = len(self._frames[0].moved)
-        basis = posterior.load_basis(components, candidate_tissues(self._scene)[0])
-        self._weights = weigh_tissues(self._scene, self._frames, posterior.own_motion(basis, own))
+        basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
+        if contact_free.any() or not self._scene.living:
+            own_mm = posterior.own_motion(basis, [self._frames[k] for k in np.flatnonzero(contact_free)])
+        else:
+            quiet, factor = quietest_frames(np.array(self._times), self._frames)
+            own_mm = factor * posterior.own_motion(basis, [self._frames[k] for k in quiet])
+            own_mm = np.minimum(own_mm, TISSUES.living_mm)
+        assumed = not contact_free.any() and bool(own_mm.any())
+        self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(one, False) for one in self._frames])
 
@@ -115,7 +129,7 @@ class Physics:
         if not self._contact_free:
             own = (
                 "no span without contact is given on the video's clock (sensor.free_s, or pulse.free_s where "
-                "clocks are found by correlation): the tissue's own motion is attributed to loads"
+                f"clocks are found by correlation): {'by its quietest frames, ' * self._scene.living}{own}"
             )
         return [describe(self._weights, self._scene), own]
 
@@ -144,6 +158,23 @@ class Physics:
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
+def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
+    """The frames in which the tissue moves least, and the factor from its motion there to that at any time.
+
+    Motion a (1 - cos 2 pi f t) since it turned is below a (1 - cos pi q) in a share q of each period: a
+    large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
+    """
+    size = np.array([one.signal_mm**2 for one in frames])
+    order = np.argsort(size, kind="stable")
+    count = np.arange(1, len(frames) + 1)
+    share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
+    factor = 1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6)
+    moved = factor * np.sqrt(size[order] + posterior.MODEL.least_mm**2)
+    moved[share < TISSUES.quiet * share[-1]] = np.inf  # the least of many would be too little
+    best = int(moved.argmin())
+    return [int(k) for k in order[best // 2 : best + 1]], float(factor[best])
+
+
 def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     """The tissues that agree with meta.yaml, each with the most likely Poisson's ratio in its range."""
     radius = np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
@@ -152,12 +183,22 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     every = TISSUES.membranes_mm
     stiff = {"stripped": every[:1], "intact": every[1:], "unknown": every}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
+    if "free" not in edges and border_share(scene.tissue) > TISSUES.cut:
+        edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
         TissueKind(edge, one, middle, stretch)
         for edge in edges
         for one in stiff
         for stretch in (TISSUES.stretches if one else TISSUES.stretches[:1])
     )
+
+
+def border_share(tissue: Mask) -> float:
+    """Share of the outline of a tissue mask (H, W) that lies on the border of the picture."""
+    inside = np.pad(tissue, 1)
+    outline = sum(int((inside != np.roll(inside, 1, axis)).sum()) for axis in (0, 1))
+    sides = tissue[0], tissue[-1], tissue[:, 0], tissue[:, -1]
+    return sum(int(side.sum()) for side in sides) / max(outline, 1)
 
 
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
@@ -167,7 +208,9 @@ def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
     return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
-def weigh_tissues(scene: MethodContext, frames: Sequence[Observation], own_mm: Floats) -> TissueWeights:
+def weigh_tissues(
+    scene: MethodContext, frames: Sequence[Observation], own_mm: Floats, assumed: bool = False
+) -> TissueWeights:
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
     strongest = sorted(frames, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
     strongest = [one for one in strongest if one.size_mm > 0]
@@ -189,22 +232,30 @@ def weigh_tissues(scene: MethodContext, frames: Sequence[Observation], own_mm: F
     for nu in others:
         tissues.append(replace(tissues[best], poisson=nu))
         score.append(score[best] + evidence(tissues[-1]) - first)
-    weight = softmax(score)
-    used = np.argsort(-weight)[: max(1, min(2, int((weight > TISSUES.least).sum())))]
+    weight = np.maximum(softmax(score), TISSUES.unlikely)
+    # The most likely tissue with and without a membrane, and with each Poisson's ratio, however unlikely.
+    kinds = [(one.membrane > 0, one.poisson == tissues[best].poisson or one.poisson) for one in tissues]
+    used = [
+        int(max(np.flatnonzero([k == kind for k in kinds]), key=lambda k: weight[k]))
+        for kind in dict.fromkeys(kinds)
+    ]
+    used = sorted(used, key=lambda k: -weight[k])
     covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])
-    return TissueWeights(tuple(tissues[k] for k in used), weight[used] / weight[used].sum(), own_mm, covered)
+    weight = weight[used] / weight[used].sum()
+    return TissueWeights(tuple(tissues[k] for k in used), weight, own_mm, assumed, covered)
 
 
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     """The posterior of a frame's loads, as a mixture over tissues."""
     components, weight = len(weights.own_mm), weights.weight
-    found = [
-        posterior.infer(posterior.load_basis(components, one), frame, weights.own_mm)
-        for one in weights.tissues
-    ]
+    worlds = [(one, weights.own_mm) for one in weights.tissues]
+    if weights.assumed:
+        worlds.append((weights.tissues[0], 0 * weights.own_mm))
+        weight = np.append(weight, TISSUES.unlikely)
+    found = [posterior.infer(posterior.load_basis(components, one), frame, own) for one, own in worlds]
     return Posterior(
         float(weight @ [one.evidence for one in found]),
-        mix([one.force for one in found], weight),
+        mix([one.force for one in found], weight, range(len(found))),
         sum((share * one.load for share, one in zip(weight, found, strict=True)), np.zeros(())),
     )
 

@@ -31,6 +31,8 @@ class MethodContext:
     """Range of the tissue's Poisson's ratio."""
     young_uncertainty: float = 0.0
     """Relative standard uncertainty of `young_kpa`."""
+    living: bool = True
+    """Whether the tissue may move by heart and breath; False: ex vivo, or a phantom."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""
@@ -59,13 +61,17 @@ class ForceEstimate:
 
 
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
-    """Extends the intervals of a video's small forces, below a share of its largest force, down to 0.
+    """Extends the intervals of a video's small forces, below a share of its largest force, to 0 and that share.
 
-    Tissue creeps: after a press it still moves without a force. The share, a twentieth, is set by hand;
-    docs/results/learn/foreign has the coverage on videos of other simulators and renderers.
+    Tissue creeps: after a press it still moves without a force; and a slight touch moves it less than flow
+    resolves. The share, a twentieth, is set by hand; docs/results/learn/foreign has the coverage on videos of
+    other simulators and renderers.
     """
-    largest = max((one.size_mn for one in estimates), default=0.0)
-    return [replace(one, low_mn=0.0) if one.size_mn < share * largest else one for one in estimates]
+    least = share * max((one.size_mn for one in estimates), default=0.0)
+    return [
+        replace(one, low_mn=0.0, high_mn=max(one.high_mn, least)) if one.size_mn < least else one
+        for one in estimates
+    ]
 
 
 class Method(Protocol):

@@ -298,7 +298,7 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
         notes.append(f"{path.name}: {np.sum(~usable)} rows with a missing force are not scored")
         newtons[~usable] = np.nan
     largest = float(np.nanmax(np.abs(newtons)))
-    if largest > _LARGEST_FORCE_N and about.tissue == "brain":
+    if largest > _LARGEST_FORCE_N and about.tissue != "phantom":
         raise UserError(
             f"{path}: force reaches {largest:.4g} N, too much for a brain; are the columns in mN? "
             "(for a phantom: --phantom, or tissue: phantom in meta.yaml)"

@@ -187,8 +187,9 @@ class Meta(Section):
     """Number of a frame with the tissue unloaded; displacement is measured from it."""
     press_s: Span | None = None
     """Span of video time with a separate press for calibrating the gain [s]; it is not scored."""
-    tissue: Literal["brain", "phantom"] = "brain"
-    """`phantom`: larger forces than those a brain withstands are accepted."""
+    tissue: Literal["brain", "ex-vivo", "phantom"] = "brain"
+    """`brain`: it may pulsate, by up to 0.8 mm, unless the video shows otherwise. `ex-vivo`: it does not.
+    `phantom`: nor does it, and larger forces than those a brain withstands are accepted."""
     specimen: str = ""
     """Name of the specimen; recordings of the same specimen are not treated as independent."""
     stereo: Stereo | None = None
@@ -198,6 +199,11 @@ class Meta(Section):
     sensor: SensorMeta = SensorMeta()
     sync: Sync = Sync()
     pulse: PulseMeta = PulseMeta()
+
+    @property
+    def may_pulsate(self) -> bool:
+        """Whether heart and breath may move the tissue."""
+        return self.tissue == "brain"
 
     @model_validator(mode="after")
     def _scale_is_known(self) -> Meta:

@@ -14,8 +14,8 @@ from bench.methods.fusion import Fusion
 from bench.methods.protocol import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
-from bench.recording.meta import Meta
 from bench.recording.right_pictures import RightPictures, StereoQuality
+from bench.sensor.alignment import align_sensor
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.recording_flow.decode import RecordingFlowSettings
@@ -107,7 +107,7 @@ def track_recording(
     footage, free_s = replace(as_footage(recording, scale_mm_per_px), only=only), about.pulse.free_s
     for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
         mm_per_px = scale_mm_per_px * video.rest.shrink
-        known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty
+        known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
         scene = MethodContext(video.rest.tissue, mm_per_px, *known)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
@@ -120,7 +120,7 @@ def track_recording(
                     turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    forces.finish(about)  # of the last pass
+    forces.finish(recording)  # of the last pass
     forces.out.stereo, forces.out.turning = pictures.quality, turning if turning.time_s else None
     _describe(forces.out, video, recording, methods, mm_per_px)
     forces.out.timings |= watch.report()  # of all passes
@@ -203,8 +203,9 @@ class _Forces:
         if wanted:
             self._snap(position, frame, density)
 
-    def finish(self, about: Meta) -> None:
+    def finish(self, recording: Recording) -> None:
         """Computes results that need all frames, with contact-free spans on the clock of the video."""
+        about = recording.meta
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times = np.array(self.out.time_s)
@@ -215,11 +216,17 @@ class _Forces:
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate
-        tracked = [frame for frame, known in zip(self.estimates, self.out.trusted, strict=True) if known]
+        trusted = np.array(self.out.trusted, bool)
+        tracked = [self.estimates[k] for k in np.flatnonzero(trusted)]
+        known_mn = np.where(contact_free, 0.0, np.nan)
+        if about.press_s is not None and about.young_kpa is not None:
+            pressed = align_sensor(recording, times, np.where(trusted, self.out.speed, np.nan), None).size_mn
+            inside = (times >= about.press_s[0]) & (times <= about.press_s[1])
+            known_mn = known_mn if pressed is None else np.where(inside, pressed, known_mn)
         for name, method in self.methods.items():
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
-                    fused = method.fuse(tracked, self.scene, self.cameras)
+                    fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate
                 for frame in self.estimates:
