@@ -61,7 +61,7 @@ class ForceEstimate:
 
 
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
-    """Extends the intervals of a video's small forces, below a share of its largest force, to 0 and that share.
+    """Extends the intervals of a video's small forces, below a share of its largest one, to 0 and that share.
 
     Tissue creeps: after a press it still moves without a force; and a slight touch moves it less than flow
     resolves. The share, a twentieth, is set by hand; docs/results/learn/foreign has the coverage on videos of
