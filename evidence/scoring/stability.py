@@ -1,7 +1,9 @@
-"""Recordings degraded in one way at a time: the error of the force, and whether a message names the cause.
+"""Recordings degraded in one way at a time, scored by the default command: what leads, and what is said.
 
-Silently wrong: the error, of the peak or over time, more than doubled and above a tenth of the peak, no new
-message, and the force is outside the 90% interval. Also the messages on undegraded recordings.
+Each way is applied to plain tissue, to tissue with a membrane and to pulsating tissue; with two cameras and
+with one; described (tissue, instruments and contact-free span stated) and bare (scale and E only). Silently
+wrong: the force errs by more than a tenth of the peak, its 90% interval holds under 80% of the frames in or
+out of contact, and there is no finding. Also the findings on undegraded recordings.
 """
 
 import re
@@ -11,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from bench.methods.comparison import PHYSICS
-from bench.methods.physics import Physics
 from bench.recording import writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
@@ -35,13 +36,21 @@ from synth.dataset.store import Dataset, Sequence
 from synth.engine.run import render_job
 from synth.errors import UserError
 from synth.job import reader
+from synth.job.schema import FemSection
 
-_JOBS = {"opening": "mission", "edge to edge": str(Path(__file__).parents[1] / "curves/mission-bench.yaml")}
-_SCENES = (("opening", 1), ("edge to edge", 0))
-_CLEAN = 8  # undegraded recordings of each kind
+_KINDS = {
+    "plain": {"skull": ("bonded",), "membrane": {"probability": 0.0}},
+    "membrane": {"skull": ("bonded",), "membrane": {"probability": 1.0}},
+    "pulse": {
+        "skull": ("bonded",),
+        "membrane": {"probability": 0.0},
+        "pulse": {"heart_mm": (0.1, 0.3), "breath_mm": (0.1, 0.3)},
+    },
+}
+_CASES = tuple((described, cameras) for described in (True, False) for cameras in (2, 1))
+_CLEAN = 4  # undegraded recordings of each kind
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
-_DOUBLED, _LEAST, _COVERED = 2.0, 0.1, 0.8
-_NOTES = "out of distribution|again, frozen"
+_LEAST, _COVERED = 0.1, 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,47 +68,50 @@ class Video:
     codec: tuple[int, str, int] | None = None
     """Quality (crf), pixel format, and pixels' width in thirds of their height; None: PNG."""
     white: int = 255  # value of masked pixels
+    described: bool = True  # whether tissue, instruments and the span without contact are stated
 
 
 Change = Callable[[Video], Video]
 
 
-def measure(work: Path, seed: int = 35, only: str = "") -> dict[str, Any]:
-    """Scores rendered recordings before and after each change; `only`: a pattern of the changes' names."""
-    rows = list[dict[str, Any]]()
-    for name, index in _SCENES:
-        clean = _rendered(work, name, seed, 2)[index]
-        peak = 1000 * float(np.linalg.norm(clean.sensor[:, 1:], axis=1).max())
-        for what in filter(re.compile(only).search, CHANGES):
-            cameras = 1 if what in MONOCULAR else 2
-            video, (change, cause) = clean if cameras == 2 else replace(clean, right=None), CHANGES[what]
-            before = _point(work, video, lambda same: same, peak, name, index, seed, cameras)
-            after = _point(work, video, change, peak, name, index, seed, cameras, what)
-            row = {"change": what, "scene": f"{name} {index}", "cameras": cameras}
-            rows.append(row | _judged(after, before, cause))
-    found: dict[str, Any] = {"seed": seed, "changes": _summary(rows), "undegraded": [], "points": rows}
-    for name in () if only else _JOBS:  # recordings that were not tuned on
-        videos, causes = _rendered(work, name, seed + 1000, _CLEAN), Counter[str]()
-        for video in videos:
-            messages = _scored(_written(video, work), 1.0)["messages"]
-            causes.update({one.split(":")[0] for one in messages} or {"none"})
-        line = ", ".join(f"{k}: {n}" for k, n in causes.items())
-        found["undegraded"].append({"scenes": name, "count": len(videos), "messages on": line})
-    return found
+def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_KINDS)) -> dict[str, Any]:
+    """Scores rendered recordings after each change; `only`: a pattern of the changes' names."""
+    rows, clean = list[dict[str, Any]](), list[dict[str, Any]]()
+    for kind, (described, cameras) in product(kinds.split(","), _CASES):
+        for k, video in enumerate(_rendered(work, kind, seed, _CLEAN)):
+            given = replace(video, described=described, right=video.right if cameras == 2 else None)
+            case = {"kind": kind, "cameras": cameras, "described": described}
+            if not only:  # those that were not tuned on
+                clean.append(case | _point(work, given, lambda same: same, "", kind, seed, k, *case.values()))
+            for what, (change, cause) in CHANGES.items() if k == 0 else ():
+                if re.search(only, what) and (cameras == 2 or what in MONOCULAR):
+                    row = _point(work, given, change, cause, kind, seed, k, *case.values(), what)
+                    rows.append({"change": what, **case, **row})
+    return {"seed": seed, "changes": _summary(rows), "undegraded": _undegraded(clean), "points": rows}
 
 
-def _point(work: Path, video: Video, change: Change, peak_mn: float, *key: Any) -> Any:
-    """Scores of a changed recording, cached in `work`."""
-    return stored.result(
+def _point(work: Path, video: Video, change: Change, cause: str, *key: Any) -> Any:
+    """Scores of a changed recording, cached in `work`; `cause`: pattern of a finding that names it."""
+    peak_mn = 1000 * float(np.linalg.norm(video.sensor[:, 1:], axis=1).max())
+    row = stored.result(
         work / "points", "change", stored.key(*key), lambda: _scored(_written(change(video), work), peak_mn)
     )
+    named = any(re.search(cause, one) for one in row["findings"]) if cause else None
+    return {**row, "named": named, "silently_wrong": _is_silently_wrong(row)}
 
 
-def _rendered(work: Path, name: str, seed: int, count: int) -> list[Video]:
+def _is_silently_wrong(row: dict[str, Any]) -> bool:
+    holds = min((row[key] for key in ("holds", "holds_free") if row[key] is not None), default=1.0)
+    return bool((row["error"] or 0.0) > _LEAST and holds < _COVERED and not row["findings"])
+
+
+def _rendered(work: Path, kind: str, seed: int, count: int) -> list[Video]:
     """Stereo recordings of 24 frames in 3 s."""
-    data = work / f"{name} {seed}"
-    changed = {"seed": seed, "sequences": count, "frames": 24, "fps": 8.0}
-    render_job(reader.load_job(_JOBS[name]).model_copy(update=changed), data, workers=1)
+    data = work / f"{kind} {seed}"
+    job = reader.load_job("mission")
+    changed = {"seed": seed + list(_KINDS).index(kind), "sequences": count, "frames": 24, "fps": 8.0}
+    fem = FemSection.model_validate({**job.fem.model_dump(exclude_unset=True), **_KINDS[kind]})
+    render_job(job.model_copy(update={**changed, "fem": fem}), data, workers=1)
     return [_read(sequence, data.with_name(f"{data.name} {k}")) for k, sequence in enumerate(Dataset(data))]
 
 
@@ -122,7 +134,7 @@ def _read(sequence: Sequence, folder: Path) -> Video:
 
 def _written(video: Video, work: Path) -> Path:
     """Folder of the recording, in place of the previous one."""
-    folder, meta = work / "degraded", dict(video.meta)
+    folder, meta = work / "degraded", {**video.meta, "tissue": "brain"}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     for name, images in (("frames", video.rgb), ("right", video.right)):
@@ -130,11 +142,14 @@ def _written(video: Video, work: Path) -> Path:
             _encode(folder / f"{name.replace('frames', 'video')}.mp4", images, video.codec)
         elif images is not None:
             writer.write_second(folder / name, range(len(images)), images)
-    (folder / "masks").mkdir()
-    for k, tool in enumerate(video.tool):
-        if tool.any():
-            cv2.imwrite(str(folder / f"masks/{k:06d}.png"), tool.astype(np.uint8) * video.white)
-    cv2.imwrite(str(folder / "tissue.png"), video.tissue.astype(np.uint8) * 255)
+    if video.described:
+        (folder / "masks").mkdir()
+        for k, tool in enumerate(video.tool):
+            if tool.any():
+                cv2.imwrite(str(folder / f"masks/{k:06d}.png"), tool.astype(np.uint8) * video.white)
+        cv2.imwrite(str(folder / "tissue.png"), video.tissue.astype(np.uint8) * 255)
+    else:
+        meta["sensor"] = {key: value for key, value in meta["sensor"].items() if key != "free_s"}
     writer.write_force(folder, video.sensor[:, 0], video.sensor[:, 1:])
     writer.write_frames(folder, video.time_s)
     if video.right is None:
@@ -162,80 +177,81 @@ def _model(stereo: bool) -> Any:
 
 
 def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
-    """Errors relative to the undegraded recording's peak, coverage of the interval, and messages."""
-    row: dict[str, Any] = dict.fromkeys(("physics", "error", "over_time", "coverage"))
-    stereo = (folder / "stereo.yaml").exists()
+    """Errors of the leading force, of the peak, share of frames in its interval, and findings."""
+    row: dict[str, Any] = dict.fromkeys(("error", "over_time", "holds", "holds_free"))
     try:
-        result = score(folder, _model(stereo), methods={PHYSICS: Physics()}, baselines=False)
+        result = score(folder, _model((folder / "stereo.yaml").exists()))
     except UserError as error:
-        return {**row, "messages": [str(error).replace(f"{folder}: ", "")]}
-    row["messages"] = [f"{one.cause}: {one.message}" for one in result.findings]
-    row["messages"] += [note for note in result.notes if re.search(_NOTES, note)]
-    sensor, main = np.asarray(result.sensor_mn), result.methods[result.main]
-    for key, method in (("physics", result.methods[PHYSICS]), ("error", main)):
-        found = method.size_mn
-        known = result.scored & np.isfinite(found) & np.isfinite(sensor)
-        if known.sum() > 1:
-            row[key] = abs(float(found[known].max() - sensor[known].max())) / peak_mn
-    if row["error"] is not None:
-        row["over_time"] = float(np.abs(found - sensor)[known].mean()) / peak_mn
-        if main.low_mn is not None and main.high_mn is not None:
-            touched = known & (np.maximum(found, sensor) > _LEAST * peak_mn) & np.isfinite(main.low_mn)
-            inside = (sensor >= main.low_mn) & (sensor <= main.high_mn)
-            row["coverage"] = float(inside[touched].mean()) if touched.any() else None
+        return {**row, "findings": [str(error).replace(f"{folder}: ", "")]}
+    row["findings"] = [f"{one.cause}: {one.message}" for one in result.findings]
+    sensor, main = np.asarray(result.sensor_mn, np.float64), result.methods[result.main]
+    if result.refused or main.low_mn is None or main.high_mn is None:
+        return row
+    known = result.scored & np.isfinite(main.size_mn) & np.isfinite(sensor)
+    if known.sum() > 1:
+        row["error"] = abs(float(main.size_mn[known].max() - sensor[known].max())) / peak_mn
+        row["over_time"] = float(np.abs(main.size_mn - sensor)[known].mean()) / peak_mn
+        inside, touched = (sensor >= main.low_mn) & (sensor <= main.high_mn), sensor > _LEAST * peak_mn
+        for key, of in (("holds", known & touched), ("holds_free", known & ~touched)):
+            row[key] = float(inside[of].mean()) if of.any() else None
     return row
 
 
-def _judged(after: dict[str, Any], before: dict[str, Any], cause: str) -> dict[str, Any]:
-    """Comparison of the scores after and before a change; `cause`: pattern of a message that names it."""
-    known = {re.sub(r"[\d.,]+", "", one) for one in before["messages"]}
-    new = [one for one in after["messages"] if re.sub(r"[\d.,]+", "", one) not in known]
-    worse = any(
-        after[key] is not None and after[key] > max(_DOUBLED * (before[key] or 0.0), _LEAST)
-        for key in ("error", "over_time")
-    )
-    named = any(re.search(cause, one) for one in new) if cause else None
-    row = {"before": before["error"], **after, "messages": new, "worse": worse, "named": named}
-    return {**row, "silently_wrong": worse and (after["coverage"] or 0.0) < _COVERED and not new}
-
-
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line for each change."""
+    """A line for each change: medians over kinds of tissue, and how many of them are named or held back."""
     lines = []
     for (name,), own in report.grouped(rows, "change").items():
-        named = [row["named"] for row in own if row["named"] is not None]
-        messages, cause = (one for row in own for one in row["messages"]), CHANGES[name][1] or "$^"
-        errors = {k: [row[k] for row in own if row[k] is not None] for k in ("before", "error", "physics")}
-        lines.append(
-            {"change": name, "cameras": own[0]["cameras"]}
-            | {key: f"{100 * np.median(e):.0f}%" if e else "none" for key, e in errors.items()}
-            | {
-                "worse": f"{sum(row['worse'] for row in own)} of {len(own)}",
-                "covered": f"{sum((row['coverage'] or 0) >= _COVERED for row in own)} of {len(own)}",
-                "named": f"{sum(named)} of {len(named)}" if named else None,
-                "silently wrong": sum(row["silently_wrong"] for row in own),
-                "message": max(messages, key=lambda one: bool(re.search(cause, one)), default="")[:90],
-            }
-        )
+        line: dict[str, Any] = {"change": name, "silently wrong": sum(row["silently_wrong"] for row in own)}
+        for described, cameras in _CASES:
+            of = [row for row in own if (row["described"], row["cameras"]) == (described, cameras)]
+            if of:
+                line[f"{'described' if described else 'bare'}, {cameras}"] = _cell(of)
+        messages, cause = (one for row in own for one in row["findings"]), CHANGES[name][1] or "$^"
+        line["finding"] = max(messages, key=lambda one: bool(re.search(cause, one)), default="")[:90]
+        lines.append(line)
+    return lines
+
+
+def _cell(rows: list[dict[str, Any]]) -> str:
+    """Error of the peak, least share in the interval, and how often the cause is named, in words."""
+    errors = [row["error"] for row in rows if row["error"] is not None]
+    holds = [row["holds"] for row in rows if row["holds"] is not None]
+    text = (
+        f"{100 * np.median(errors):.0f}%, holds {100 * min(holds):.0f}%" if errors and holds else "held back"
+    )
+    if rows[0]["named"] is None:
+        return text
+    answered = sum(row["named"] or row["error"] is None for row in rows)
+    return f"{text}, named {answered} of {len(rows)}"
+
+
+def _undegraded(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A line for each kind of tissue and case: the same, and the causes of findings."""
+    lines = []
+    for (kind, described, cameras), own in report.grouped(rows, "kind", "described", "cameras").items():
+        causes = Counter(cause for row in own for cause in {one.split(":")[0] for one in row["findings"]})
+        known = ", ".join(f"{cause}: {count}" for cause, count in causes.items()) or "none"
+        case = {"tissue": kind, "stated": "described" if described else "bare", "cameras": cameras}
+        free = [row["holds_free"] for row in own if row["holds_free"] is not None]
+        held = {"holds without contact": f"{100 * min(free):.0f}%" if free else "–"}
+        lines.append({**case, "count": len(own), "error": _cell(own), **held, "findings": known})
     return lines
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Draws `stability.json`: the changes with a larger error, or without a message on the cause."""
+    """Draws `stability.json`."""
     changes = found["changes"]
-    silent = sum(row["silently wrong"] for row in changes)
-    columns = ("change", "cameras", "before", "error", "worse", "covered", "named")
-    shown = [row for row in changes if row["worse"][0] != "0" or row["named"] in ("0 of 2", "1 of 2")]
+    silent = sum(row["silently wrong"] for row in changes) or "None"
     words = [
-        f"**{silent or 'None'} of {len(changes)} degradations moved the force out of its interval without a "
-        f"message.** {len(shown)} increased the error or were not always named (others: in the data).",
-        "Two scenes each, one with tissue from edge to edge. Errors are of the peak force, medians. *Worse*: "
-        "more than doubled and above a tenth of the peak, at the peak or over time. *Covered*: at least 80% "
-        "of frames inside the 90% interval. *Named*: a message names the cause.",
+        f"**{silent} of {len(found['points'])} recordings, degraded in {len(changes)} ways, had a force outside "
+        "its interval without a finding.** Each cell: median error of the peak force, least share of contact "
+        "frames in the 90% interval, for how many kinds of tissue the cause was named or the force held back.",
+        "The force is that of the default command. *Described*: tissue, instruments and the span without "
+        "contact are stated; *bare*: scale and Young's modulus only. 2, 1: cameras.",
     ]
     sections = [
-        report.Section("Degraded recordings", [{key: row[key] for key in columns} for row in shown]),
-        report.Section("Messages on undegraded recordings", found["undegraded"]),
+        report.Section("Degraded recordings", changes),
+        report.Section("Undegraded recordings", found["undegraded"]),
     ]
     return report.Page("Scoring: degraded recordings", found, (), sections, words)
 
@@ -375,6 +391,39 @@ def _rest_at_peak(video: Video) -> Video:
     return replace(video, meta={**video.meta, "rest_frame": int(np.abs(video.time_s - at).argmin())})
 
 
+def _starts_at_peak(tared: bool) -> Change:
+    """The recording from the largest force on; with a sensor that is tared there or not."""
+
+    def change(video: Video) -> Video:
+        peak = int(np.linalg.norm(video.sensor[:, 1:], axis=1).argmax())
+        first = int(np.abs(video.time_s - video.sensor[peak, 0]).argmin())
+        sensor = video.sensor - tared * np.append(0, video.sensor[peak, 1:])
+        left, times = video.sensor[:, 0] >= video.time_s[first], video.time_s[first:]
+        meta = {
+            **video.meta,
+            "sensor": {key: v for key, v in video.meta["sensor"].items() if key != "free_s"},
+        }
+        right = None if video.right is None else video.right[first:]
+        cut = replace(video, rgb=video.rgb[first:], right=right, tool=video.tool[first:], time_s=times)
+        return replace(cut, sensor=sensor[left], meta=meta)
+
+    return change
+
+
+def _refrozen(video: Video) -> Video:
+    """Five frames frozen, with new sensor noise on each copy."""
+    frozen = _order(lambda k: np.where((k > 7) & (k < 13), 8, k))(video)
+    return _each(lambda rgb, k: rgb + _noise(2, k, rgb) * (8 < k < 13))(frozen)
+
+
+def _drifted(video: Video) -> Video:
+    """A camera that drifts by 6 px over the recording."""
+    move = 6 / max(len(video.rgb) - 1, 1)
+    return _each(lambda rgb, k: _warped(rgb, np.array([[1, 0, 0.8 * move * k], [0, 1, 0.6 * move * k]])))(
+        video
+    )
+
+
 def _right(of: Callable[[Video], Any]) -> Change:
     return lambda video: replace(video, right=np.ascontiguousarray(of(video)))
 
@@ -392,6 +441,12 @@ def _turned(video: Video, how: Any) -> Video:
     )
 
 
+def _shifted(pictures: Pixels, when: Mask, x: float, y: float) -> Pixels:
+    """Pictures (T, H, W, 3), shifted by x, y px in the frames `when` (T,)."""
+    matrix = np.array([[1, 0, x], [0, 1, y]])
+    return np.stack([_warped(one, matrix) if now else one for one, now in zip(pictures, when, strict=True)])
+
+
 def _both_bumped(video: Video) -> Video:
     right = _moved(replace(video, rgb=video.right), shift=5.0).rgb
     return replace(_moved(video, shift=5.0), right=right)
@@ -404,11 +459,18 @@ _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons
 # Function that makes it, and pattern of the message on its cause; empty: the force should stay the same.
 MONOCULAR: dict[str, tuple[Change, str]] = {
     "camera bumped by 5 px": (lambda video: _moved(video, shift=5.0), "^camera"),
+    "camera bumped by 2 px": (lambda video: _moved(video, shift=2.0), "^camera"),
+    "camera drifts by 6 px": (_drifted, "^camera"),
+    "zoom by 1%": (lambda video: _moved(video, scale=1.01), "^camera"),
     "camera moves, no contact": (_moved_untouched, "^camera"),
     "zoom by 3%": (lambda video: _moved(video, scale=1.03), "^camera"),
     "rotation by 2 deg": (lambda video: _moved(video, turn_deg=2.0), "^camera"),
     "ripples of 1 px": (_each(_rippled), f"moves unlike|{_OOD}"),
     "rest frame at the peak": (_rest_at_peak, "^rest frame"),
+    "first picture under load": (_starts_at_peak(False), "^rest frame|rest frame"),
+    "first picture under load, sensor tared": (_starts_at_peak(True), "^rest frame|rest frame"),
+    "frozen, new noise on copies": (_refrozen, _AGAIN),
+    "half the light later": (_each(lambda rgb, k: rgb * (0.5 if k > 11 else 1.0)), "light|bright|exposure"),
     "frozen for 5 frames": (_order(lambda k: np.where((k > 7) & (k < 13), 8, k)), _AGAIN),
     "4 frames dropped": (_order(lambda k: k[(k < 8) | (k > 11)]), _MISSING),
     "4 frames late": (_order(lambda k: np.maximum(k - 4, 0)), f"{_MISSING}|{_AGAIN}"),
@@ -424,13 +486,16 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "blur of 3 px": (_each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3)), "detail"),
     "focus lost later": (_each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3) if k > 8 else rgb), "sharp"),
     "scale 1.5 times too large": (_stated(scale_mm_per_px=1.5), "^scale"),
+    "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "scale"),
     "scale in cm": (_stated(scale_mm_per_px=0.1), "^scale"),
     "scale in um": (_stated(scale_mm_per_px=1000.0), "^scale"),
     "scale in m": (_stated(scale_mm_per_px=0.001), "^scale"),
     "scale in px": (_stated(scale_mm_per_px=1), "^scale"),
+    "E 5 times too large": (_stated(young_kpa=5.0), "stiffness|E "),
     "E in Pa": (_stated(young_kpa=1000.0), "^stiffness"),
     "E in MPa": (_stated(young_kpa=0.001), "^stiffness"),
     "tissue.png inverted": (lambda video: replace(video, tissue=~video.tissue), "^tissue|marks no tissue"),
+    "sensor: 2 times too large": (_sensor(lambda t, f: (t, 2 * f)), "sensor|E "),
     "sensor: grams": (_sensor(lambda t, f: (t, f * 1000 / 9.81)), _UNITS),
     "sensor: mN": (_sensor(lambda t, f: (t, f * 1000)), _UNITS),
     "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor"),
@@ -466,6 +531,22 @@ STEREO: dict[str, tuple[Change, str]] = {
     "right camera frozen": (_order(lambda k: np.minimum(k, 6), True), "^stereo"),
     "right camera mirrored": (_right(lambda video: video.right[:, :, ::-1]), "mirrored"),
     "right camera 4 rows down": (_right(lambda video: np.roll(video.right, 4, axis=1)), "rows"),
+    "right camera 1.2 rows down": (
+        _right(lambda video: _shifted(video.right, np.arange(len(video.right)) >= 0, 0.0, 1.2)),
+        "^stereo",
+    ),
+    "right camera bumped by 3 px": (
+        _right(lambda v: _shifted(v.right, np.arange(len(v.right)) >= len(v.right) // 2, 2.4, 1.8)),
+        "^stereo",
+    ),
+    "right camera out of focus": (
+        _right(lambda video: np.stack([cv2.GaussianBlur(one, (0, 0), 3) for one in video.right])),
+        "^stereo",
+    ),
+    "baseline 1.2 times too long": (
+        _stated(stereo={"calibration": "stereo.yaml", "mm_per_unit": 1.2}),
+        "^scale",
+    ),
     "cameras swapped": (lambda video: replace(video, rgb=video.right, right=video.rgb), "swapped"),
     "right camera a copy of the left": (_right(lambda video: video.rgb), "left camera's own"),
     "baseline 2 times too long": (
