@@ -243,9 +243,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     changes = found["changes"]
     silent = sum(row["silently wrong"] for row in changes) or "None"
     words = [
-        f"**{silent} of {len(found['points'])} recordings, degraded in {len(changes)} ways, had a force outside "
-        "its interval without a finding.** Each cell: median error of the peak force, least share of contact "
-        "frames in the 90% interval, for how many kinds of tissue the cause was named or the force held back.",
+        f"**{silent} of {len(found['points'])} recordings, degraded in {len(changes)} ways, had a force "
+        "outside its interval without a finding.** Each cell: median error of the peak force, least share of "
+        "contact frames in the 90% interval, and for how many kinds of tissue the cause was named or the "
+        "force held back.",
         "The force is that of the default command. *Described*: tissue, instruments and the span without "
         "contact are stated; *bare*: scale and Young's modulus only. 2, 1: cameras.",
     ]

@@ -1,7 +1,7 @@
 """Size of the project: one in, one out.
 
-Each row states what there is now and what is aimed at at the end of the round. A commit may raise the first up to the second, never
-above it; where it is above already, it only falls.
+Each row states what there is now and what is aimed at for the end of the round. A commit may raise the first
+up to the second, never above it; where it is above already, it only falls.
 """
 
 import re
