@@ -346,11 +346,11 @@ def _open_footage(path: Path, masks: MaskFiles | None) -> Footage:
     """A video with the tissue mask next to it, if there is one, and tool masks."""
     from functools import partial
 
-    from synth.recording_flow.decode import Footage, everywhere
+    from synth.recording_flow.decode import Footage
     from synth.video.read import FPS, read_mask, read_video
 
     drawn = path.parent / "tissue.png"
-    tissue = partial(read_mask, drawn) if drawn.exists() else everywhere
+    tissue = partial(read_mask, drawn) if drawn.exists() else None
     return Footage(partial(read_video, path, FPS), str(path), tissue, masks.read if masks else None)
 
 

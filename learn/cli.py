@@ -210,7 +210,7 @@ Membrane = Annotated[MembraneState, Option(help="State of the membrane (pia), fo
 Scale = Annotated[str | None, Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")]
 Tissue = Annotated[
     Path | None,
-    Option(help="Tissue mask of the video: a picture, white on tissue. Default: everywhere."),
+    Option(help="Tissue mask of the video: a picture, white on tissue. Default: found by motion."),
 ]
 Flow = Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")]
 Shrink = Annotated[

@@ -14,12 +14,6 @@ def check_notes(recording: Recording) -> list[Finding]:
     return [Finding("warning", "files", note) for note in recording.notes]
 
 
-def check_tissue(recording: Recording) -> list[Finding]:
-    """Findings on the tissue mask."""
-    message = "no tissue.png: the whole picture is assumed to be tissue"
-    return [] if recording.tissue else [Finding("missing", "tissue", message)]
-
-
 def check_tool(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masks of the tool."""
     message = recording.describe_tool(len(tracked.decoded))

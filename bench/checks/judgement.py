@@ -18,7 +18,6 @@ RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     files.check_notes,
     scale.check_stiffness,
     scale.check_scale,
-    files.check_tissue,
     sensor.check_samples,
     sensor.check_free_spans,
 )

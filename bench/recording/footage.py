@@ -30,7 +30,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     return Footage(
         recording.frames,
         str(recording.folder),
-        recording.tissue_mask,
+        recording.tissue_mask if recording.tissue or recording.region else None,
         recording.masks.read if recording.masks else None,
         recording.meta.rest_frame,
         depth=depth,

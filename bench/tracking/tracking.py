@@ -260,15 +260,17 @@ def _shrunk(array: NDArray[A]) -> NDArray[A]:
 
 def picture_masks(tracked: TrackedRecording) -> Pixels | None:
     """The rest frame (h, w, 3), tinted red by the share of frames in which a pixel is masked and yellow where
-    the rest frame is masked; None if nothing is masked."""
-    summary, rest = tracked.summary, tracked.rest
-    if rest is None or summary.masked_count is None:
+    the rest frame is masked, with the outline of the tissue in green; None if there is nothing to show."""
+    summary, rest, tissue = tracked.summary, tracked.rest, tracked.tissue
+    if rest is None or tissue is None or summary.masked_count is None:
         return None
-    if summary.rest_masked is None and not summary.masked_count.any():
+    if summary.rest_masked is None and not summary.masked_count.any() and tissue.all():
         return None
     often = _shrunk(summary.masked_count / max(summary.frames, 1))[..., None]
     shown = rest * (1 - 0.7 * often) + 0.7 * often * np.array([230, 40, 30])
     if summary.rest_masked is not None:
         always = _shrunk(summary.rest_masked.astype(np.float32))[..., None]
         shown = shown * (1 - 0.5 * always) + 0.5 * always * np.array([240, 200, 30])
-    return np.asarray(np.clip(shown, 0, 255), np.uint8)
+    picture = np.asarray(np.clip(shown, 0, 255), np.uint8)
+    edges = cv2.findContours(tissue.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+    return np.asarray(cv2.drawContours(picture, edges, -1, (60, 230, 90), 1), np.uint8)

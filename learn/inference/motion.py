@@ -17,7 +17,7 @@ from synth.arrays import Array, Floats, Mask
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
 from synth.flow.stereo.track import Moved
-from synth.recording_flow.decode import Footage, RecordingFlowSettings, everywhere
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, judge_scale
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass, passes
@@ -56,7 +56,7 @@ class VideoOptions:
     """What a video file lacks, and settings of its flow."""
 
     scale_mm_per_px: StatedScale | None = None
-    tissue: Path | None = None  # a picture, white on tissue; None: tissue everywhere
+    tissue: Path | None = None  # a picture, white on tissue; None: found
     settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
     tool: MaskFiles | None = None  # instrument masks; None: detected in the pictures
 
@@ -125,7 +125,7 @@ def _video(path: Path, options: VideoOptions) -> Motion:
     if options.scale_mm_per_px is None:
         raise UserError(f"{path}: a video needs its scale: give --scale in mm/px, or --scale unknown")
     scale_known = options.scale_mm_per_px != "unknown"
-    tissue = everywhere if options.tissue is None else partial(video.read_mask, options.tissue)
+    tissue = None if options.tissue is None else partial(video.read_mask, options.tissue)
     taken: list[str] = [] if scale_known else [UNKNOWN_NOTE]
     if path.is_dir():
         taken.append(f"the pictures have no times: {video.FPS:g} per second are assumed")

@@ -47,23 +47,20 @@ class RecordingFlowSettings:
             raise UserError(f"masks: no kind {self.masks!r}; there are {', '.join(MASKS)}")
 
 
-def everywhere(size: Size) -> Mask:
-    """Tissue mask (H, W) that covers the whole picture."""
-    return np.ones(size, bool)
-
-
 @dataclass(frozen=True)
 class Footage:
     """A video to be tracked."""
 
     pictures: Callable[[], Iterable[Picture]]  # all frames in order, the same in every pass
     name: str  # for messages
-    tissue: Callable[[Size], Mask] = everywhere  # (H, W) tissue mask of the rest frame
+    # (H, W) tissue mask of the rest frame; None: `passes` finds it, a single pass takes the whole picture.
+    tissue: Callable[[Size], Mask] | None = None
     # (H, W) instrument mask of a frame, None: empty; if the function is None, instruments are detected.
     tool: Callable[[int, Size], Mask | None] | None = None
     rest_frame: int = 0
     only: Container[int] | None = None  # numbers of the frames to track, with the rest frame; None: all
     depth: RightVideo | DepthVideo | None = None  # right camera or depth camera, if any
+    findings: tuple[Finding, ...] = ()  # on the tissue mask, if it was found
 
 
 class Decoder:
@@ -161,8 +158,8 @@ class Decoder:
     def _describe_rest(self, picture: Picture, shrink: int) -> RestFrame:
         size = (picture.rgb.shape[0], picture.rgb.shape[1])
         shrink = shrink or max(1, size[1] // LEAST_COLUMNS)
-        tissue, bars = self._footage.tissue(size), find_bars(picture.rgb)
-        findings = []
+        given, bars = self._footage.tissue, find_bars(picture.rgb)
+        tissue, findings = np.ones(size, bool) if given is None else given(size), [*self._footage.findings]
         if is_inside_out(tissue):
             inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
             findings.append(Finding("warning", "tissue", inverted))

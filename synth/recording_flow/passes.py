@@ -20,15 +20,18 @@ from dataclasses import replace
 from itertools import chain
 from typing import Protocol
 
+import cv2
 import numpy as np
 
+from synth.arrays import Mask
 from synth.errors import UserError
 from synth.recording_flow.decode import Decoder, Footage, RecordingFlowSettings
 from synth.recording_flow.detrend import Detrend, GatherMotion
+from synth.recording_flow.find_tissue import TissueSearch, choose_frames
 from synth.recording_flow.finding import Finding, first_fault
 from synth.recording_flow.flow import LocalFlow, with_flow
 from synth.recording_flow.foreground import ForegroundSearch
-from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
+from synth.recording_flow.frame_motion import FrameMotion, Size, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.mask import ProposeMasks
 from synth.recording_flow.pulse import PulseEstimate, PulseSearch
@@ -75,6 +78,8 @@ def passes(
 ) -> Iterator[VideoPass]:
     """The passes over a video; a second one follows if the first found pulsation or camera motion in it.
 
+    Tissue that is not given is found before them, in a few frames.
+
     The caller takes all `frames` of a pass before the next one.
 
     Args:
@@ -89,11 +94,35 @@ def passes(
         UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
     """
     flow, watch = flow or LocalFlow(), watch or Stopwatch()
+    if footage.tissue is None:
+        footage = _with_tissue(footage, settings, flow, watch)
     first = VideoPass(footage, settings, None, flow=flow, watch=watch, progress=progress)
     yield first
     found = first.search(free_s)
     if found is not None and (found.pulse or found.camera):
         yield VideoPass(footage, settings, found, flow=flow, watch=watch, progress=progress)
+
+
+def _with_tissue(
+    footage: Footage, settings: RecordingFlowSettings, flow: LocalFlow, watch: Stopwatch
+) -> Footage:
+    """The footage with the tissue that is found in a few of its frames."""
+    with watch.stage("decode"):
+        few = replace(footage, only=choose_frames(footage), depth=None)
+    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), flow=flow, watch=watch)
+    if video.rest.fault:
+        return footage
+    search = TissueSearch(video.rest)
+    for frame in video.frames():
+        search.add(frame)
+    with watch.stage("mask"):
+        found, finding = search.find()
+
+    def tissue(size: Size) -> Mask:
+        whole = cv2.resize(found.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+        return np.asarray(whole > 0)
+
+    return replace(footage, tissue=tissue, findings=(finding,))
 
 
 class VideoPass:

@@ -1,0 +1,164 @@
+"""Tissue of a video that states none: found in the rest frame by the motion of a few frames and by colour.
+
+What is still while the rest moves is no tissue. Bonded tissue moves ever less towards its rim, so that motion
+marks only a part of it, from which GrabCut (Rother et al., SIGGRAPH 2004) grows to an edge of colour. Tissue
+that fills the picture is still too, far from a gentle contact: a rim is assumed only where elastic tissue
+without one would visibly move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from synth.arrays import Map, Mask, Pixels
+from synth.flow.confidence import deviation
+from synth.recording_flow.decode import Footage
+from synth.recording_flow.finding import Finding, Severity
+from synth.recording_flow.frame_motion import FrameMotion, RestFrame
+
+
+@dataclass(frozen=True)
+class TissueConstants:
+    """Constants of the search, chosen by hand on renders and on photographs that were warped in a part."""
+
+    frames: int = 16  # tracked: in each part of the video the one that differs most from the rest frame
+    step_px: int = 8  # px between those compared for it
+    moves: float = 2.0  # root mean square of the motion over its standard deviation; still pixels have 0.7
+    well: float = 0.2  # likewise over the median of what moves: flow carries some across a rim
+    rim: float = 0.15  # share of the visible picture, still though it should move
+    near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
+    wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
+    sure: float = 0.7  # confidence above which a pixel is tracked
+    seen: float = 0.7  # share of frames in which a pixel has to be tracked
+    rounds: int = 5  # of GrabCut
+
+
+CONSTANTS = TissueConstants()
+
+
+def choose_frames(footage: Footage) -> frozenset[int]:
+    """Numbers of the rest frame and of some later ones, as `TissueConstants.frames` says."""
+    rest: Map | None = None
+    number, change = list[int](), list[float]()
+    for picture in footage.pictures():
+        wanted = footage.only is None or picture.index in footage.only
+        if picture.index < footage.rest_frame or not wanted or (number and picture.time_s is None):
+            continue
+        some = picture.rgb[:: CONSTANTS.step_px, :: CONSTANTS.step_px].astype(np.float32)
+        rest = some if rest is None else rest
+        number.append(picture.index)
+        change.append(float(np.abs(some - rest).mean()) if some.shape == rest.shape else 0.0)
+    parts = np.array_split(np.arange(1, len(number)), CONSTANTS.frames)
+    return frozenset(
+        number[k] for k in [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
+    )
+
+
+class TissueSearch:
+    """Gathers the motion of frames, the rest frame first, from which the tissue is then found."""
+
+    def __init__(self, rest: RestFrame) -> None:
+        self._rest, self._frames = rest, 0
+        self._square, self._variance, self._count, self._hidden = np.zeros(
+            (4, *rest.tissue.shape), np.float32
+        )
+
+    def add(self, frame: FrameMotion) -> None:
+        """Adds a frame."""
+        if frame.is_rest and frame.proposal is not None:
+            found = frame.proposal.within(self._rest.tissue)
+            self._tool = found.tool | found.known
+        elif frame.trusted:
+            known = frame.confidence > CONSTANTS.sure
+            self._square += known * np.square(frame.flow).sum(axis=-1)
+            self._variance += known * 2 * deviation(frame.confidence) ** 2
+            self._count += known
+            self._hidden += frame.hidden
+            self._frames += 1
+
+    def find(self) -> tuple[Mask, Finding]:
+        """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
+        whole = self._rest.tissue
+        near, wide = (max(1, round(share * len(whole))) for share in (CONSTANTS.near, CONSTANTS.wide))
+        hidden = self._tool | (self._hidden > (1 - CONSTANTS.seen) * self._frames)
+        seen = whole & (self._count > CONSTANTS.seen * self._frames) & ~_morph(hidden, cv2.MORPH_DILATE, near)
+        motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
+        moves = seen & (motion > CONSTANTS.moves * noise)
+        if moves.any():
+            moves &= motion > CONSTANTS.well * np.median(motion[moves])
+        moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
+        core = _morph(moves, cv2.MORPH_ERODE, near)
+        if not core.any():
+            return whole, _state("nothing moves by which to find it: the whole picture is assumed", "warning")
+        expected = _expected(motion, moves) > CONSTANTS.moves * noise
+        if np.mean(seen & expected & (motion < noise)) < CONSTANTS.rim * np.mean(seen):
+            if np.mean(seen & ~expected) < 0.5 * np.mean(seen):
+                return whole, _state("it moves as tissue that fills the picture")
+            return whole, _state("too little moves to find it: the whole picture is assumed", "warning")
+        tissue = _morph(_grow(self._rest.rgb, moves, core), cv2.MORPH_OPEN, near)
+        tissue = _largest(_with_hidden(tissue, core, hidden), core)
+        tissue = whole & _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
+        return tissue, _state(f"found by motion and colour, {100 * tissue.mean():.0f}% of the picture")
+
+
+def touches_border(tissue: Mask) -> float:
+    """Share of the outline of a mask (H, W) on the border of the picture, which is no edge of the tissue."""
+    inner = cv2.erode(tissue.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    outline = tissue & ~inner
+    border = np.ones(tissue.shape, bool)
+    border[1:-1, 1:-1] = False
+    return float(np.count_nonzero(outline & border) / max(np.count_nonzero(outline), 1))
+
+
+def _state(text: str, severity: Severity = "missing") -> Finding:
+    return Finding(severity, "tissue", f"no mask of the tissue (tissue.png) is given: {text}")
+
+
+def _expected(motion: Map, moves: Mask) -> Map:
+    """Motion (h, w) px of tissue without a rim: around what moves most it falls with distance, as 1 / r."""
+    half = float(np.percentile(motion[moves], 98)) / 2
+    most = moves & (motion > half)
+    radius = np.sqrt(np.count_nonzero(most) / np.pi)
+    distance = cv2.distanceTransform((~most).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(half * radius / (radius + distance), np.float32)
+
+
+def _grow(rgb: Pixels, moves: Mask, core: Mask) -> Mask:
+    """What looks like the tissue that moves (h, w); its `core` is certain."""
+    lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), 5).astype(np.float32)
+    # Shading changes lightness, hardly the colour.
+    lab = np.clip((lab - 128) * np.array([0.5, 2, 2], np.float32) + 128, 0, 255).astype(np.uint8)
+    label = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+    cv2.setRNGSeed(0)
+    background, foreground = np.zeros((2, 1, 65))
+    cv2.grabCut(lab, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
+    return (label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)
+
+
+def _morph(mask: Mask, how: int, radius: int) -> Mask:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), how, disc) > 0)
+
+
+def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
+    """The mask with what instruments hide within the convex hull of its components that move."""
+    label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
+    parts = mask & np.isin(label, np.unique(label[core]))
+    outline = cv2.convexHull(np.argwhere(parts)[:, ::-1].astype(np.int32))
+    under = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
+    return parts | (under & hidden)
+
+
+def _largest(mask: Mask, core: Mask) -> Mask:
+    """The component that contains most of the core."""
+    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return np.asarray(label == 1 + np.argmax(np.bincount(label[core], minlength=count)[1:]))
+
+
+def _filled(mask: Mask) -> Mask:
+    """The mask without holes."""
+    edges = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    return cv2.drawContours(np.zeros(mask.shape, np.uint8), edges, -1, 1, cv2.FILLED) > 0
