@@ -6,7 +6,7 @@ frames.csv             optional: frame,t_s      (else the video's own presentati
 force.csv              optional: t_s,fx_n,fy_n,fz_n
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
 mask.png               optional: the same for all frames that have no mask of their own
-tissue.png             optional: white on all tissue in the rest frame; the rest shows the camera's motion
+tissue.png             optional: white on all tissue in the rest frame; without it found by motion
 right.mp4 or right/*.png   optional: the right camera, frame by frame, with `stereo` in meta.yaml
 depth/*.png or *.npy   optional: depth (H, W) or points (H, W, 3), frame by frame, with `depth` in meta.yaml
 

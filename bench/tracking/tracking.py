@@ -272,5 +272,6 @@ def picture_masks(tracked: TrackedRecording) -> Pixels | None:
         always = _shrunk(summary.rest_masked.astype(np.float32))[..., None]
         shown = shown * (1 - 0.5 * always) + 0.5 * always * np.array([240, 200, 30])
     picture = np.asarray(np.clip(shown, 0, 255), np.uint8)
-    edges = cv2.findContours(tissue.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+    inside = (tissue & ~tissue.all()).astype(np.uint8)  # tissue that fills the picture has no outline
+    edges = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     return np.asarray(cv2.drawContours(picture, edges, -1, (60, 230, 90), 1), np.uint8)

@@ -140,7 +140,8 @@ def _video(path: Path, options: VideoOptions) -> Motion:
     def described(one: VideoPass) -> MotionPass:
         def notes() -> list[str]:
             removed = [] if one.removed is None else [one.removed.describe(scale * rest.shrink)]
-            return [*taken, *one.notes, *removed]
+            missing = [found.message for found in one.findings if found.severity == "missing"]
+            return [*taken, *one.notes, *removed, *missing]
 
         frames = (replace(frame, time_s=frame.time_s or 0.0) for frame in one.frames())
         return MotionPass(frames, notes, lambda: [*judge_scale(scale, rest.size[1]), *one.findings])

@@ -3,7 +3,7 @@
 What is still while the rest moves is no tissue. Bonded tissue moves ever less towards its rim, so that motion
 marks only a part of it, from which GrabCut (Rother et al., SIGGRAPH 2004) grows to an edge of colour. Tissue
 that fills the picture is still too, far from a gentle contact: a rim is assumed only where elastic tissue
-without one would visibly move.
+without one would visibly move, and if what is still has other colours.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ class TissueConstants:
     step_px: int = 8  # px between those compared for it
     moves: float = 2.0  # root mean square of the motion over its standard deviation; still pixels have 0.7
     well: float = 0.2  # likewise over the median of what moves: flow carries some across a rim
-    rim: float = 0.15  # share of the visible picture, still though it should move
+    rim: float = 0.2  # least share of the picture, still though it should move: openings 0.38, others 0.05
+    alike: float = 0.4  # largest overlap of the colours of what is still and what moves: openings 0.31
+    bins: int = 16  # of each channel of the colours, for their overlap
     near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
     wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
     sure: float = 0.7  # confidence above which a pixel is tracked
@@ -92,13 +94,15 @@ class TissueSearch:
         moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
         core = _morph(moves, cv2.MORPH_ERODE, near)
         if not core.any():
-            return whole, _state("nothing moves by which to find it: the whole picture is assumed", "warning")
+            return whole, _state("nothing moves by which to find it: the whole picture is assumed")
         expected = _expected(motion, moves) > CONSTANTS.moves * noise
-        if np.mean(seen & expected & (motion < noise)) < CONSTANTS.rim * np.mean(seen):
+        colours, still = _colours(self._rest.rgb), seen & (motion < noise)
+        is_bounded = np.mean(expected & still) > CONSTANTS.rim * np.mean(seen)
+        if not is_bounded or _overlap(colours, core, still) > CONSTANTS.alike:
             if np.mean(seen & ~expected) < 0.5 * np.mean(seen):
                 return whole, _state("it moves as tissue that fills the picture")
             return whole, _state("too little moves to find it: the whole picture is assumed", "warning")
-        tissue = _morph(_grow(self._rest.rgb, moves, core), cv2.MORPH_OPEN, near)
+        tissue = _morph(_grow(colours, moves, core), cv2.MORPH_OPEN, near)
         tissue = _largest(_with_hidden(tissue, core, hidden), core)
         tissue = whole & _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
         return tissue, _state(f"found by motion and colour, {100 * tissue.mean():.0f}% of the picture")
@@ -126,15 +130,25 @@ def _expected(motion: Map, moves: Mask) -> Map:
     return np.asarray(half * radius / (radius + distance), np.float32)
 
 
-def _grow(rgb: Pixels, moves: Mask, core: Mask) -> Mask:
-    """What looks like the tissue that moves (h, w); its `core` is certain."""
+def _colours(rgb: Pixels) -> Pixels:
+    """Lab (h, w, 3), smoothed, with less of lightness, which shading changes, and more of colour."""
     lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), 5).astype(np.float32)
-    # Shading changes lightness, hardly the colour.
-    lab = np.clip((lab - 128) * np.array([0.5, 2, 2], np.float32) + 128, 0, 255).astype(np.uint8)
+    return np.clip((lab - 128) * np.array([0.5, 2, 2], np.float32) + 128, 0, 255).astype(np.uint8)
+
+
+def _overlap(colours: Pixels, first: Mask, second: Mask) -> float:
+    """Overlap in 0..1 of the histograms of the colours (h, w, 3) in two masks."""
+    bins, every = [CONSTANTS.bins] * 3, [0, 256] * 3
+    both = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in (first, second)]
+    return float(np.minimum(*(one / max(one.sum(), 1) for one in both)).sum())
+
+
+def _grow(colours: Pixels, moves: Mask, core: Mask) -> Mask:
+    """What has the colours (h, w, 3) of the tissue that moves; its `core` is certain."""
     label = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
-    cv2.grabCut(lab, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(colours, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
     return (label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)
 
 

@@ -1,0 +1,57 @@
+"""Tissue found in videos of analytic motion: an opening in still surroundings, and tissue everywhere."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.find_tissue import touches_border
+from synth.recording_flow.passes import passes
+from synth.video.read import Picture
+from tests.synth.recording_flow.test_camera_motion import EVERYWHERE, OPENING, X, Y, texture
+
+SETTINGS = RecordingFlowSettings("dis", 1, None, False, "none")
+RIM = np.clip(1 - np.hypot(X - 80, Y - 60) / 40, 0, 1)  # motion falls to 0 at the rim
+
+
+def video(opening: NDArray[np.bool_], rim: NDArray[np.float64], px: float, bump: int = 0) -> Footage:
+    """A load at (70, 60) drags the tissue by up to `px` and lets go; the surroundings have another colour."""
+    rng = np.random.default_rng(0)
+    pull = rim * np.minimum(1, 10 / np.maximum(np.hypot(X - 70, Y - 60), 1e-6))
+
+    def picture(frame: int) -> Picture:
+        drag = px * np.sin(np.pi * frame / 8) ** 2 * pull
+        rgb = texture(X - drag, Y) * np.array([1.0, 0.7, 0.6])
+        rgb[~opening] = (texture(Y, X) * np.array([0.6, 0.8, 1.0]))[~opening]
+        rgb = np.roll(rgb, bump * (frame > 5), axis=0) + rng.normal(0, 1, rgb.shape)
+        return Picture(frame, frame / 8, np.clip(rgb, 0, 255).astype(np.uint8))
+
+    return Footage(partial(map, picture, range(12)), "video")
+
+
+@pytest.mark.parametrize(
+    ("footage", "truth", "severity"),
+    [
+        (lambda: video(OPENING, RIM, 4), OPENING, "missing"),
+        (lambda: video(OPENING, RIM, 4, bump=3), OPENING, "missing"),
+        (lambda: video(EVERYWHERE, EVERYWHERE, 4), EVERYWHERE, "missing"),
+        (lambda: video(EVERYWHERE, EVERYWHERE, 0.4), EVERYWHERE, "warning"),
+        (lambda: video(EVERYWHERE, EVERYWHERE, 0), EVERYWHERE, "missing"),
+    ],
+    ids=["opening", "moved camera", "edge to edge", "gentle contact", "nothing moves"],
+)
+def test_tissue_is_found(footage: Callable[[], Footage], truth: NDArray[np.bool_], severity: str) -> None:
+    *_, last = passes(footage(), SETTINGS)
+    tissue = last.rest.tissue
+    assert (tissue & truth).sum() / (tissue | truth).sum() > 0.9
+    assert [one.severity for one in last.rest.findings] == [severity]
+    assert last.rest.findings[0].cause == "tissue"
+
+
+def test_the_border_of_the_picture_is_no_edge() -> None:
+    assert touches_border(EVERYWHERE) == 1
+    assert touches_border(OPENING) == 0
+    assert touches_border(X < 80) == pytest.approx(278 / 396)
