@@ -114,7 +114,7 @@ def touches_border(tissue: Mask) -> float:
     outline = tissue & ~inner
     border = np.ones(tissue.shape, bool)
     border[1:-1, 1:-1] = False
-    return float(np.count_nonzero(outline & border) / max(np.count_nonzero(outline), 1))
+    return float((outline & border).sum() / max(outline.sum(), 1))
 
 
 def _state(text: str, severity: Severity = "missing") -> Finding:
@@ -133,7 +133,7 @@ def _expected(motion: Map, moves: Mask) -> Map:
 def _colours(rgb: Pixels) -> Pixels:
     """Lab (h, w, 3), smoothed, with less of lightness, which shading changes, and more of colour."""
     lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), 5).astype(np.float32)
-    return np.clip((lab - 128) * np.array([0.5, 2, 2], np.float32) + 128, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
 
 
 def _overlap(colours: Pixels, first: Mask, second: Mask) -> float:
@@ -149,7 +149,7 @@ def _grow(colours: Pixels, moves: Mask, core: Mask) -> Mask:
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
     cv2.grabCut(colours, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
-    return (label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)
+    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
 
 
 def _morph(mask: Mask, how: int, radius: int) -> Mask:
@@ -163,7 +163,7 @@ def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
     parts = mask & np.isin(label, np.unique(label[core]))
     outline = cv2.convexHull(np.argwhere(parts)[:, ::-1].astype(np.int32))
     under = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
-    return parts | (under & hidden)
+    return np.asarray(parts | (under & hidden))
 
 
 def _largest(mask: Mask, core: Mask) -> Mask:
@@ -175,4 +175,4 @@ def _largest(mask: Mask, core: Mask) -> Mask:
 def _filled(mask: Mask) -> Mask:
     """The mask without holes."""
     edges = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    return cv2.drawContours(np.zeros(mask.shape, np.uint8), edges, -1, 1, cv2.FILLED) > 0
+    return np.asarray(cv2.drawContours(np.zeros(mask.shape, np.uint8), edges, -1, 1, cv2.FILLED) > 0)

@@ -95,7 +95,7 @@ def passes(
     """
     flow, watch = flow or LocalFlow(), watch or Stopwatch()
     if footage.tissue is None:
-        footage = _with_tissue(footage, settings, flow, watch)
+        footage = _with_tissue(footage, settings, watch)
     first = VideoPass(footage, settings, None, flow=flow, watch=watch, progress=progress)
     yield first
     found = first.search(free_s)
@@ -103,13 +103,11 @@ def passes(
         yield VideoPass(footage, settings, found, flow=flow, watch=watch, progress=progress)
 
 
-def _with_tissue(
-    footage: Footage, settings: RecordingFlowSettings, flow: LocalFlow, watch: Stopwatch
-) -> Footage:
-    """The footage with the tissue that is found in a few of its frames."""
+def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
+    """The footage with the tissue that is found in a few of its frames, by flow in this process."""
     with watch.stage("decode"):
         few = replace(footage, only=choose_frames(footage), depth=None)
-    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), flow=flow, watch=watch)
+    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
     if video.rest.fault:
         return footage
     search = TissueSearch(video.rest)
