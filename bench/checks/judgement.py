@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.checks import clocks, files, scale, sensor, stereo, times
+from bench.checks import clocks, contradiction, files, scale, sensor, stereo, times
 from bench.checks.sensor import SensorMotion
 from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
@@ -40,9 +40,7 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
 """Checks of the pictures, of which a few or all are tracked."""
 
 SENSOR_CHECKS: tuple[Callable[[SensorMotion], list[Finding]], ...] = (
-    sensor.check_unit,
-    sensor.check_axes,
-    clocks.check_motion,
+    contradiction.check_contradiction,
     sensor.check_constant,
 )
 """Checks of the aligned sensor against the motion and the methods' forces in all tracked frames."""
@@ -62,5 +60,5 @@ def judge(
     found += [one for check in TRACKED_CHECKS for one in check(recording, tracked)]
     # Forces that are not valid contradict any sensor.
     if sensor is not None and not first_fault(found):
-        found += [one for check in SENSOR_CHECKS for one in check(sensor)]
+        found = [one for check in SENSOR_CHECKS for one in check(sensor)] + found
     return by_severity(found)

@@ -1,12 +1,11 @@
-"""Checks of the sensor: its samples, load where there should be none; unit, sign and axes against the video.
+"""Checks of the sensor alone: its samples, load where there should be none, constant or saturated force.
 
-Loads are of raw samples, because a tare would hide them. No single method is trusted: a fault of the sensor
-is assumed only where all methods contradict it.
+Loads are of raw samples, because a tare would hide them. For the sensor against the video's force see
+`bench.checks.contradiction`.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,22 +17,12 @@ from bench.methods.protocol import Method
 from bench.recording.folder import Recording
 from bench.sensor.alignment import AlignedSensor
 from bench.tracking.tracking import TrackedRecording
-from synth.arrays import Floats
+from synth.arrays import Floats, Mask
 from synth.recording_flow.finding import Finding
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
 _LOADED = 0.25  # share of the range of force above which the tissue is not at rest; by hand
-# Chosen by hand between the corrupted and the clean recordings of docs/results/scoring/stability, which
-# reports detections and false alarms.
-LEAST_FRAMES = 8
-_ODD_UNIT = 12.0  # factor between sensor and all methods, in the same direction
-_OTHER_UNIT = 50.0  # such a factor from which no force is reported
-_METHODS = 2  # least number that must agree on a unit, since one may be wrong itself
-_PRESSED = 0.3  # share of the peak from which frames are used for the unit
-_ALIKE = 0.7  # least correlation with the sensor of methods used for the unit
-_SIDEWAYS = 0.2  # least share of the force in the observed axes
-# Cosine between sensor and methods: largest in the stated axes, least in the proposed axes, least difference.
-_DISAGREE, _AGREE, _APART = 0.2, 0.7, 0.5
+LEAST_FRAMES = 8  # for a judgement on the sensor; by hand
 _CONSTANT = 3  # frames of constant force that are no saturation
 _MOVES = 0.25  # share of the largest motion during constant force, from which it is one
 
@@ -101,8 +90,13 @@ class SensorMotion:
     time_s: Floats  # (T,) of the tracked frames [s]
     axes_mn: Floats  # (T, 3) the sensor's force
     moved: Floats  # (T,) mean motion of the tissue since the rest frame, any unit
-    forces_mn: tuple[Floats, ...] = ()  # of each method, (T, 3) in the camera's axes; none if E is unknown
+    forces_mn: tuple[Floats, ...] = ()  # of independent methods, (T, 3) in the camera's axes; none without E
     observed_axes: int = 0  # number of camera axes that the video shows; 0 if the sensor has other axes
+    leading_mn: Floats | None = None  # (T, 3) of the main method; None without E
+    bounds_mn: Floats | None = None  # (T, 2) its 90% interval, NaN where it states none
+    rest_mn: Floats | None = None  # (3,) the sensor's force at the rest frame
+    noise_mn: float = 0.0  # of the sensor without contact; 0 if unknown
+    pulsates: bool = False  # the tissue moves by itself
 
     @property
     def size_mn(self) -> Floats:
@@ -110,81 +104,57 @@ class SensorMotion:
         return np.asarray(np.linalg.norm(self.axes_mn, axis=1))
 
     @property
+    def contact_mn(self) -> float:
+        """Force at contact: 3 times the noise, at least 5% of the peak."""
+        return max(3 * self.noise_mn, 0.05 * float(self.size_mn.max()))
+
+    @property
     def is_constant(self) -> bool:
         """Whether the sensor's force never changes."""
         return not np.ptp(self.axes_mn, axis=0).any()
 
-    @property
-    def compared(self) -> tuple[Floats, list[Floats]]:
-        """The observed components of the sensor and of each method; no method if they are next to nothing."""
-        n = self.observed_axes or 3
-        axes, forces = self.axes_mn[:, :n], [force[:, :n] for force in self.forces_mn]
-        return axes, forces if np.linalg.norm(axes) > _SIDEWAYS * np.linalg.norm(self.axes_mn) else []
-
 
 def find_sensor_motion(
-    recording: Recording, tracked: TrackedRecording, methods: Mapping[str, Method], sensor: AlignedSensor
+    recording: Recording,
+    tracked: TrackedRecording,
+    methods: Mapping[str, Method],
+    main: str,
+    sensor: AlignedSensor,
+    scored: Mask,
 ) -> SensorMotion | None:
-    """Sensor and motion in the tracked frames; None without a sensor, motion or enough frames."""
+    """Sensor and motion in the frames (T,) to be scored; None without a sensor, motion or enough frames.
+
+    `main`: name of the leading method.
+    """
     moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
     if sensor.axes_mn is None or moved is None:
         return None
     size = np.array(tracked.force_mn[moved])[:, 0]
-    known = np.isfinite(sensor.axes_mn).all(axis=1) & np.isfinite(size) & np.array(tracked.trusted)
+    known = np.isfinite(sensor.axes_mn).all(axis=1) & np.isfinite(size) & np.array(tracked.trusted) & scored
     if known.sum() < LEAST_FRAMES or not np.ptp(size[known]) > 0:
         return None
-    forces = []
+    forces, leading = [], None
     if recording.meta.young_kpa is not None:
         # A fusion is not an independent estimate.
         alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Fusion))]
         every = [np.nan_to_num(tracked.force_mn[name]) for name in alone]
         forces = [force[known] for force in every if force.any()]
+        leading = (
+            None if isinstance(methods[main], FlowSize) else np.nan_to_num(tracked.force_mn[main])[known]
+        )
     axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
-    observed = axes if sensor.in_camera_axes else 0
-    time_s = np.array(tracked.time_s)[known]
-    return SensorMotion(time_s, sensor.axes_mn[known], size[known], tuple(forces), observed)
-
-
-def check_unit(sensor: SensorMotion) -> list[Finding]:
-    """Findings on the unit, by the median ratio to methods that correlate with the sensor."""
-    axes, forces = sensor.compared
-    gains, size = [], np.linalg.norm(axes, axis=1)
-    for force in (np.linalg.norm(one, axis=1) for one in forces):
-        pressed = force > _PRESSED * float(np.quantile(force, 0.98))
-        if correlation(size, force) > _ALIKE and pressed.any():
-            gains.append(float(np.log(max(np.median(size[pressed] / force[pressed]), 1e-9))))
-    least = min(map(abs, gains), default=0.0)
-    if len(gains) < _METHODS or least < np.log(_ODD_UNIT) or min(gains) < 0 < max(gains):
-        return []
-    factor, more = np.exp(abs(np.median(gains))), "larger" if gains[0] > 0 else "smaller"
-    message = (
-        f"the sensor's force is {factor:.2g} times {more} than that of every method: is a unit wrong? "
-        "(factor 1000: mN for N, or Pa or MPa for kPa; 102: grams; 100: cm for mm)"
+    return SensorMotion(
+        np.array(tracked.time_s)[known],
+        sensor.axes_mn[known],
+        size[known],
+        tuple(forces),
+        axes if sensor.in_camera_axes else 0,
+        leading,
+        np.array(tracked.bounds[main], np.float64)[known],
+        sensor.axes_mn[0] if np.isfinite(sensor.axes_mn[0]).all() else None,
+        sensor.noise_floor_mn,
+        bool(tracked.pulse),
     )
-    return [Finding("warning" if least < np.log(_OTHER_UNIT) else "error", "sensor", message)]
-
-
-def check_axes(sensor: SensorMotion) -> list[Finding]:
-    """Findings on a signed permutation of the axes for which the methods' force is along the sensor's."""
-    n, (axes, forces) = sensor.observed_axes, sensor.compared
-    every = [force / max(float(np.linalg.norm(force)), 1e-12) for force in forces]
-    if not every or not n or sensor.is_constant:
-        return []
-    one = np.sum(every, axis=0)
-    both = one.T @ axes / max(float(np.linalg.norm(one) * np.linalg.norm(axes)), 1e-12)
-    found = {
-        (order, signs): sum(sign * both[k, j] for k, (j, sign) in enumerate(zip(order, signs, strict=True)))
-        for order in itertools.permutations(range(n))
-        for signs in itertools.product((1, -1), repeat=n)
-    }
-    best, now = max(found, key=lambda key: found[key]), float(np.trace(both))
-    if now > _DISAGREE or found[best] < max(_AGREE, now + _APART):
-        return []
-    names = ", ".join(f"{'-' * (sign < 0)}f{'xyz'[j]}_n" for j, sign in zip(*best, strict=True))
-    message = f"the tissue moves as if the force along the camera's axes were {names} of force.csv"
-    if best[1] == (-1,) * n and best[0] == tuple(range(n)):
-        message += ": is it the force on the tool (sensor.acts_on)?"
-    return [Finding("warning", "sensor", message)]
 
 
 def check_constant(sensor: SensorMotion) -> list[Finding]:
@@ -202,10 +172,3 @@ def check_constant(sensor: SensorMotion) -> list[Finding]:
                 what = f"f{'xyz'[k]}_n is constant at {values[run[0]]:.3g} mN from {span}"
                 return [Finding("warning", "sensor", f"{what} while the tissue moves: saturated, or stuck?")]
     return []
-
-
-def correlation(one: Floats, other: Floats) -> float:
-    """Pearson's correlation of two curves (T,); 0 if one is constant."""
-    if not (np.ptp(one) > 0 and np.ptp(other) > 0):
-        return 0.0
-    return float(np.corrcoef(one, other)[0, 1])

@@ -60,8 +60,9 @@ def evaluate_recording(
     # Since the frame before, which may be lost too.
     speed = np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
     sensor = align_sensor(recording, time_s, speed, tracked.turning)
-    findings = judge(recording, tracked, find_sensor_motion(recording, tracked, methods, sensor))
     scored, unscored = _select_frames(meta, tracked, sensor)
+    seen = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
+    findings = judge(recording, tracked, seen)
     missing = [one.message for one in findings if one.severity == "missing"]
     result = Result(
         recording=recording.name,

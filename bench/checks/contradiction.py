@@ -1,0 +1,250 @@
+"""What contradicts the video: the sensor's force against the leading method's, and the causes that fit best.
+
+Each hypothesis on the recording is a transformation of the sensor's force after which it should equal the
+estimate up to a gain. Within the stated interval a gain needs no explanation. A residual r has the Laplace
+likelihood, which spikes hardly change: n log(mean |r|) over n independent frames, where mean |r| counts from
+the noise on; a hypothesis that is one of N of its kind pays log N. Magnitudes and, if their axes are known,
+components count separately. The rates of detections and false alarms are those of
+`tests/bench/scoring/test_judgement.py`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betainc
+
+from bench.checks.sensor import LEAST_FRAMES, SensorMotion
+from learn.uncertainty.intervals import LEVEL
+from synth.arrays import Floats, Mask
+from synth.recording_flow.finding import Finding
+
+_HELD = 0.6  # coverage of the interval from which it isn't reported; by hand
+_CHANCE = 0.05  # largest probability of such a coverage by chance
+_SHAPE = 0.05  # mean error of a right estimate's curve over its peak, gain aside
+_TURNED = 0.4  # mean error of a right estimate's components over its force
+_BEYOND = 2.0  # factor between sensor and force that no method errs by; the worst scenes of ours reach 1.7
+_SURE = np.log(20.0)  # log odds from which a hypothesis is named
+_LIKELY = np.log(3.0)  # the same where the interval fails, so that there is a fault
+_ALIKE = np.log(10.0)  # log odds within which others are named next to the best
+_LEFT = 0.5  # share of the force's mean deviation that a hypothesis may leave
+_SIDEWAYS = 0.2  # least share of the force in the observed axes
+_UNITS = {1000.0: "mN for N, or Pa or MPa for kPa", 102.0: "grams", 100.0: "cm for mm"}
+_RATES = (0.9, 0.92, 0.95, 0.97, 1.03, 1.05, 1.08, 1.1)
+_RATE_S = 10.0  # least duration for advice on a clock's rate
+_LATE_S = 1.5  # largest clock error tried, in both directions
+_TRIED = 30  # largest number of lags, and twice that of positions of a gap
+_PART = 4  # least number of frames before and after a gap
+_COMMON = 0.6  # least share of the frames that a hypothesis covers
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A fault of the recording."""
+
+    cause: str
+    message: str
+    axes_mn: Floats  # (T, 3) what a sensor would measure without it; NaN where unknown
+    tried: int = 1  # number of hypotheses of its kind
+    any_gain: bool = False  # whether the gain is beyond the stated interval
+
+
+@dataclass(frozen=True)
+class _Judged:
+    hypothesis: Hypothesis
+    odds: float  # log odds against the recording as it is
+    explains: bool  # whether little of the force is left unexplained
+    gain: float  # of the sensor
+
+
+def check_contradiction(sensor: SensorMotion) -> list[Finding]:
+    """The finding on a sensor that contradicts the leading method, with the likeliest causes."""
+    if sensor.is_constant:
+        return []
+    force, gains = _estimate(sensor)
+    judged = sorted(_judge(sensor, force, gains), key=lambda one: -one.odds)
+    missed = find_missed(sensor)
+    likely = [one for one in judged if one.explains and one.odds > (_LIKELY if missed else _SURE)]
+    if not likely:
+        cause = "no cause was found among gain, axes, rest frame and clocks"
+        return [Finding("warning", "interval", f"{missed}; {cause}")] if missed else []
+    best = likely[0]
+    close = [one.hypothesis for one in likely if one.odds > best.odds - _ALIKE]
+    names = {one.cause: one.message for one in reversed(close)}
+    start = missed or "sensor and video contradict each other"
+    # Only what several methods agree on is certain: one may be wrong itself.
+    sure = missed and best.odds > _SURE and len(sensor.forces_mn) > 1
+    sure = sure and all(_agrees(sensor, one, best) for one in sensor.forces_mn)
+    found = f"{start}; most likely {', or '.join(reversed(names.values()))}"
+    return [Finding("error" if sure else "warning", best.hypothesis.cause, found)]
+
+
+def find_missed(sensor: SensorMotion) -> str:
+    """Which frames' 90% interval holds clearly fewer of the sensor's readings than stated; empty: none."""
+    if sensor.leading_mn is None or sensor.bounds_mn is None:
+        return ""
+    size = sensor.size_mn
+    margin = 0.5 * sensor.contact_mn
+    low, high = sensor.bounds_mn.T
+    held, known = (size >= low - margin) & (size <= high + margin), np.isfinite(low + high)
+    count = independent(size - np.linalg.norm(sensor.leading_mn, axis=1)) / len(size)
+    contact = size > sensor.contact_mn
+    parts, missed = {"": known, " in contact": known & contact, " without contact": known & ~contact}, []
+    for which, mask in parts.items():
+        share, n = float(held[mask].mean()) if mask.any() else 1.0, max(2.0, count * mask.sum())
+        # Binomial probability of at most this share.
+        chance = betainc(max(n * (1 - share), 1e-9), n * share + 1, 1 - LEVEL)
+        if mask.sum() >= LEAST_FRAMES and share < _HELD and chance < _CHANCE:
+            missed.append(f"{share:.0%} of the sensor's readings{which}")
+    return f"the interval of {LEVEL:.0%} holds {' and '.join(missed)}" if missed else ""
+
+
+def independent(curve: Floats) -> float:
+    """Number of independent values of a curve (T,), by its autocorrelation up to the first zero."""
+    off = curve - curve.mean()
+    full = np.correlate(off, off, "full")[len(off) - 1 :]
+    rho = full[1:] / max(float(full[0]), 1e-30)
+    ends = np.flatnonzero(rho <= 0)
+    return float(len(curve) / (1 + 2 * rho[: ends[0] if len(ends) else None].sum()))
+
+
+def _estimate(sensor: SensorMotion) -> tuple[Floats, tuple[float, float]]:
+    """The video's force (T, 3) and the range of the sensor's gain that its interval allows; without E the
+    motion, and any gain."""
+    if sensor.leading_mn is None:
+        return np.pad(sensor.moved[:, None], ((0, 0), (0, 2))), (0.0, np.inf)
+    size = np.linalg.norm(sensor.leading_mn, axis=1)
+    low, high = np.full((2, len(size)), np.nan) if sensor.bounds_mn is None else sensor.bounds_mn.T
+    pressed = np.isfinite(low + high) & (size > 0.3 * size.max())
+    if not pressed.any():
+        return sensor.leading_mn, (1 / _BEYOND, _BEYOND)
+    with np.errstate(divide="ignore"):
+        return sensor.leading_mn, tuple(float(np.median(size[pressed] / end[pressed])) for end in (high, low))
+
+
+def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> Iterator[_Judged]:
+    """Every hypothesis against the recording as it is, for an estimate (T, 3) and its range of gains."""
+    size = np.linalg.norm(force, axis=1)
+    if not np.ptp(size) > 0:
+        return
+    n = sensor.observed_axes if sensor.leading_mn is not None else 0
+    n *= bool(np.linalg.norm(sensor.axes_mn[:, :n]) > _SIDEWAYS * np.linalg.norm(sensor.axes_mn))
+    floor = _SHAPE * float(size.max())
+    if sensor.bounds_mn is not None:
+        # Uncertainty that does not grow with force, such as that by a pulse.
+        wide = (sensor.bounds_mn[:, 1] - size)[np.isfinite(sensor.bounds_mn[:, 1])]
+        floor = max(floor, float(np.quantile(wide, 0.1)) if len(wide) else 0.0)
+
+    def misfits(axes: Floats, gain: float, inside: Mask) -> Floats:
+        """Mean residual of magnitudes and of components, if they are known."""
+        now_mn = gain * axes[inside]
+        left, noise = [np.abs(size[inside] - np.linalg.norm(now_mn, axis=1)).mean()], [floor]
+        if n:
+            left.append(np.linalg.norm(force[inside, :n] - now_mn[:, :n], axis=1).mean())
+            noise.append(np.hypot(floor, _TURNED * size[inside].mean()))
+        return np.hypot(left, noise)
+
+    now = float(np.clip(_gain(size, sensor.size_mn), *gains))
+    count = independent(size - now * sensor.size_mn)
+    for one in hypotheses(sensor, n):
+        inside = np.isfinite(one.axes_mn).all(axis=1)
+        if inside.sum() < max(_COMMON * len(inside), LEAST_FRAMES):
+            continue
+        free = _gain(size[inside], np.linalg.norm(one.axes_mn[inside], axis=1))
+        gain = free if one.any_gain else float(np.clip(free, *gains))
+        before, after = misfits(sensor.axes_mn, now, inside), misfits(one.axes_mn, gain, inside)
+        spread = float(np.abs(size[inside] - np.median(size[inside])).mean())
+        explains = after[0] < np.hypot(_LEFT * spread, floor)
+        odds = count * inside.mean() * float(np.log(before / after).sum()) - np.log(one.tried)
+        if one.any_gain:
+            explains &= not 1 / _BEYOND < free / now < _BEYOND or bool(gains[0] > free or free > gains[1])
+            one = _named_gain(one, gain)
+        yield _Judged(one, odds, bool(explains), gain)
+
+
+def _gain(size: Floats, sensor_mn: Floats) -> float:
+    """The gain of the sensor (T,) with the least mean residual from forces (T,): a weighted median."""
+    used = sensor_mn > 0
+    ratio, weight = size[used] / sensor_mn[used], sensor_mn[used]
+    order = np.argsort(ratio)
+    total = np.cumsum(weight[order])
+    return float(ratio[order][np.searchsorted(total, total[-1] / 2)]) if len(total) else 1.0
+
+
+def _agrees(sensor: SensorMotion, force: Floats, best: _Judged) -> bool:
+    """Whether another method's force (T, 3) has the same cause, beyond what a method errs by."""
+    if best.hypothesis.any_gain:
+        gain = _gain(np.linalg.norm(force, axis=1), sensor.size_mn)
+        return abs(np.log(max(gain, 1e-9))) > np.log(_BEYOND) and (gain > 1) == (best.gain > 1)
+    every = _judge(sensor, force, (1 / _BEYOND, _BEYOND))
+    same = [one for one in every if one.hypothesis.cause == best.hypothesis.cause]
+    return any(one.odds > _SURE and one.explains for one in same)
+
+
+def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:
+    """Faults of a recording; `axes`: number of axes in which components of force can be compared."""
+    t, force = sensor.time_s, sensor.axes_mn
+    if sensor.leading_mn is not None:
+        yield Hypothesis("force", "", force, len(_UNITS), any_gain=True)
+    loaded = 0.0 if sensor.rest_mn is None else float(np.linalg.norm(sensor.rest_mn))
+    if loaded > sensor.contact_mn:
+        what = f"the sensor's {loaded:.3g} mN at the rest frame: it shows loaded tissue, or the tare is wrong"
+        yield Hypothesis("rest frame", what, force - sensor.rest_mn)
+    turns = [
+        (order, signs)
+        for order in itertools.permutations(range(axes))
+        for signs in itertools.product((1, -1), repeat=axes)
+    ][1:]
+    for order, signs in turns:
+        names = ", ".join(f"{'-' * (s < 0)}f{'xyz'[j]}_n" for j, s in zip(order, signs, strict=True))
+        what = f"axes: the camera's are {names} of force.csv"
+        if tool := set(signs) == {-1} and order == tuple(range(axes)):
+            what = "the sign: force.csv holds the force on the tool (sensor.acts_on)"
+        turned = force.copy()
+        turned[:, :axes] = force[:, list(order)] * signs
+        yield Hypothesis("sensor", what, turned, 1 if tool else len(turns) * (1 + signs.count(-1)))
+    if not sensor.pulsates:
+        for what, at, tried in _clocks(sensor):
+            outside = (at < t[0]) | (at > t[-1])
+            moved = np.stack([np.interp(at, t, axis) for axis in force.T], axis=1)
+            yield Hypothesis("clocks", what, np.where(outside[:, None], np.nan, moved), tried)
+
+
+def _named_gain(one: Hypothesis, gain: float) -> Hypothesis:
+    """The hypothesis of a gain with its size in words."""
+    factor, more = max(gain, 1 / gain) if gain > 0 else np.inf, "smaller" if gain > 1 else "larger"
+    unit = next((name for unit, name in _UNITS.items() if 1 / 1.6 < factor / unit < 1.6), "")
+    what = f"a gain: the sensor's force is {factor:.3g} times {more} than the video's"
+    what += f" (is a unit wrong? {unit})" if unit else f" (E by this factor, the scale by {factor**0.5:.2g}?)"
+    return Hypothesis("sensor" if unit else one.cause, what, one.axes_mn, one.tried, True)
+
+
+def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
+    """Possible faults of the clock, the frames' times (T,) [s] that follow, and their number of the kind."""
+    time_s = sensor.time_s
+    frame, since = float(np.median(np.diff(time_s))), time_s - time_s[0]
+    yield "the clocks: the video runs backwards", time_s[-1] - since, 1
+    most = round(_LATE_S / frame)
+    # Creep delays the tissue by as much as one frame.
+    lags = [k for k in range(-most, most + 1, max(1, 2 * most // _TRIED)) if abs(k) > 1]
+    contact = np.concatenate([[False], sensor.size_mn > sensor.contact_mn, [False]])
+    several = np.count_nonzero(np.diff(contact)) > 2
+    rates = _RATES if since[-1] >= _RATE_S and several else ()
+    for k in (0, *lags):
+        if k:
+            yield f"the sensor's clock is shifted by {k * frame:+.2f} s", time_s - k * frame, len(lags)
+        for rate in rates:
+            what = (
+                f"the sensor's clock runs {1 / rate:.2f} times as fast"
+                + f" and is {k * frame:+.2f} s off" * bool(k)
+            )
+            yield what, time_s[0] + since * rate - k * frame, len(lags) * len(rates)
+    starts = time_s[_PART : -_PART : max(1, 2 * len(time_s) // _TRIED)]
+    for k in lags:
+        what = f"the clocks: {abs(k) * frame:.2f} s of the video are {'missing' if k < 0 else 'repeated'}"
+        for start in starts:
+            at = np.where(time_s < start, time_s, time_s - k * frame)
+            yield f"{what} at {start:.2f} s", at, len(lags) * len(starts)
