@@ -92,14 +92,17 @@ def find_missed(sensor: SensorMotion) -> str:
     held, known = (size >= low - margin) & (size <= high + margin), np.isfinite(low + high)
     count = independent(size - np.linalg.norm(sensor.leading_mn, axis=1)) / len(size)
     contact = size > sensor.contact_mn
-    parts, missed = {"": known, " in contact": known & contact, " without contact": known & ~contact}, []
-    for which, mask in parts.items():
-        share, n = float(held[mask].mean()) if mask.any() else 1.0, max(2.0, count * mask.sum())
+    parts, few = {"": known, " in contact": known & contact, " without": known & ~contact}, False
+    shares = {which: float(held[mask].mean()) for which, mask in parts.items() if mask.any()}
+    for which, share in shares.items():
+        n = max(2.0, count * parts[which].sum())
         # Binomial probability of at most this share.
         chance = betainc(max(n * (1 - share), 1e-9), n * share + 1, 1 - LEVEL)
-        if mask.sum() >= LEAST_FRAMES and share < _HELD and chance < _CHANCE:
-            missed.append(f"{share:.0%} of the sensor's readings{which}")
-    return f"the interval of {LEVEL:.0%} holds {' and '.join(missed)}" if missed else ""
+        few |= bool(parts[which].sum() >= LEAST_FRAMES and share < _HELD and chance < _CHANCE)
+    of = ", ".join(f"{share:.0%}{which}" for which, share in shares.items() if which)
+    return (
+        f"the interval of {LEVEL:.0%} holds {shares['']:.0%} of the sensor's readings ({of})" if few else ""
+    )
 
 
 def independent(curve: Floats) -> float:

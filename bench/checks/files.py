@@ -6,7 +6,7 @@ from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.recording_flow.finding import Finding
 
-_MANY = 0.2  # share of the tissue masked, or of the frames lost, from which to check the recording; by hand
+_MANY = 0.2  # share of the tissue masked, from which to check the recording; by hand
 
 
 def check_notes(recording: Recording) -> list[Finding]:
@@ -30,6 +30,6 @@ def check_pictures(recording: Recording, tracked: TrackedRecording) -> list[Find
 def check_tracking(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masked tissue and lost frames."""
     summary = tracked.summary
-    many = max(summary.shares["masked"], summary.shares["lost"]) > _MANY
+    many = summary.shares["masked"] > _MANY or summary.lost > 0
     message = summary.describe()
     return [Finding("warning" if many else "ok", "tracking", message)] if summary.frames else []

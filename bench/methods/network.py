@@ -14,6 +14,7 @@ from learn import Predictor, load_model
 from learn.inference.force_estimator import ForceEstimator
 from learn.inference.shipped import find_name
 from learn.uncertainty.intervals import LEVEL
+from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 
 
 class Model:
@@ -45,6 +46,15 @@ class Model:
     @property
     def notes(self) -> list[str]:
         """Notes on the estimates of the last recording."""
+        return [note for note in self._all_notes if not note.startswith(OUT_OF_DISTRIBUTION)]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Reasons to doubt these estimates."""
+        return [note for note in self._all_notes if note.startswith(OUT_OF_DISTRIBUTION)]
+
+    @property
+    def _all_notes(self) -> list[str]:
         return [] if self._estimator is None else self._estimator[1].notes + self._estimator[1].interval_notes
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:

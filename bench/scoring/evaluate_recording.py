@@ -27,7 +27,7 @@ from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from synth.arrays import Array, Floats, Mask
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import first_fault, problems
+from synth.recording_flow.finding import by_severity, first_fault, problems
 from synth.recording_flow.flow import LocalFlow
 
 _MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones
@@ -62,7 +62,7 @@ def evaluate_recording(
     sensor = align_sensor(recording, time_s, speed, tracked.turning)
     scored, unscored = _select_frames(meta, tracked, sensor)
     seen = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
-    findings = judge(recording, tracked, seen)
+    findings = by_severity([*judge(recording, tracked, seen), *sensor.findings])
     missing = [one.message for one in findings if one.severity == "missing"]
     result = Result(
         recording=recording.name,

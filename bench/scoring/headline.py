@@ -9,7 +9,6 @@ from bench.bootstrap import Interval
 from bench.methods.comparison import FUSION, MAIN
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
-from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "false_positive_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
@@ -34,7 +33,7 @@ class Headline:
     tiles: tuple[Tile, ...]
     warnings: tuple[str, ...] = ()  # caveats that must be shown with the numbers
     of_peak: float | None = None  # the first tile's error over the contacts' mean peak; None: no error
-    trust: str = ""  # one sentence on lost frames, unfamiliar motion and assumptions
+    trust: str = ""  # one sentence on assumptions and, without findings, on frames and motion
 
 
 def headline(result: Result) -> Headline:
@@ -53,11 +52,6 @@ def headline(result: Result) -> Headline:
     warnings = list(doubts)
     if result.left == 2:
         warnings.append("Only two frames are scored: correlations are meaningless (see the notes)")
-    if result.sync is not None and not result.aligned:
-        warnings.append(
-            f"The clocks could not be aligned ({result.sync.refused}): scored with the stated offset of "
-            f"{result.settings['meta']['sync']['offset_s']:g} s"
-        )
     tiles, of_peak = list[Tile](), main.scores["mae_of_peak"] if result.absolute else None
     if math.isfinite(main.calibrated.get("mae_mn", math.nan)):
         of_peak = main.calibrated["mae_of_peak"]
@@ -73,23 +67,21 @@ def headline(result: Result) -> Headline:
 
 
 def _trust(result: Result) -> str:
-    """One sentence on lost frames, motion unlike the network's training, and assumed tissue and scale."""
-    meta, frames, lost = result.settings["meta"], len(result.lost), int(result.lost.sum())
-    parts = [f"{lost} of {frames} frames were lost" if lost else f"None of {frames} frames was lost"]
-    network = MAIN if result.main == FUSION else result.main
-    scored = result.methods.get(
-        network
-    )  # networks without intervals have no check of their training distribution
-    if network in result.settings.get("networks", {}) and scored is not None and scored.low_mn is not None:
-        unlike = any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes)
-        parts.append(f"the motion is {'unlike' if unlike else 'like'} that of the network's training data")
+    """One sentence on the assumed tissue and scale and, without findings, on frames and motion."""
+    meta, network = result.settings["meta"], MAIN if result.main == FUSION else result.main
+    parts = [] if result.findings else [f"None of {len(result.lost)} frames was lost"]
+    scored = result.methods.get(network)
+    # Networks without intervals have no check of their training distribution; its findings are the method's.
+    if parts and network in result.settings.get("networks", {}) and scored and scored.low_mn is not None:
+        parts.append("the motion is like that of the network's training data")
     young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E = 1 kPa (unknown)"
     assumed = [young + _within(meta.get("young_uncertainty", 0.0))]
     guessed = meta.get("scale_mm_per_px") == "unknown"
     scale = " (unknown)" if guessed else _within(result.scale.uncertainty)
     assumed.append(f"{result.scale.mm_per_px:.3g} mm/px{scale}")
     assumed.append(f"membrane {meta.get('membrane', 'unknown')}")
-    return "; ".join([*parts, f"assumed: {', '.join(assumed)}"]) + "."
+    parts.append(f"{'a' if parts else 'A'}ssumed: {', '.join(assumed)}")
+    return "; ".join(parts) + "."
 
 
 def _within(uncertainty: float) -> str:

@@ -13,6 +13,7 @@ from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation, find_rotation
 from synth.arrays import Floats
+from synth.recording_flow.finding import Finding
 from synth.recording_flow.pulse import SurfaceMotion
 
 
@@ -27,6 +28,7 @@ class AlignedSensor:
     rotation: SensorRotation | None = None  # found on `sensor.turn_s`; None without that span
     in_camera_axes: bool = False
     notes: tuple[str, ...] = ()  # for the user
+    findings: tuple[Finding, ...] = ()
 
     @property
     def size_mn(self) -> Floats | None:
@@ -63,8 +65,14 @@ def align_sensor(
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if 0 < covered < len(time_s):
         notes.append(f"the sensor covers {covered} of {len(time_s)} frames; only those are scored")
+    refused = list[Finding]()
+    if found is not None and found.refused:
+        scored = f"scored with the stated offset of {offset_s:g} s"
+        refused = [
+            Finding("warning", "clocks", f"the clocks could not be aligned ({found.refused}): {scored}")
+        ]
     about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
-    return AlignedSensor(axes if covered else None, *about)
+    return AlignedSensor(axes if covered else None, *about, tuple(refused))
 
 
 def describe_span(span: Span) -> str:

@@ -137,13 +137,14 @@ def _describe(
     """Adds summary, findings and notes after the last frame."""
     rest, decoder = video.rest, video.decoder
     out.summary, out.size, out.notes = video.summary, rest.size, video.notes
-    out.findings, out.decoded, out.rest_s = video.findings, decoder.decoded, rest.time_s
+    out.findings, out.decoded, out.rest_s = [*video.findings], decoder.decoded, rest.time_s
     out.scale_mm_per_px = mm_per_px / rest.shrink
     out.repeats = decoder.faults.repeats()
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
     for name, method in methods.items():
         out.notes += [f"{name}: {note}" for note in getattr(method, "notes", ())]
+        out.findings += [Finding("warning", name, one) for one in getattr(method, "warnings", ())]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:

@@ -150,7 +150,10 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
     if rates_hz is None:
         return None
     known = _design(t, rhythms)
-    u, s, _ = np.linalg.svd(y - known @ np.linalg.lstsq(known, y, rcond=None)[0], full_matrices=False)
+    left = y - known @ np.linalg.lstsq(known, y, rcond=None)[0]
+    if not left.any():  # tissue that never moves has no rate
+        return None
+    u, s, _ = np.linalg.svd(left, full_matrices=False)
     main = u[:, : RHYTHM.main] * s[: RHYTHM.main]
 
     def loss(rate: float) -> float:

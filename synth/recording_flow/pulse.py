@@ -139,18 +139,16 @@ def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = (
     if len(time_s) < CELLS.frames:
         return _too_few(time_s)
     cells = _Cells(surface, np.array([1.0, 1.0, surface.depth_weight])[: surface.motion[0].shape[2]])
-    if len(cells.basis) < 2 * cells.basis.shape[1]:
-        return PulseSearch(None, time_s, None, "too little of the picture is tracked tissue")
-    usable = (cells.weight > 0).mean(axis=1) > 0.5
+    usable = (cells.weight > 0).mean(axis=1) > 0.5 if cells.used.any() else np.zeros(len(time_s), bool)
+    if len(cells.basis) < 2 * cells.basis.shape[1] or usable.sum() < CELLS.frames:
+        return PulseSearch(None, time_s[usable], None, "too little of the picture is tracked tissue")
     if free_s:
         smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
     else:
         # Frames about as smooth as the smoothest fifth: motion by a contact is less smooth.
         misfit = cells.misfit(cells.coefficients)
-        smooth = usable
-        if usable.any():
-            most = CELLS.smooth * np.quantile(misfit[usable], CELLS.smoothest) + CELLS.noise_px
-            smooth = usable & (misfit <= most)
+        most = CELLS.smooth * np.quantile(misfit[usable], CELLS.smoothest) + CELLS.noise_px
+        smooth = usable & (misfit <= most)
     rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= CELLS.frames else None
     if rates_hz is None:
         return _too_few(time_s[smooth])
@@ -189,10 +187,11 @@ class _Cells:
 
     @cached_property
     def coefficients(self) -> Floats:
-        """Coefficients (T, B, C) of the polynomials that fit each frame best."""
+        """Coefficients (T, B, C) of the polynomials that fit each frame best; 0 where no cell is visible."""
         gram = np.einsum("tp,pa,pb->tab", self.weight, self.basis, self.basis, optimize=True)
         size = gram.shape[1]
-        gram += 1e-3 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / size * np.eye(size)
+        mean = np.trace(gram, axis1=1, axis2=2)[:, None, None] / size
+        gram += np.where(mean > 0, 1e-3 * mean, 1.0) * np.eye(size)
         right = np.einsum("tp,pa,tpc->tac", self.weight, self.basis, self.motion, optimize=True)
         return np.asarray(np.linalg.solve(gram, right), np.float64)
 

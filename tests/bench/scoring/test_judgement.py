@@ -60,7 +60,7 @@ def test_load_at_the_rest_frame_or_in_a_free_span_is_found_by_check_and_score(
     assert set(loaded) <= set(check_recording(folder))
 
 
-TIME = np.arange(60) / 10
+TIME = np.arange(120) / 10
 PRESS = np.sin(TIME * 1.3)[:, None] ** 2 * [1.0, -2.0, 4.0] + np.sin(TIME)[:, None] ** 4 * [3.0, 1.0, 0.0]
 
 
@@ -71,28 +71,33 @@ def at(time_s: np.ndarray) -> np.ndarray:
 
 SENSORS = {
     "mN for N": (1000 * PRESS, "error", "sensor"),
+    "E too large by 5": (PRESS / 5, "error", "force"),
+    "rest frame under load": (PRESS - [1.0, -2.0, 4.0], "error", "rest frame"),
     "on the tool": (-PRESS, "warning", "sensor"),
     "axes permuted": (PRESS[:, [1, 2, 0]], "warning", "sensor"),
     "constant": (0 * PRESS + 2.0, "error", "sensor"),
     "saturated": (PRESS.clip(-9, 2.0), "warning", "sensor"),
-    "0.6 s late": (np.roll(PRESS, 6, axis=0), "warning", "clocks"),
-    "a clock 8% slow": (at(0.92 * TIME), "warning", "clocks"),
-    "backwards": (PRESS[::-1], "warning", "clocks"),
-    "0.5 s of the video missing": (np.concatenate([PRESS[:25], PRESS[20:55]]), "warning", "clocks"),
+    "0.6 s late": (np.roll(PRESS, 6, axis=0), "error", "clocks"),
+    "a clock 8% slow": (at(0.92 * TIME), "error", "clocks"),
+    "backwards": (PRESS[::-1], "error", "clocks"),
+    "0.5 s of the video missing": (np.concatenate([PRESS[:55], PRESS[50:115]]), "warning", "clocks"),
 }
 
 
 def findings(axes: np.ndarray, methods: list[np.ndarray]) -> set[tuple[str, str]]:
-    """Severity and cause of findings on a sensor (T, 3) next to the motion of `PRESS` and forces (T, 3)."""
-    sensor = SensorMotion(TIME, axes, np.linalg.norm(PRESS, axis=1) ** 0.9, tuple(methods), 3)
+    """Severity and cause of findings on a sensor (T, 3) next to the motion of `PRESS` and forces (T, 3), the
+    first with an interval of 40%."""
+    bounds = np.linalg.norm(methods[0], axis=1)[:, None] * [0.6, 1.4]
+    moved, leading = np.linalg.norm(PRESS, axis=1) ** 0.9, methods[0]
+    sensor = SensorMotion(TIME, axes, moved, tuple(methods), 3, leading, bounds, axes[0])
     return {(one.severity, one.cause) for check in SENSOR_CHECKS for one in check(sensor)}
 
 
 @pytest.mark.parametrize("case", SENSORS)
 def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
-    methods = [0.6 * PRESS, 1.5 * PRESS]
+    methods = [0.8 * PRESS, 1.2 * PRESS]
     assert findings(PRESS, methods) == set()
-    assert findings(PRESS, [60 * PRESS]) == set(), "one method may be wrong itself"
+    assert findings(PRESS, [60 * PRESS]) == {("warning", "force")}, "one method may be wrong itself"
     spiked = PRESS + 400 * (np.arange(len(PRESS)) == 3)[:, None]
     noise = np.random.default_rng(1).normal(0, 0.3, PRESS.shape)
     for doubtful in (spiked, noise):
