@@ -12,6 +12,7 @@ from synth.recording_flow.finding import Finding
 _FROZEN = 3  # frames
 _BEHIND_PX = 1.0  # disparity of tissue minus that of the tool, which hides tissue and so is nearer than it
 _OFF_ROWS_PX, _OTHER_ROWS_PX = 0.5, 2.0  # of reduced frames: an outdated calibration, one of another pair
+_SOFT = 0.7  # least share of fine detail over that of the left camera; clean: at least 0.9
 _NOISY_MM = 0.16  # depth motion from which force is no better than monocular
 # Logarithm of the stated scale over the stereo scale: from the first they contradict each other, from the
 # second the error of force is too large for any result.
@@ -39,7 +40,7 @@ def check_pairing(recording: Recording, tracked: TrackedRecording) -> list[Findi
 
 
 def check_quality(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
-    """Findings on the calibration and on the noise of depth motion."""
+    """Findings on the right camera's calibration, motion and focus, and on the noise of depth motion."""
     stereo = tracked.stereo
     if stereo is None:
         return []
@@ -47,7 +48,16 @@ def check_quality(recording: Recording, tracked: TrackedRecording) -> list[Findi
         rows = f"rows of left and right picture are {stereo.epipolar_px:.2g} px off"
         return [Finding("error", "stereo", f"{rows}: is the calibration of this camera pair?")]
     poor = stereo.epipolar_px > _OFF_ROWS_PX or not stereo.noise_mm < _NOISY_MM
-    return [Finding("warning" if poor else "ok", "stereo", stereo.describe())]
+    found = [Finding("warning" if poor else "ok", "stereo", stereo.describe())]
+    found += [Finding("warning", "camera", f"right camera: {text}") for text in stereo.motion]
+    if stereo.last_rows_px > max(_OFF_ROWS_PX, 2 * stereo.epipolar_px):
+        moved = f"rows of left and right picture are {stereo.last_rows_px:.2g} px off at the end, but"
+        moved += f" {stereo.epipolar_px:.2g} px in the rest frame: was the right camera bumped?"
+        found.append(Finding("error", "stereo", moved))
+    if stereo.sharpness < _SOFT:
+        share = f"has {100 * stereo.sharpness:.0f}% of the left camera's fine detail: is it out of focus?"
+        found.append(Finding("warning", "stereo", f"the right camera {share}"))
+    return found
 
 
 def check_scale(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

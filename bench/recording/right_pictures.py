@@ -33,6 +33,9 @@ class StereoQuality(stereo.StereoQuality):
     tool_behind_px: float = 0.0  # disparity of the surrounding tissue minus that of the tool; 0: unknown
     lag_s: float = 0.0  # of the right camera; negative: early; 0: none, or unknown
     lag_from_s: float | None = None  # time from which on it is late or early; None: the start
+    last_rows_px: float = 0.0  # as `epipolar_px`, in the last frame; 0: unknown
+    sharpness: float = 1.0  # share of fine detail over that of the left camera
+    motion: tuple[str, ...] = ()  # sentences on the motion of the right camera
 
     def describe(self) -> str:
         """The quality in words."""
@@ -48,7 +51,7 @@ class RightPictures:
     def __init__(self, video: VideoPass) -> None:
         self._video = video
         self._timing: StereoTiming | None = None
-        self._last: tuple[Pixels, Pixels] | None = None
+        self._last: tuple[Pixels, Pixels, Mask] | None = None  # and the visible tissue
         self._copied, self._frozen, self._largest = True, 0, 0
         self._tool: tuple[Mask, Pixels, Pixels] | None = None  # largest tool mask, and its frame's pictures
 
@@ -59,15 +62,16 @@ class RightPictures:
             return
         masked = frame.hidden
         if self._timing is None:
-            self._timing = StereoTiming(camera.stereo, left, right, self._video.rest.tissue & ~masked)
-        else:
-            self._timing.add(left, right, frame.time_s or 0.0)
+            self._timing = StereoTiming(camera.stereo.rectified)
+            self._sharpness = _sharpness(right) / max(_sharpness(left), 1e-6)
+        self._timing.add(left, right, frame.time_s or 0.0)
         # A flat surface may look the same in both cameras, but not in every frame.
         self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
-        if self._last is not None:
-            before_left, before_right = self._last
-            self._frozen += _change(right, before_right) < _SAME * _change(left, before_left)
-        self._last = left, right
+        if self._last is not None:  # without noise, of which a camera out of focus or frozen has less or more
+            pairs = zip((left, right), self._last[:2], strict=True)
+            change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)
+            self._frozen += other < _SAME * change
+        self._last = left, right, self._video.rest.tissue & ~masked
         tool = masked & ~mask_detection.glare(left, 3)
         if tool.sum() > max(_LEAST_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
@@ -83,7 +87,19 @@ class RightPictures:
             return StereoQuality(**vars(found))
         numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
         pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
-        return StereoQuality(*numbers, *pair, *self._timing.find_lag_s())
+        late = (*pair, *self._timing.find_lag_s(), self._last_rows_px(camera.stereo.rectified))
+        return StereoQuality(*numbers, *late, self._sharpness, tuple(camera.describe()))
+
+    def _last_rows_px(self, rectified: Rectified) -> float:
+        """See `StereoQuality`."""
+        if self._last is None:
+            return 0.0
+        *pair, tissue = self._last
+        pictures = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
+        try:
+            return rest.match(*pictures, rectified.flags(tissue, 0), np.ones_like(tissue)).epipolar_px
+        except UserError:  # too little in common
+            return 0.0
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
         """See `StereoQuality`."""
@@ -101,6 +117,12 @@ class RightPictures:
         if min(inner.sum(), around.sum()) < _LEAST_TOOL / 2:
             return 0.0
         return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
+
+
+def _sharpness(rgb: Pixels) -> float:
+    """Detail of 1 to 2 px, which is coarser than noise, over that of 4 to 8 px."""
+    levels = [cv2.GaussianBlur((rgb @ image.GREY), (0, 0), width) for width in (1, 2, 4, 8)]
+    return float((levels[0] - levels[1]).std() / max((levels[2] - levels[3]).std(), 1e-6))
 
 
 def _change(one: Pixels, other: Pixels) -> float:

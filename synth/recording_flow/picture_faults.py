@@ -30,12 +30,15 @@ class Thresholds:
     even: float = 4.0  # grey levels, largest standard deviation within a row of a bar
     same: float = 0.1  # change from picture to picture over the usual one below which a picture is repeated
     still: float = 0.2  # grey levels, least change of the stillest part of a picture with sensor noise
+    noise: float = 1.0  # grey levels, likewise, from which that change is steady; coding makes less vary
+    stale: float = 0.7  # that change over the usual one below which the noise is no new one; clean: 0.77
     caught_up: float = 1.6  # change after repeated pictures over the usual one that shows a delay
     leapt: float = 3.0  # change over those before and after that shows a jump
 
 
 LIMITS = Thresholds()
 _SOME = 5  # most times that a message lists
+_AROUND = 25  # pictures before and after one in which the usual noise is measured
 _STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise distinguishes two pictures
 
 
@@ -131,13 +134,19 @@ class VideoFaults:
     def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
         """Repeated pictures as {number: number of the picture shown}, certain ones, and those for which the
         tissue may just have been still. The rest frame has number -1."""
-        change, quiet, _ = np.array(self._changes).reshape(-1, 3).T
+        change, quiet, median = np.array(self._changes).reshape(-1, 3).T
         surely, maybe = dict[int, int](), dict[int, int]()
         if not change.any():
             return surely, maybe
         usual = float(np.median(change[change > 0]))
         noisy = float(np.median(quiet[change > 0])) > LIMITS.still
-        same = np.concatenate([[False], change < LIMITS.same * usual, [False]]).astype(int)
+        # Noise on copies of a picture hides that they are equal, but each new exposure has noise of its own.
+        # It must be usual before and after: a change of light or gain changes it for good.
+        levels = np.column_stack([quiet, median])
+        spans = [(levels[max(k - _AROUND, 0) : k + 1], levels[k : k + _AROUND]) for k in range(len(levels))]
+        floor = np.array([np.minimum(*(np.median(span, axis=0) for span in pair)) for pair in spans])
+        stale = ((floor > LIMITS.noise) & (levels < LIMITS.stale * floor)).all(axis=1)
+        same = np.concatenate([[False], stale | (change < LIMITS.same * usual), [False]]).astype(int)
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
             caught_up = stop < len(change) and change[stop] > LIMITS.caught_up * usual
             shown = self._numbers[first - 1] if first else -1

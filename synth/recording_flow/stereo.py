@@ -97,6 +97,10 @@ class RightCamera:
         self._noise.append(_noise(moved, tissue))
         return replace(frame, right=right, motion=moved)
 
+    def describe(self) -> list[str]:
+        """Sentences on this camera's motion, after the last frame."""
+        return [] if self._camera is None else self._camera.describe(self._rest.shrink)
+
     def depth_mm(self) -> Map | None:
         """Depth (h, w) in the last frame, NaN where unknown, by stereo matching; None: unknown."""
         if self.stereo is None or self._pair is None:

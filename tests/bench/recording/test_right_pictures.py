@@ -180,7 +180,14 @@ PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
 
 @pytest.mark.parametrize(
     "fault",
-    [{"copied": True}, {"frozen": 3}, {"tool_behind_px": 2.0}, {"lag_s": -0.1}, {"epipolar_px": 3.0}],
+    [
+        {"copied": True},
+        {"frozen": 3},
+        {"tool_behind_px": 2.0},
+        {"lag_s": -0.1},
+        {"epipolar_px": 3.0},
+        {"last_rows_px": 1.8},
+    ],
 )
 def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: dict[str, float]) -> None:
     recording = open_recording(make("right"))
@@ -191,6 +198,7 @@ def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: dict[str, flo
 
     assert severities(PAIR) == {"ok"}
     assert severities(replace(PAIR, noise_mm=0.3)) == {"warning"}
+    assert "warning" in severities(replace(PAIR, sharpness=0.5))
     assert "error" in severities(replace(PAIR, **fault))
 
 
@@ -211,10 +219,13 @@ def test_a_lag_of_the_right_camera_is_found_by_its_motion(
     order: Callable[[NDArray[np.intp]], NDArray[np.intp]], lag: int
 ) -> None:
     rng = np.random.default_rng(3)
-    level = np.sin(np.linspace(0, 2 * np.pi, 24))[:, None, None] ** 2
-    left = level * rng.normal(size=(1, 40, 2)) * 3 + rng.normal(0, 0.05, (24, 40, 2))
-    right = level[order(np.arange(24))] * left[6] + [0.1, 0] * level + rng.normal(0, 0.05, (24, 40, 2))
-    right[5:8, :9] = np.nan
-    found, since = find_lag(left, right)
+    rows, frames = np.arange(60), np.arange(24)[:, None]
+    place = np.where(
+        frames < 6, 5 * frames, np.where(frames < 18, 30, 30 + 4 * (frames - 18))
+    )  # moves, rests
+    left = 5 * np.exp(-(((rows - place) / 6) ** 2)) * np.diff(place, axis=0, prepend=-5).clip(0, 1)
+    left = left + np.sin(frames / 3) ** 2 * np.exp(-(((rows - 30) / 15) ** 2)) + 2
+    right = 0.8 * left[order(np.arange(24))] + rng.normal(0, 0.05, left.shape)
+    found, since = find_lag(left + rng.normal(0, 0.05, left.shape), right)
     assert found == lag
     assert (since > 5) == (lag < 0)
