@@ -72,7 +72,8 @@ class RightPictures:
             change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)
             self._frozen += other < _SAME * change
         self._last = left, right, self._video.rest.tissue & ~masked
-        tool = masked & ~mask_detection.glare(left, 3)
+        detected = masked if frame.proposal is None else masked | frame.proposal.tool
+        tool = detected & ~mask_detection.glare(left, 3)
         if tool.sum() > max(_LEAST_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 

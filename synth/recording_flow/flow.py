@@ -130,5 +130,6 @@ def with_flow(frame: FrameMotion, found: FrameMotion) -> FrameMotion:
         time_s=frame.time_s,
         rgb=frame.rgb,
         camera=frame.camera,
+        proposal=frame.proposal,
         masking_s=frame.masking_s,
     )

@@ -29,9 +29,14 @@ class Thresholds:
     lost: float = 0.02  # least share of the tissue that an occluder covers
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
+    wide: float = (
+        0.2  # least width of a hand that is detected as a tool, over that of the picture; tools: 0.1
+    )
+    wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
 
 LIMITS = Thresholds()
+_WIDE = "is wider than an instrument"
 
 
 class ForegroundSearch:
@@ -43,12 +48,19 @@ class ForegroundSearch:
         self._surface: tuple[Map, float] | None = None
         self._found: dict[str, list[tuple[float, str, Mask]]] = {}
         self._masked = ~tissue  # in any frame: masks are often selected only once something moves
+        self._width_px = 0.0  # of the widest tool at rest
+        # Where the tissue is unknown, what is in front of it from the start may be its surroundings.
+        self._surroundings = np.zeros_like(tissue)
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
         """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
         masked = ~self._tissue
         for known in (frame.masked, frame.rest_masked, frame.confidence == 0 if frame.is_rest else None):
             masked = masked if known is None else masked | known
+        # A tool whose mask is not used, because it does no harm, is no foreign object either.
+        tool = np.zeros_like(masked) if frame.proposal is None else frame.proposal.tool
+        self._find_wide(tool, frame)
+        masked = masked | tool
         self._masked |= masked
         free = cv2.erode((~masked).astype(np.uint8), _square(LIMITS.near_px), borderValue=1) > 0
         if depth_mm is not None:
@@ -56,7 +68,10 @@ class ForegroundSearch:
             surface, deviation = self._surface
             with np.errstate(invalid="ignore"):
                 high = surface - depth_mm > max(LIMITS.front_mm, LIMITS.sigmas * deviation)
-            self._note("stands in front of the tissue", high & free, frame, LIMITS.front)
+            if frame.is_rest and self._tissue.all():
+                self._surroundings = cv2.dilate(high.astype(np.uint8), _square(LIMITS.near_px)) > 0
+            high &= free & ~self._surroundings
+            self._note("stands in front of the tissue", high, frame, LIMITS.front)
         if frame.is_rest or not frame.trusted:
             return
         lost = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
@@ -72,11 +87,20 @@ class ForegroundSearch:
     def findings(self) -> list[Finding]:
         """The largest object of each kind that is found in two frames or more and not masked in others."""
         found = []
-        for places in self._found.values():
-            unmasked = [(share, text) for share, text, where in places if self._masked[where].mean() < 0.5]
+        for why, places in self._found.items():
+            free = [why == _WIDE or self._masked[where].mean() < 0.5 for *_, where in places]
+            unmasked = [(share, text) for (share, text, _), use in zip(places, free, strict=True) if use]
             if len(unmasked) > 1:
                 found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
+
+    def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
+        """Notes a detected tool that is wider than tools are and than those at rest."""
+        depth_px = cv2.distanceTransform(tool.astype(np.uint8), cv2.DIST_L2, 5)
+        if frame.is_rest:
+            self._width_px = 2 * float(depth_px.max())
+        least = max(LIMITS.wide * tool.shape[1], LIMITS.wider * self._width_px)
+        self._note(_WIDE, 2 * depth_px > least, frame, 0.0)
 
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
         """Stores the largest component if it has this share of tissue and this extent in picture widths."""

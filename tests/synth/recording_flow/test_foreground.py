@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from synth.flow.mask_selection import Proposal
 from synth.recording_flow.foreground import ForegroundSearch, fit_surface, flow_jump
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -22,7 +23,7 @@ def load(peak_px: float) -> NDArray[np.float32]:
 
 
 def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked: bool = False) -> list[str]:
-    search = ForegroundSearch(np.ones(SHAPE, bool), 1)
+    search = ForegroundSearch(SHAPE[1] - 1 > X, 1)  # stated: it does not fill the picture
     for k in range(4):
         sure = np.ones(SHAPE, np.float32)
         mask = ROD if masked else None
@@ -43,6 +44,18 @@ def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(pea
         x, y = map(int, re.findall(r"\d+", message)[:2])
         assert ROD[max(y - 10, 0) : y + 10, x].any()
     assert found(rigid, np.where(ROD, flat - 6, flat), masked=True) == []
+
+
+@pytest.mark.parametrize(("half_width", "reported"), [(8, False), (24, True)])
+def test_a_detected_instrument_is_no_foreign_object_but_a_hand_is(half_width: int, reported: bool) -> None:
+    tool, none = (np.abs(Y - 60) < half_width) & (X < 90), np.zeros(SHAPE, bool)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1)
+    for k in range(4):
+        sure = np.where(tool & (k > 0), 0.1, 1).astype(np.float32)  # hidden, but its mask is not used
+        proposal = Proposal(none, tool & (k > 0), none)
+        frame = FrameMotion(k * load(2.0), sure, is_rest=k == 0, index=k, proposal=proposal)
+        search.add(frame, (300 - 6.0 * (tool & (k > 0))).astype(np.float32))
+    assert bool(search.findings) is reported
 
 
 def test_the_surface_follows_the_tissue_and_a_slope_is_not_a_jump() -> None:
