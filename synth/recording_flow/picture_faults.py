@@ -166,7 +166,7 @@ class VideoFaults:
             (self._combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
             ([at[k] for k in sorted(again)], "the previous one again: frozen or doubled"),
-            (cuts, "very different from their neighbours: are frames missing, or is there a cut or a bump?"),
+            (cuts, "unlike their neighbours: are frames missing, or is there a cut, a bump or other light?"),
         ):
             if times:
                 some = ", ".join(f"{t:.2f}" for t in times[:_SOME]) + (", ..." if len(times) > _SOME else "")
