@@ -88,17 +88,17 @@ class RightPictures:
             return StereoQuality(**vars(found))
         numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
         pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
-        late = (*pair, *self._timing.find_lag_s(), self._last_rows_px(camera.stereo.rectified))
-        return StereoQuality(*numbers, *late, self._sharpness, tuple(camera.describe()))
+        later = self._last_rows_px(camera.stereo.rectified), self._sharpness, tuple(camera.describe())
+        return StereoQuality(*numbers, *pair, *self._timing.find_lag_s(), *later)
 
     def _last_rows_px(self, rectified: Rectified) -> float:
         """See `StereoQuality`."""
         if self._last is None:
             return 0.0
         *pair, tissue = self._last
-        pictures = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
+        left, right = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
         try:
-            return rest.match(*pictures, rectified.flags(tissue, 0), np.ones_like(tissue)).epipolar_px
+            return rest.match(left, right, rectified.flags(tissue, 0), np.ones_like(tissue)).epipolar_px
         except UserError:  # too little in common
             return 0.0
 
