@@ -84,7 +84,7 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
 
 def find_missed(sensor: SensorMotion) -> str:
     """Which frames' 90% interval holds clearly fewer of the sensor's readings than stated; empty: none."""
-    if sensor.leading_mn is None or sensor.bounds_mn is None:
+    if sensor.leading_mn is None or sensor.bounds_mn is None or not np.isfinite(sensor.bounds_mn).any():
         return ""
     size = sensor.size_mn
     margin = 0.5 * sensor.contact_mn
@@ -100,9 +100,8 @@ def find_missed(sensor: SensorMotion) -> str:
         chance = betainc(max(n * (1 - share), 1e-9), n * share + 1, 1 - LEVEL)
         few |= bool(parts[which].sum() >= LEAST_FRAMES and share < _HELD and chance < _CHANCE)
     of = ", ".join(f"{share:.0%}{which}" for which, share in shares.items() if which)
-    return (
-        f"the interval of {LEVEL:.0%} holds {shares['']:.0%} of the sensor's readings ({of})" if few else ""
-    )
+    holds = f"holds {shares['']:.0%} of the sensor's readings ({of})"
+    return f"the interval of {LEVEL:.0%} {holds}" if few else ""
 
 
 def independent(curve: Floats) -> float:
@@ -238,11 +237,11 @@ def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
     rates = _RATES if since[-1] >= _RATE_S and several else ()
     for k in (0, *lags):
         if k:
-            yield f"the sensor's clock is shifted by {k * frame:+.2f} s", time_s - k * frame, len(lags)
+            yield f"the sensor's clock: add {k * frame:+.2f} s (sync.offset_s)", time_s - k * frame, len(lags)
         for rate in rates:
             what = (
                 f"the sensor's clock runs {1 / rate:.2f} times as fast"
-                + f" and is {k * frame:+.2f} s off" * bool(k)
+                + f" (add {k * frame:+.2f} s too)" * bool(k)
             )
             yield what, time_s[0] + since * rate - k * frame, len(lags) * len(rates)
     starts = time_s[_PART : -_PART : max(1, 2 * len(time_s) // _TRIED)]

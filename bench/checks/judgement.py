@@ -36,6 +36,7 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     clocks.check_overlap,
     clocks.check_margin,
     sensor.check_rest_frame,
+    sensor.check_start,
 )
 """Checks of the pictures, of which a few or all are tracked."""
 

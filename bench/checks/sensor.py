@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.methods.flow_size import FlowSize
+from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.fusion import Fusion
 from bench.methods.protocol import Method
 from bench.recording.folder import Recording
@@ -22,6 +22,9 @@ from synth.recording_flow.finding import Finding
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
 _LOADED = 0.25  # share of the range of force above which the tissue is not at rest; by hand
+# By hand: step of the motion of tissue at rest over the largest motion; how long it rests after a load [s];
+# least time in the rest frame's state that is a rest [s].
+_CALM, _RESTS_S, _LEFT_S = 0.06, 0.6, 0.4
 LEAST_FRAMES = 8  # for a judgement on the sensor; by hand
 _CONSTANT = 3  # frames of constant force that are no saturation
 _MOVES = 0.25  # share of the largest motion during constant force, from which it is one
@@ -81,6 +84,44 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
     lowest = f"the minimum is {least:.3g} mN at {t[size.argmin()]:.3g} s"
     message = f"the sensor measures {there:.3g} mN at the rest frame; {lowest}"
     return [Finding("warning", "rest frame", message)]
+
+
+def check_start(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings, from the video alone, on a rest frame under load if there is no sensor that shows it."""
+    moved = next((tracked.force_mn[name] for name in flow_sizes() if name in tracked.force_mn), None)
+    known = np.array(tracked.trusted)
+    if recording.force is not None or moved is None or known.sum() < LEAST_FRAMES:
+        return []
+    found = find_other_rest(np.array(tracked.time_s)[known], np.array(moved)[known, 0])
+    if found is None:
+        return []
+    message = f"from {found[0]:.3g} s the tissue rests in another state than the rest frame's: the video "
+    message += "starts under load, or a tool holds the tissue at its end"
+    return [Finding("warning" if found[1] else "missing", "rest frame", message)]
+
+
+def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
+    """When tissue comes to rest in another state than the rest frame's, and whether it never rests in that.
+
+    Tissue that was loaded in the rest frame rests when the load has gone. Under a contact that lasts to the
+    end it does so too, but mostly after it has rested in the rest frame. None: it rests there only.
+
+    Args:
+        time_s: (T,) times of the frames [s].
+        moved: (T,) mean motion since the rest frame, any unit.
+    """
+    share = moved / max(float(moved.max()), 1e-12)
+    calm = np.abs(np.diff(share, prepend=share[0])) < _CALM
+
+    def longest(state: Mask) -> tuple[float, float]:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], state, [False]])))
+        runs = [(time_s[b - 1] - time_s[a], time_s[a]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return max(runs, default=(0.0, 0.0))
+
+    (rests_s, since_s), (before_s, _) = longest(calm & (share > 0.5)), longest(calm & (share < 0.3))
+    # A plateau of a contact is left again.
+    ends = bool((share[time_s >= since_s] > 0.5).all())
+    return (float(since_s), before_s < _LEFT_S) if rests_s >= _RESTS_S and ends else None
 
 
 @dataclass(frozen=True)
