@@ -124,7 +124,8 @@ def _estimate(sensor: SensorMotion) -> tuple[Floats, tuple[float, float]]:
     if not pressed.any():
         return sensor.leading_mn, (1 / _BEYOND, _BEYOND)
     with np.errstate(divide="ignore"):
-        return sensor.leading_mn, tuple(float(np.median(size[pressed] / end[pressed])) for end in (high, low))
+        least, most = (float(np.median(size[pressed] / end[pressed])) for end in (high, low))
+    return sensor.leading_mn, (least, most)
 
 
 def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> Iterator[_Judged]:
@@ -152,7 +153,7 @@ def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> I
     now = float(np.clip(_gain(size, sensor.size_mn), *gains))
     count = independent(size - now * sensor.size_mn)
     for one in hypotheses(sensor, n):
-        inside = np.isfinite(one.axes_mn).all(axis=1)
+        inside: Mask = np.asarray(np.isfinite(one.axes_mn).all(axis=1))
         if inside.sum() < max(_COMMON * len(inside), LEAST_FRAMES):
             continue
         free = _gain(size[inside], np.linalg.norm(one.axes_mn[inside], axis=1))
@@ -191,10 +192,11 @@ def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:
     t, force = sensor.time_s, sensor.axes_mn
     if sensor.leading_mn is not None:
         yield Hypothesis("force", "", force, len(_UNITS), any_gain=True)
-    loaded = 0.0 if sensor.rest_mn is None else float(np.linalg.norm(sensor.rest_mn))
+    rest_mn = np.zeros(3) if sensor.rest_mn is None else sensor.rest_mn
+    loaded = float(np.linalg.norm(rest_mn))
     if loaded > sensor.contact_mn:
         what = f"the sensor's {loaded:.3g} mN at the rest frame: it shows loaded tissue, or the tare is wrong"
-        yield Hypothesis("rest frame", what, force - sensor.rest_mn)
+        yield Hypothesis("rest frame", what, force - rest_mn)
     turns = [
         (order, signs)
         for order in itertools.permutations(range(axes))

@@ -113,15 +113,16 @@ def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
     share = moved / max(float(moved.max()), 1e-12)
     calm = np.abs(np.diff(share, prepend=share[0])) < _CALM
 
-    def longest(state: Mask) -> tuple[float, float]:
+    def runs(state: Mask) -> list[tuple[float, float]]:
+        """Start and duration [s] of each run."""
         edges = np.flatnonzero(np.diff(np.concatenate([[False], state, [False]])))
-        runs = [(time_s[b - 1] - time_s[a], time_s[a]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        return max(runs, default=(0.0, 0.0))
+        return [(time_s[a], time_s[b - 1] - time_s[a]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
-    (rests_s, since_s), (before_s, _) = longest(calm & (share > 0.5)), longest(calm & (share < 0.3))
+    since_s = max((start for start, lasts in runs(calm & (share > 0.5)) if lasts >= _RESTS_S), default=np.inf)
     # A plateau of a contact is left again.
-    ends = bool((share[time_s >= since_s] > 0.5).all())
-    return (float(since_s), before_s < _LEFT_S) if rests_s >= _RESTS_S and ends else None
+    if not since_s < np.inf or (share[time_s >= since_s] < 0.5).any():
+        return None
+    return float(since_s), max((lasts for _, lasts in runs(calm & (share < 0.3))), default=0.0) < _LEFT_S
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class TrackingSummary:
 
     def describe(self) -> str:
         """A sentence for reports."""
-        masked = f"{100 * self.shares['masked']:.2g}% of the tissue is masked on average; "
+        masked = f"{100 * self.shares['masked']:.3g}% of the tissue is masked on average; "
         lost = f"{self.lost} of {self.frames} frames could not be tracked"
         again = f", {self.reinitialised} only at a second attempt" if self.reinitialised else ""
         return masked + lost + again

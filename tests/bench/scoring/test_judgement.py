@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from bench.checks.check_recording import check_recording
 from bench.checks.judgement import SENSOR_CHECKS
-from bench.checks.sensor import SensorMotion
+from bench.checks.sensor import SensorMotion, find_other_rest
 from bench.cli import app
 from bench.scoring.headline import headline
 from bench.scoring.result import as_json
@@ -104,6 +104,25 @@ def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
         assert "error" not in {severity for severity, _ in findings(doubtful, methods)}
     wrong, severity, cause = SENSORS[case]
     assert (severity, cause) in findings(wrong, methods)
+
+
+def test_a_video_that_starts_under_load_rests_elsewhere() -> None:
+    load = np.concatenate(
+        [np.zeros(15), np.linspace(0, 1, 10), np.ones(20), np.linspace(1, 0, 10), np.zeros(15)]
+    )
+    cases = {
+        "whole": (0, 70),
+        "released": (20, 70),
+        "hold at the start": (26, 70),
+        "hold at the end": (0, 45),
+    }
+    found = {
+        name: find_other_rest(TIME[: stop - start], np.abs(load - load[start])[start:stop])
+        for name, (start, stop) in cases.items()
+    }
+    sure = {name: None if one is None else one[1] for name, one in found.items()}
+    # Of a hold and a release, the video shows the same.
+    assert sure == {"whole": None, "released": True, "hold at the start": False, "hold at the end": False}
 
 
 BLACK = np.zeros((96, 128, 3), np.uint8)

@@ -98,3 +98,13 @@ def test_noise_alone_and_a_short_video_give_no_pulse() -> None:
     surface, time, _ = simulate(seconds=2.5)
     found = find_pulse(surface, float(time[0]))
     assert (found.pulse, len(found.free_s), found.rates_hz) == (None, 25, None)
+
+
+@pytest.mark.parametrize("case", ["hidden at times", "never visible", "still"])
+def test_too_little_tissue_or_motion_is_no_pulse(case: str) -> None:
+    surface, rng = SurfaceMotion(np.ones((96, 128), bool)), np.random.default_rng(0)
+    for k in range(60):
+        visible = case == "still" or (case == "hidden at times" and k % 5 > 0)
+        motion = (case != "still") * rng.normal(0, 0.1, (96, 128, 2)).astype(np.float32)
+        surface.add(k / 10, motion, np.full((96, 128), visible, np.float32))
+    assert find_pulse(surface, 0.0).pulse is None
