@@ -88,8 +88,8 @@ class RightPictures:
             return StereoQuality(**vars(found))
         numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
         pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
-        late = *self._timing.find_lag_s(), self._last_rows_px(camera.stereo.rectified), self._sharpness
-        return StereoQuality(*numbers, *pair, *late, motion=tuple(camera.describe()))
+        rows, moved = self._last_rows_px(camera.stereo.rectified), tuple(camera.describe())
+        return StereoQuality(*numbers, *pair, *self._timing.find_lag_s(), rows, self._sharpness, moved)
 
     def _last_rows_px(self, rectified: Rectified) -> float:
         """See `StereoQuality`."""
