@@ -73,10 +73,14 @@ class Fusion:
     @property
     def notes(self) -> list[str]:
         """The weights of the two methods over the video."""
-        network, physics = self.parts
-        if self._alone:
-            return [f"{self._alone} frames use {network} alone: one of the two methods states no error"]
-        return [f"weights where they differ: {network} {self._share:.0%}, {physics} {1 - self._share:.0%}"]
+        (network, physics), share = self.parts, self._share
+        return [f"weights where they differ: {network} {share:.0%}, {physics} {1 - share:.0%}"]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Frames without a fusion."""
+        alone = f"{self._alone} frames use {self.parts[0]} alone: one of the two methods states no error"
+        return [alone] if self._alone else []
 
 
 def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:

@@ -26,6 +26,7 @@ from learn.data.grid import GridView, to_image
 from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
 from synth.job.types import MembraneState
+from synth.recording_flow.find_tissue import touches_border
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     every = TISSUES.membranes_mm
     stiff = {"stripped": every[:1], "intact": every[1:], "unknown": every}[scene.membrane]
     edges: tuple[Edge, ...] = ("free",) if radius > TISSUES.wide * OPENING_MM else ("bonded", "slipping")
-    if "free" not in edges and border_share(scene.tissue) > TISSUES.cut:
+    if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
         TissueKind(edge, one, middle, stretch)
@@ -191,14 +192,6 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
         for one in stiff
         for stretch in (TISSUES.stretches if one else TISSUES.stretches[:1])
     )
-
-
-def border_share(tissue: Mask) -> float:
-    """Share of the outline of a tissue mask (H, W) that lies on the border of the picture."""
-    inside = np.pad(tissue, 1)
-    outline = sum(int((inside != np.roll(inside, 1, axis)).sum()) for axis in (0, 1))
-    sides = tissue[0], tissue[-1], tissue[:, 0], tissue[:, -1]
-    return sum(int(side.sum()) for side in sides) / max(outline, 1)
 
 
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:

@@ -83,8 +83,8 @@ class Method(Protocol):
             moved_mm = scene.scale_mm_per_px * np.linalg.norm(frame.flow[scene.tissue], axis=1)
             return ForceEstimate(np.array([moved_mm.mean(), np.nan, np.nan]))
 
-    A method with a list of strings `notes` has them shown in the report, `warnings` as findings. One that has
-    to see the whole video first is `Revising`.
+    A method with a list of strings `notes` has them shown in the report, `warnings` as findings if it leads.
+    One that has to see the whole video first is `Revising`.
     """
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:

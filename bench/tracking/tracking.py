@@ -122,7 +122,7 @@ def track_recording(
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     forces.finish(recording)  # of the last pass
     forces.out.stereo, forces.out.turning = pictures.quality, turning if turning.time_s else None
-    _describe(forces.out, video, recording, methods, mm_per_px)
+    _describe(forces.out, video, recording, methods, pictured, mm_per_px)
     forces.out.timings |= watch.report()  # of all passes
     return forces.out
 
@@ -132,6 +132,7 @@ def _describe(
     video: VideoPass,
     recording: Recording,
     methods: Mapping[str, Method],
+    main: str,
     mm_per_px: float,
 ) -> None:
     """Adds summary, findings and notes after the last frame."""
@@ -143,8 +144,10 @@ def _describe(
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
     for name, method in methods.items():
-        out.notes += [f"{name}: {note}" for note in getattr(method, "notes", ())]
-        out.findings += [Finding("warning", name, one) for one in getattr(method, "warnings", ())]
+        warnings = getattr(method, "warnings", ())
+        out.notes += [f"{name}: {note}" for note in (*getattr(method, "notes", ()), *warnings)]
+        # Doubts on a method that does not lead, or not alone, are in the interval of the one that does.
+        out.findings += [Finding("warning", name, one) for one in warnings if name == main]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:

@@ -42,14 +42,15 @@ _WIDE = "is wider than an instrument"
 class ForegroundSearch:
     """Searches frames of a video, in order from the rest frame on."""
 
-    def __init__(self, tissue: Mask, shrink: int) -> None:
-        """`tissue`: (h, w) on the pixels of the frames; `shrink`: their factor of downsampling."""
-        self._tissue, self._shrink = tissue, shrink
+    def __init__(self, tissue: Mask, shrink: int, is_stated: bool) -> None:
+        """`tissue`: (h, w) on the pixels of the frames, stated or found; `shrink`: their factor of
+        downsampling."""
+        self._tissue, self._shrink, self._is_stated = tissue, shrink, is_stated
         self._surface: tuple[Map, float] | None = None
         self._found: dict[str, list[tuple[float, str, Mask]]] = {}
         self._masked = ~tissue  # in any frame: masks are often selected only once something moves
         self._width_px = 0.0  # of the widest tool at rest
-        # Where the tissue is unknown, what is in front of it from the start may be its surroundings.
+        # Where the tissue is not stated, what is in front of it from the start may be its surroundings.
         self._surroundings = np.zeros_like(tissue)
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
@@ -59,16 +60,17 @@ class ForegroundSearch:
             masked = masked if known is None else masked | known
         # A tool whose mask is not used, because it does no harm, is no foreign object either.
         tool = np.zeros_like(masked) if frame.proposal is None else frame.proposal.tool
-        self._find_wide(tool, frame)
         masked = masked | tool
         self._masked |= masked
+        self._tool = cv2.dilate(tool.astype(np.uint8), _square(LIMITS.near_px + LIMITS.across_px)) > 0
+        self._find_wide(tool, frame)
         free = cv2.erode((~masked).astype(np.uint8), _square(LIMITS.near_px), borderValue=1) > 0
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)
             surface, deviation = self._surface
             with np.errstate(invalid="ignore"):
                 high = surface - depth_mm > max(LIMITS.front_mm, LIMITS.sigmas * deviation)
-            if frame.is_rest and self._tissue.all():
+            if frame.is_rest and not self._is_stated:
                 self._surroundings = cv2.dilate(high.astype(np.uint8), _square(LIMITS.near_px)) > 0
             high &= free & ~self._surroundings
             self._note("stands in front of the tissue", high, frame, LIMITS.front)
@@ -96,22 +98,29 @@ class ForegroundSearch:
 
     def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
         """Notes a detected tool that is wider than tools are and than those at rest."""
-        depth_px = cv2.distanceTransform(tool.astype(np.uint8), cv2.DIST_L2, 5)
+        width_px = _width(tool)
         if frame.is_rest:
-            self._width_px = 2 * float(depth_px.max())
+            self._width_px = float(width_px.max())
         least = max(LIMITS.wide * tool.shape[1], LIMITS.wider * self._width_px)
-        self._note(_WIDE, 2 * depth_px > least, frame, 0.0)
+        self._note(_WIDE, width_px > least, frame, 0.0)
 
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
-        """Stores the largest component if it has this share of tissue and this extent in picture widths."""
+        """Stores the largest component if it has this share of tissue and this extent in picture widths.
+
+        A narrow one next to a detected tool is the rest of that tool.
+        """
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
         if len(stats) < 2:
             return
+        width_px = _width(whole > 0)
+        for part in np.unique(label[self._tool & (label > 0)]) if why != _WIDE else ():
+            if width_px[label == part].max() < LIMITS.wide * where.shape[1]:
+                stats[part] = 0
         k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
         found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
         wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]
-        if found >= share and np.hypot(wide, high) >= extent * where.shape[1]:
+        if found > 0 and found >= share and np.hypot(wide, high) >= extent * where.shape[1]:
             x, y = self._shrink * (centres[k] + 0.5) - 0.5
             text = f"an object at x {x:.0f}, y {y:.0f} in frame {frame.index} {why}: mask it in masks/?"
             self._found.setdefault(why, []).append((found, text, label == k))
@@ -157,6 +166,12 @@ def flow_jump(flow: Map) -> Map:
         slopes = np.linalg.norm(c - a, axis=-1) + np.linalg.norm(b - d, axis=-1)
         most = np.maximum(most, np.linalg.norm(a - b, axis=-1) - slopes * 2 / 3)
     return most
+
+
+def _width(mask: Mask) -> Map:
+    """Width (h, w) px of a mask around each of its pixels: twice the distance from its outline."""
+    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(2 * np.minimum(distance, mask.shape[1]), np.float32)
 
 
 def _square(around_px: int) -> Pixels:
