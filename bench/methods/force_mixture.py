@@ -22,7 +22,6 @@ class ForceMixture:
     weight: Floats  # (M,) with sum 1
     force: Floats  # (M, 3), mN or, over E, mN/kPa
     covariance: Floats  # (M, 3, 3)
-    common: float = 0.0  # relative standard deviation common to all components, not in `covariance`
     world: Ints | None = None  # (M,) assumption on the tissue of each component; None: the same
 
     @property
@@ -38,7 +37,7 @@ class ForceMixture:
         """The distribution under one assumption on the tissue."""
         of = self.world == world
         weight = np.maximum(self.weight[of], 1e-300)
-        return ForceMixture(weight / weight.sum(), self.force[of], self.covariance[of], self.common)
+        return ForceMixture(weight / weight.sum(), self.force[of], self.covariance[of])
 
     def with_gain(self, gain: float) -> ForceMixture:
         """The distribution with a further relative standard deviation `gain` of every force."""
@@ -75,16 +74,14 @@ def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
     """90% interval of the force's magnitude, in its unit, by reproducible draws.
 
     It holds the interval under each assumption on the tissue, however unlikely: evidence between them is
-    not reliable. `gain`: relative standard deviation of all forces, in addition to `found.common`. An
-    interval starts at 0 if 0 is in the 90% region; with one camera it then ends at the 98th percentile,
-    because pressing along the optical axis, which hardly shows in the picture, is a small part of the
-    distribution.
+    not reliable. `gain`: relative standard deviation of all forces. An interval starts at 0 if 0 is in the
+    90% region; with one camera it then ends at the 98th percentile, because pressing along the optical axis,
+    which hardly shows in the picture, is a small part of the distribution.
     """
     if found.world is not None and len(worlds := np.unique(found.world)) > 1:
         size = float(np.linalg.norm(found.mean))
         ends = [size_interval(found.within(one), gain, cameras) for one in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
-    gain = float(np.hypot(gain, found.common))
     size = float(np.linalg.norm(found.mean))  # may be less than most drawn magnitudes
     weight = found.weight / found.weight.sum()
     drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS)

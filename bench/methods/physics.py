@@ -33,8 +33,9 @@ from synth.recording_flow.find_tissue import touches_border
 class TissueConstants:
     """Candidate tissues and constants of their weights; by hand where no source is given."""
 
-    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0)  # stiffness over E
+    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
+    unlike: float = 60.0  # nats a frame by which a tissue is excluded; membranes were found 47 below the best
     thin_mm: float = 5.0  # on another mesh bare tissue is taken for a membrane of up to this (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
@@ -50,8 +51,6 @@ class TissueConstants:
     unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
-    stiffness: float = 0.5
-    """The same from a membrane's stiffness; from even sequences of mission-ood (evidence.scoring.fusion)."""
 
 
 TISSUES = TissueConstants()
@@ -138,13 +137,11 @@ class Physics:
         assert self._scene is not None
         young = assumed_young(self._scene.young_kpa)
         found = infer(self._weights, frame)
-        covered = float(self._weights.weight @ [one.membrane > 0 for one in self._weights.tissues])
-        force = replace(found.force, common=TISSUES.stiffness * covered)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
-        low, high = size_interval(force, gain, cameras)
+        low, high = size_interval(found.force, gain, cameras)
         density = np.float32(young) * self._picture(found) if picture else None
-        likely = force.times(young).with_gain(TISSUES.gain)
-        return ForceEstimate(young * force.mean, density, young * low, young * high, likely)
+        likely = found.force.times(young).with_gain(TISSUES.gain)
+        return ForceEstimate(young * found.force.mean, density, young * low, young * high, likely)
 
     def _picture(self, found: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
@@ -226,16 +223,17 @@ def weigh_tissues(
         tissues.append(replace(tissues[best], poisson=nu))
         score.append(score[best] + evidence(tissues[-1]) - first)
     weight = np.maximum(softmax(score), TISSUES.unlikely)
-    # The most likely tissue with and without a membrane, and with each Poisson's ratio, however unlikely.
-    kinds = [(one.membrane > 0, one.poisson == tissues[best].poisson or one.poisson) for one in tissues]
-    used = [
-        int(max(np.flatnonzero([k == kind for k in kinds]), key=lambda k: weight[k]))
-        for kind in dict.fromkeys(kinds)
-    ]
-    used = sorted(used, key=lambda k: -weight[k])
+    # The interval is to hold the most likely tissue with and without a membrane, the one with the stiffest
+    # membrane that is not excluded, and the most likely one with each other Poisson's ratio.
+    known = len(tissues) - len(others)
+    parts = [[k for k in range(known) if (tissues[k].membrane > 0) is covered] for covered in (False, True)]
+    used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(known, len(tissues))}
+    least = max(score) - TISSUES.unlike * TISSUES.temper * max(len(strongest), 1)
+    used.add(max((k for k in range(known) if score[k] >= least), key=lambda k: tissues[k].membrane))
+    order = sorted(used, key=lambda k: -weight[k])
     covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])
-    weight = weight[used] / weight[used].sum()
-    return TissueWeights(tuple(tissues[k] for k in used), weight, own_mm, assumed, covered)
+    weight = weight[order] / weight[order].sum()
+    return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed, covered)
 
 
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:

@@ -36,6 +36,9 @@ class TissueConstants:
     sure: float = 0.7  # confidence above which a pixel is tracked
     seen: float = 0.7  # share of frames in which a pixel has to be tracked
     rounds: int = 5  # of GrabCut
+    solid: float = (
+        0.93  # share of its convex hull below which the result is doubtful: right ones 0.95 and more
+    )
 
 
 CONSTANTS = TissueConstants()
@@ -102,10 +105,27 @@ class TissueSearch:
             if np.mean(seen & ~expected) < 0.5 * np.mean(seen):
                 return whole, _state("it moves as tissue that fills the picture")
             return whole, _state("too little moves to find it: the whole picture is assumed", "warning")
-        tissue = _morph(_grow(colours, moves, core), cv2.MORPH_OPEN, near)
+        guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        # From either guess tissue may be lost that instruments cut off: the rounder result is right.
+        guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))
+        tissue, solid = max(
+            (self._region(colours, one, core, hidden) for one in guesses), key=lambda one: one[1]
+        )
+        text = f"found by motion and colour, {100 * tissue.mean():.0f}% of the picture"
+        if solid < CONSTANTS.solid:
+            return tissue, _state(
+                f"{text}, but with an uneven outline: see the picture of the masks", "warning"
+            )
+        return tissue, _state(text)
+
+    def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
+        """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
+        near, wide = (max(1, round(share * len(core))) for share in (CONSTANTS.near, CONSTANTS.wide))
+        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near)
         tissue = _largest(_with_hidden(tissue, core, hidden), core)
-        tissue = whole & _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
-        return tissue, _state(f"found by motion and colour, {100 * tissue.mean():.0f}% of the picture")
+        tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
+        hull = _hull(tissue)
+        return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
 
 
 def touches_border(tissue: Mask) -> float:
@@ -136,20 +156,44 @@ def _colours(rgb: Pixels) -> Pixels:
     return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
 
 
-def _overlap(colours: Pixels, first: Mask, second: Mask) -> float:
-    """Overlap in 0..1 of the histograms of the colours (h, w, 3) in two masks."""
+def _histograms(colours: Pixels, first: Mask, second: Mask) -> list[Map]:
+    """Histograms of the colours (h, w, 3) in two masks, each of sum 1."""
     bins, every = [CONSTANTS.bins] * 3, [0, 256] * 3
     both = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in (first, second)]
-    return float(np.minimum(*(one / max(one.sum(), 1) for one in both)).sum())
+    return [np.asarray(one / max(one.sum(), 1), np.float32) for one in both]
 
 
-def _grow(colours: Pixels, moves: Mask, core: Mask) -> Mask:
-    """What has the colours (h, w, 3) of the tissue that moves; its `core` is certain."""
-    label = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+def _overlap(colours: Pixels, first: Mask, second: Mask) -> float:
+    """Overlap in 0..1 of the histograms of the colours (h, w, 3) in two masks."""
+    return float(np.minimum(*_histograms(colours, first, second)).sum())
+
+
+def _by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pixels:
+    """A guess that adds what has the colours (h, w, 3) of the core rather than of what is outside."""
+    core_share, outside_share = (
+        cv2.GaussianBlur(one.reshape(CONSTANTS.bins, -1), (0, 0), 0.5).reshape(one.shape) + 1e-5
+        for one in _histograms(colours, core, outside)
+    )
+    at = tuple((colours // (256 // CONSTANTS.bins)).transpose(2, 0, 1))
+    odds = cv2.GaussianBlur(np.log(core_share[at] / outside_share[at]), (0, 0), 2)
+    added = np.where((guess == cv2.GC_PR_BGD) & (odds > 0), cv2.GC_PR_FGD, guess)
+    return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, added).astype(np.uint8)
+
+
+def _inner(whole: Mask) -> Mask:
+    """The picture without a band along its border."""
+    inside, band = np.zeros_like(whole), max(1, round(2 * CONSTANTS.wide * len(whole)))
+    inside[band:-band, band:-band] = True
+    return inside
+
+
+def _grow(colours: Pixels, guess: Pixels) -> Mask:
+    """GrabCut of the colours (h, w, 3) from a guess (h, w) in its labels."""
+    label = guess.copy()
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
     cv2.grabCut(colours, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
-    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
+    return (label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)
 
 
 def _morph(mask: Mask, how: int, radius: int) -> Mask:
@@ -161,9 +205,13 @@ def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
     """The mask with what instruments hide within the convex hull of its components that move."""
     label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
     parts = mask & np.isin(label, np.unique(label[core]))
-    outline = cv2.convexHull(np.argwhere(parts)[:, ::-1].astype(np.int32))
-    under = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
-    return np.asarray(parts | (under & hidden))
+    return parts | (_hull(parts) & hidden)
+
+
+def _hull(mask: Mask) -> Mask:
+    """The convex hull of a mask (h, w)."""
+    outline = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
+    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
 
 
 def _largest(mask: Mask, core: Mask) -> Mask:

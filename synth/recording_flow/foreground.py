@@ -42,10 +42,17 @@ _WIDE = "is wider than an instrument"
 class ForegroundSearch:
     """Searches frames of a video, in order from the rest frame on."""
 
-    def __init__(self, tissue: Mask, shrink: int, is_stated: bool) -> None:
-        """`tissue`: (h, w) on the pixels of the frames, stated or found; `shrink`: their factor of
-        downsampling."""
-        self._tissue, self._shrink, self._is_stated = tissue, shrink, is_stated
+    def __init__(self, tissue: Mask, shrink: int, *, is_stated: bool, has_masks: bool) -> None:
+        """Starts before the rest frame.
+
+        Args:
+            tissue: (h, w) on the pixels of the frames, stated or found.
+            shrink: factor of downsampling of the frames.
+            is_stated: whether the tissue is stated.
+            has_masks: whether instruments' masks are given: without, narrow objects are instruments.
+        """
+        self._tissue, self._shrink = tissue, shrink
+        self._is_stated, self._has_masks = is_stated, has_masks
         self._surface: tuple[Map, float] | None = None
         self._found: dict[str, list[tuple[float, str, Mask]]] = {}
         self._masked = ~tissue  # in any frame: masks are often selected only once something moves
@@ -62,7 +69,6 @@ class ForegroundSearch:
         tool = np.zeros_like(masked) if frame.proposal is None else frame.proposal.tool
         masked = masked | tool
         self._masked |= masked
-        self._tool = cv2.dilate(tool.astype(np.uint8), _square(LIMITS.near_px + LIMITS.across_px)) > 0
         self._find_wide(tool, frame)
         free = cv2.erode((~masked).astype(np.uint8), _square(LIMITS.near_px), borderValue=1) > 0
         if depth_mm is not None:
@@ -107,16 +113,15 @@ class ForegroundSearch:
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
         """Stores the largest component if it has this share of tissue and this extent in picture widths.
 
-        A narrow one next to a detected tool is the rest of that tool.
+        Without masks narrow ones are left out: they are instruments, or parts of them, not detected.
         """
         whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
         _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
         if len(stats) < 2:
             return
-        width_px = _width(whole > 0)
-        for part in np.unique(label[self._tool & (label > 0)]) if why != _WIDE else ():
-            if width_px[label == part].max() < LIMITS.wide * where.shape[1]:
-                stats[part] = 0
+        if not self._has_masks and why != _WIDE:
+            wide = np.unique(label[_width(whole > 0) > LIMITS.wide * where.shape[1]])
+            stats[np.setdiff1d(np.arange(len(stats)), wide)] = 0
         k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
         found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
         wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]

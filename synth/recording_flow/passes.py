@@ -159,8 +159,10 @@ class VideoPass:
             self.stereo = RightCamera(footage.depth, rest, settings.masks, footage.name)
         elif footage.depth is not None:
             self.stereo = DepthCamera(footage.depth, rest)
-        searched, stated = pace is None and not rest.fault, bool(footage.tissue and not footage.findings)
-        self._foreground = ForegroundSearch(rest.tissue, rest.shrink, stated) if searched else None
+        self._foreground: ForegroundSearch | None = None
+        if pace is None and not rest.fault:
+            stated, masks = bool(footage.tissue and not footage.findings), footage.tool is not None
+            self._foreground = ForegroundSearch(rest.tissue, rest.shrink, is_stated=stated, has_masks=masks)
         mm_per_px = 1.0 if footage.depth is None else footage.depth.mm_per_px * rest.shrink
         self._gather = GatherMotion(rest, mm_per_px) if settings.pulse and known is None else None
         self._detrend = None if pulse is None else Detrend(pulse, mm_per_px)

@@ -23,7 +23,7 @@ def load(peak_px: float) -> NDArray[np.float32]:
 
 
 def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked: bool = False) -> list[str]:
-    search = ForegroundSearch(np.ones(SHAPE, bool), 1, True)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
     for k in range(4):
         sure = np.ones(SHAPE, np.float32)
         mask = ROD if masked else None
@@ -49,7 +49,7 @@ def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(pea
 @pytest.mark.parametrize(("half_width", "reported"), [(8, False), (24, True)])
 def test_a_detected_instrument_is_no_foreign_object_but_a_hand_is(half_width: int, reported: bool) -> None:
     tool, none = (np.abs(Y - 60) < half_width) & (X < 90), np.zeros(SHAPE, bool)
-    search = ForegroundSearch(np.ones(SHAPE, bool), 1, True)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
     for k in range(4):
         sure = np.where(tool & (k > 0), 0.1, 1).astype(np.float32)  # hidden, but its mask is not used
         proposal = Proposal(none, tool & (k > 0), none)
