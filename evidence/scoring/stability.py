@@ -538,7 +538,7 @@ STEREO: dict[str, tuple[Change, str]] = {
     ),
     "right camera bumped by 3 px": (
         _right(lambda v: _shifted(v.right, np.arange(len(v.right)) >= len(v.right) // 2, 2.4, 1.8)),
-        "^stereo",
+        "^stereo|right camera",
     ),
     "right camera out of focus": (
         _right(lambda video: np.stack([cv2.GaussianBlur(one, (0, 0), 3) for one in video.right])),

@@ -104,7 +104,8 @@ class TissueSearch:
         if not is_bounded or _overlap(colours, core, still) > CONSTANTS.alike:
             if np.mean(seen & ~expected) < 0.5 * np.mean(seen):
                 return whole, _state("it moves as tissue that fills the picture")
-            return whole, _state("too little moves to find it: the whole picture is assumed", "warning")
+            text = "too little moves to find its rim: what moves is taken for it"
+            return whole & _hull(moves), _state(text, "warning")
         guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
         # From either guess tissue may be lost that instruments cut off: the rounder result is right.
         guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))

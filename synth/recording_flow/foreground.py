@@ -82,7 +82,9 @@ class ForegroundSearch:
             self._note("stands in front of the tissue", high, frame, LIMITS.front)
         if frame.is_rest or not frame.trusted:
             return
-        lost = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
+        lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
+        # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
+        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(LIMITS.near_px)) > 0
         self._note("hides tissue that is visible at rest", lost, frame, LIMITS.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > LIMITS.least_px:
