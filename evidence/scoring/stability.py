@@ -212,7 +212,7 @@ def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _cell(rows: list[dict[str, Any]]) -> str:
+def _cell(rows: list[Mapping[str, Any]]) -> str:
     """Error of the peak, least share in the interval, and how often the cause is named, in words."""
     errors = [row["error"] for row in rows if row["error"] is not None]
     holds = [row["holds"] for row in rows if row["holds"] is not None]

@@ -194,7 +194,7 @@ def _grow(colours: Pixels, guess: Pixels) -> Mask:
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
     cv2.grabCut(colours, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
-    return (label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD)
+    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
 
 
 def _morph(mask: Mask, how: int, radius: int) -> Mask:
@@ -212,7 +212,7 @@ def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
 def _hull(mask: Mask) -> Mask:
     """The convex hull of a mask (h, w)."""
     outline = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
-    return cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0
+    return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0)
 
 
 def _largest(mask: Mask, core: Mask) -> Mask:
