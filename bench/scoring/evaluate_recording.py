@@ -61,8 +61,8 @@ def evaluate_recording(
     speed = np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
     sensor = align_sensor(recording, time_s, speed, tracked.turning)
     scored, unscored = _select_frames(meta, tracked, sensor)
-    seen = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
-    findings = by_severity([*judge(recording, tracked, seen), *sensor.findings])
+    compared = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
+    findings = by_severity([*judge(recording, tracked, compared), *sensor.findings])
     missing = [one.message for one in findings if one.severity == "missing"]
     result = Result(
         recording=recording.name,

@@ -1,4 +1,4 @@
-"""Recordings degraded in one way at a time, scored by the default command: what leads, and what is said.
+"""Recordings degraded in one way at a time, scored by the default command: what leads, and what is found.
 
 Each way is applied to plain tissue, to tissue with a membrane and to pulsating tissue; with two cameras and
 with one; described (tissue, instruments and contact-free span stated) and bare (scale and E only). Silently

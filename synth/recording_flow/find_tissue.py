@@ -34,7 +34,7 @@ class TissueConstants:
     near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
     wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
     sure: float = 0.7  # confidence above which a pixel is tracked
-    seen: float = 0.7  # share of frames in which a pixel has to be tracked
+    visible: float = 0.7  # share of frames in which a pixel has to be tracked
     rounds: int = 5  # of GrabCut
     solid: float = (
         0.93  # share of its convex hull below which the result is doubtful: right ones 0.95 and more
@@ -88,10 +88,12 @@ class TissueSearch:
         """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
         whole = self._rest.tissue
         near, wide = (max(1, round(share * len(whole))) for share in (CONSTANTS.near, CONSTANTS.wide))
-        hidden = self._tool | (self._hidden > (1 - CONSTANTS.seen) * self._frames)
-        seen = whole & (self._count > CONSTANTS.seen * self._frames) & ~_morph(hidden, cv2.MORPH_DILATE, near)
+        hidden = self._tool | (self._hidden > (1 - CONSTANTS.visible) * self._frames)
+        visible = (
+            whole & (self._count > CONSTANTS.visible * self._frames) & ~_morph(hidden, cv2.MORPH_DILATE, near)
+        )
         motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
-        moves = seen & (motion > CONSTANTS.moves * noise)
+        moves = visible & (motion > CONSTANTS.moves * noise)
         if moves.any():
             moves &= motion > CONSTANTS.well * np.median(motion[moves])
         moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
@@ -99,10 +101,10 @@ class TissueSearch:
         if not core.any():
             return whole, _state("nothing moves by which to find it: the whole picture is assumed")
         expected = _expected(motion, moves) > CONSTANTS.moves * noise
-        colours, still = _colours(self._rest.rgb), seen & (motion < noise)
-        is_bounded = np.mean(expected & still) > CONSTANTS.rim * np.mean(seen)
+        colours, still = _colours(self._rest.rgb), visible & (motion < noise)
+        is_bounded = np.mean(expected & still) > CONSTANTS.rim * np.mean(visible)
         if not is_bounded or _overlap(colours, core, still) > CONSTANTS.alike:
-            if np.mean(seen & ~expected) < 0.5 * np.mean(seen):
+            if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
                 return whole, _state("it moves as tissue that fills the picture")
             text = "too little moves to find its rim: what moves is taken for it"
             return whole & _hull(moves), _state(text, "warning")
