@@ -73,18 +73,24 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
         return [Finding("warning", "interval", f"{missed}; {cause}")] if missed else []
     best = likely[0]
     close = [one.hypothesis for one in likely if one.odds > best.odds - _ALIKE]
-    names = {one.cause: one.message for one in reversed(close)}
+    names = dict[str, str]()  # the best of each cause
+    for one in close:
+        names.setdefault(one.cause, one.message)
     start = missed or "sensor and video contradict each other"
     # Only what several methods agree on is certain: one may be wrong itself.
     sure = missed and best.odds > _SURE and len(sensor.forces_mn) > 1
     sure = sure and all(_agrees(sensor, one, best) for one in sensor.forces_mn)
-    found = f"{start}; most likely {', or '.join(reversed(names.values()))}"
+    found = f"{start}; most likely {', or '.join(names.values())}"
     return [Finding("error" if sure else "warning", best.hypothesis.cause, found)]
 
 
 def find_missed(sensor: SensorMotion) -> str:
     """Which frames' 90% interval holds clearly fewer of the sensor's readings than stated; empty: none."""
-    if sensor.leading_mn is None or sensor.bounds_mn is None or not np.isfinite(sensor.bounds_mn).any():
+    if (
+        sensor.leading_mn is None
+        or sensor.bounds_mn is None
+        or not np.isfinite(sensor.bounds_mn).all(1).any()
+    ):
         return ""
     size = sensor.size_mn
     margin = 0.5 * sensor.contact_mn
@@ -136,7 +142,7 @@ def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> I
     n = sensor.observed_axes if sensor.leading_mn is not None else 0
     n *= bool(np.linalg.norm(sensor.axes_mn[:, :n]) > _SIDEWAYS * np.linalg.norm(sensor.axes_mn))
     floor = _SHAPE * float(size.max())
-    if sensor.bounds_mn is not None:
+    if sensor.leading_mn is not None and sensor.bounds_mn is not None:
         # Uncertainty that does not grow with force, such as that by a pulse.
         wide = (sensor.bounds_mn[:, 1] - size)[np.isfinite(sensor.bounds_mn[:, 1])]
         floor = max(floor, float(np.quantile(wide, 0.1)) if len(wide) else 0.0)

@@ -6,6 +6,7 @@ from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.recording_flow.finding import Finding
 
+_FEW = 0.02  # share of the frames lost, from which it is a warning; by hand
 _MANY = 0.2  # share of the tissue masked, from which to check the recording; by hand
 
 
@@ -30,6 +31,6 @@ def check_pictures(recording: Recording, tracked: TrackedRecording) -> list[Find
 def check_tracking(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masked tissue and lost frames."""
     summary = tracked.summary
-    many = summary.shares["masked"] > _MANY or summary.lost > 0
+    many = summary.shares["masked"] > _MANY or summary.shares["lost"] > _FEW
     message = summary.describe()
     return [Finding("warning" if many else "ok", "tracking", message)] if summary.frames else []

@@ -21,6 +21,7 @@ from synth.arrays import Floats, Mask
 from synth.recording_flow.finding import Finding
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
+_MOVED_MM = 0.02  # least mean motion that is not noise of the flow; by hand
 _LOADED = 0.25  # share of the range of force above which the tissue is not at rest; by hand
 # By hand: step of the motion of tissue at rest over the largest motion; how long it rests after a load [s];
 # least time in the rest frame's state that is a rest [s].
@@ -92,8 +93,9 @@ def check_start(recording: Recording, tracked: TrackedRecording) -> list[Finding
     known = np.array(tracked.trusted)
     if recording.force is not None or moved is None or known.sum() < LEAST_FRAMES:
         return []
-    found = find_other_rest(np.array(tracked.time_s)[known], np.array(moved)[known, 0])
-    if found is None:
+    moved_mm = np.array(moved)[known, 0]
+    found = find_other_rest(np.array(tracked.time_s)[known], moved_mm)
+    if found is None or not moved_mm.max() > _MOVED_MM:
         return []
     message = f"from {found[0]:.3g} s the tissue rests in another state than the rest frame's: the video "
     message += "starts under load, or a tool holds the tissue at its end"
@@ -185,6 +187,8 @@ def find_sensor_motion(
             None if isinstance(methods[main], FlowSize) else np.nan_to_num(tracked.force_mn[main])[known]
         )
     axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
+    if np.isnan(np.array(tracked.force_mn[main])[known, 1:axes]).any():  # the method states magnitudes only
+        axes = 0
     return SensorMotion(
         np.array(tracked.time_s)[known],
         sensor.axes_mn[known],

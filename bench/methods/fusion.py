@@ -63,11 +63,16 @@ class Fusion:
             prior = replace(physics.likely, covariance=cautions[1] ** 2 * physics.likely.covariance)
             both = prior.observe(network.likely.mean, spread)
             low, high = size_interval(both, gain, cameras)
-            low, high = min(low, physics.low_mn), max(high, physics.high_mn)
-            found.append(ForceEstimate(both.mean, None, low, high))
             off = network.force_mn - physics.force_mn
-            pulled, apart = pulled + float((both.mean - physics.force_mn) @ off), apart + float(off @ off)
-        self._share = float(np.clip(pulled / apart, 0, 1)) if apart else 0.0
+            square = float(off @ off)
+            # The weight is in 0..1: components that lose weight must not move the estimate beyond both.
+            share = float((both.mean - physics.force_mn) @ off) / max(square, 1e-12)
+            force = both.mean + (float(np.clip(share, 0, 1)) - share) * off
+            size = float(np.linalg.norm(force))
+            low, high = min(low, physics.low_mn, size), max(high, physics.high_mn, size)
+            found.append(ForceEstimate(force, None, low, high))
+            pulled, apart = pulled + float(np.clip(share, 0, 1)) * square, apart + square
+        self._share = pulled / apart if apart else 0.0
         return widen_small_forces(found)
 
     @property

@@ -80,7 +80,7 @@ class Physics:
         self._contact_free = 0
         self._weighed_mm = 0.0  # motion at the last weighting
         first, still = candidate_tissues(scene)[:1], np.zeros(components)
-        self._times = list[float]()
+        self._times, self._trusted = list[float](), list[bool]()
         self._weights = TissueWeights(first, np.ones(1), still, False, TISSUES.intact)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
@@ -97,6 +97,7 @@ class Physics:
         observed = observe(moved, spread, self._view.mask)
         self._frames.append(observed)
         self._times.append(frame.time_s or 0.0)
+        self._trusted.append(frame.trusted)
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
         if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
@@ -108,11 +109,13 @@ class Physics:
         """See `Revising`."""
         assert self._scene is not None
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
-        if contact_free.any() or not self._scene.living:
+        if contact_free.any() or not self._scene.living or not any(self._trusted):
             own_mm = posterior.own_motion(basis, [self._frames[k] for k in np.flatnonzero(contact_free)])
         else:
-            quiet, factor = quietest_frames(np.array(self._times), self._frames)
-            own_mm = factor * posterior.own_motion(basis, [self._frames[k] for k in quiet])
+            tracked = np.flatnonzero(self._trusted)
+            frames = [self._frames[k] for k in tracked]
+            quiet, factor = quietest_frames(np.array(self._times)[tracked], frames)
+            own_mm = factor * posterior.own_motion(basis, [frames[k] for k in quiet])
             own_mm = np.minimum(own_mm, TISSUES.living_mm)
         assumed = not contact_free.any() and bool(own_mm.any())
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
@@ -228,7 +231,7 @@ def weigh_tissues(
     known = len(tissues) - len(others)
     parts = [[k for k in range(known) if (tissues[k].membrane > 0) is covered] for covered in (False, True)]
     used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(known, len(tissues))}
-    least = max(score) - TISSUES.unlike * TISSUES.temper * max(len(strongest), 1)
+    least = max(score[:known]) - TISSUES.unlike * TISSUES.temper * max(len(strongest), 1)
     used.add(max((k for k in range(known) if score[k] >= least), key=lambda k: tissues[k].membrane))
     order = sorted(used, key=lambda k: -weight[k])
     covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])

@@ -11,10 +11,12 @@ from synth.errors import UserError
 from synth.flow.stereo import calibration
 from synth.flow.stereo.rig import StereoRig
 from synth.recording_flow.decode import Footage
+from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion, Size
 from synth.recording_flow.stereo import DepthVideo, RightVideo
 from synth.system import checked_file
 
+_REGION = Finding("missing", "tissue", "no tissue.png: the whole region is assumed to be tissue")
 _LARGEST_BYTES = 1 << 30  # of an array of points
 
 
@@ -34,6 +36,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
         recording.masks.read if recording.masks else None,
         recording.meta.rest_frame,
         depth=depth,
+        findings=() if recording.tissue or not recording.region else (_REGION,),
     )
 
 

@@ -51,7 +51,7 @@ def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) 
         "scale_uncertainty": 0.0,
         "young_kpa": float(sequence.attrs["young_kpa"]),
         "rest_frame": 0,
-        "tissue": "brain" if sequence.attrs["scenario"].get("pulse") else "ex-vivo",
+        "tissue": "brain" if (sequence.attrs.get("scenario") or {}).get("pulse") else "ex-vivo",
         "specimen": f"anatomy {sequence.attrs.get('anatomy_id', sequence.index)}",
         "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
     }

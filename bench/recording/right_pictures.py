@@ -67,6 +67,8 @@ class RightPictures:
         self._timing.add(left, right, frame.time_s or 0.0)
         # A flat surface may look the same in both cameras, but not in every frame.
         self._copied &= _change(left, right) < _COPY * _change(left[:, 1:], left[:, :-1])
+        if not frame.trusted:
+            return
         if self._last is not None:  # without noise, of which a camera out of focus or frozen has less or more
             pairs = zip((left, right), self._last[:2], strict=True)
             change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)

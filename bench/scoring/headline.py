@@ -9,6 +9,7 @@ from bench.bootstrap import Interval
 from bench.methods.comparison import FUSION, MAIN
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
+from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 
 _NEWTONS = ("mae_mn", "mae_of_peak", "r", "ccc", "r2", "false_positive_rate")
 _SHAPE = ("r", "shape_error", "lag_s")
@@ -71,9 +72,12 @@ def _trust(result: Result) -> str:
     meta, network = result.settings["meta"], MAIN if result.main == FUSION else result.main
     parts = [] if result.findings else [f"None of {len(result.lost)} frames was lost"]
     scored = result.methods.get(network)
-    # Networks without intervals have no check of their training distribution; its findings are the method's.
-    if parts and network in result.settings.get("networks", {}) and scored and scored.low_mn is not None:
-        parts.append("the motion is like that of the network's training data")
+    # Networks without intervals have no check of their training distribution.
+    if network in result.settings.get("networks", {}) and scored and scored.low_mn is not None:
+        if any(note.startswith(f"{network}: {OUT_OF_DISTRIBUTION}") for note in result.notes):
+            parts.append("the motion is unlike that of the network's training data")
+        elif parts:
+            parts.append("the motion is like that of the network's training data")
     young = f"E = {meta['young_kpa']:.3g} kPa" if result.absolute else "E = 1 kPa (unknown)"
     assumed = [young + _within(meta.get("young_uncertainty", 0.0))]
     guessed = meta.get("scale_mm_per_px") == "unknown"

@@ -453,7 +453,7 @@ def _both_bumped(video: Video) -> Video:
     return replace(_moved(video, shift=5.0), right=right)
 
 
-_OOD, _AGAIN = "out of distribution", "again"
+_OOD, _AGAIN, _REST = "out of distribution", "again", "^rest frame|most likely.*rest frame"
 _MISSING = r"^pictures: .*missing|^clocks|^times"
 _LATE = "^stereo: .*(late|early)"
 _COARSE, _UNITS, _FLIP = "^pictures: .*(detail|compressed)", "^sensor|in newtons|in mN", np.s_[::-1]
@@ -468,10 +468,10 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "rotation by 2 deg": (lambda video: _moved(video, turn_deg=2.0), "^camera"),
     "ripples of 1 px": (_each(_rippled), f"moves unlike|{_OOD}"),
     "rest frame at the peak": (_rest_at_peak, "^rest frame"),
-    "first picture under load": (_starts_at_peak(False), "^rest frame|rest frame"),
-    "first picture under load, sensor tared": (_starts_at_peak(True), "^rest frame|rest frame"),
+    "first picture under load": (_starts_at_peak(False), _REST),
+    "first picture under load, sensor tared": (_starts_at_peak(True), _REST),
     "frozen, new noise on copies": (_refrozen, _AGAIN),
-    "half the light later": (_each(lambda rgb, k: rgb * (0.5 if k > 11 else 1.0)), "light|bright|exposure"),
+    "half the light later": (_each(lambda rgb, k: rgb * (0.5 if k > 11 else 1.0)), "^pictures: .*light"),
     "frozen for 5 frames": (_order(lambda k: np.where((k > 7) & (k < 13), 8, k)), _AGAIN),
     "4 frames dropped": (_order(lambda k: k[(k < 8) | (k > 11)]), _MISSING),
     "4 frames late": (_order(lambda k: np.maximum(k - 4, 0)), f"{_MISSING}|{_AGAIN}"),
@@ -487,16 +487,16 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "blur of 3 px": (_each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3)), "detail"),
     "focus lost later": (_each(lambda rgb, k: cv2.GaussianBlur(rgb, (0, 0), 3) if k > 8 else rgb), "sharp"),
     "scale 1.5 times too large": (_stated(scale_mm_per_px=1.5), "^scale"),
-    "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "scale"),
+    "scale 2 times too small": (_stated(scale_mm_per_px=0.5), "^(scale|force)"),
     "scale in cm": (_stated(scale_mm_per_px=0.1), "^scale"),
     "scale in um": (_stated(scale_mm_per_px=1000.0), "^scale"),
     "scale in m": (_stated(scale_mm_per_px=0.001), "^scale"),
     "scale in px": (_stated(scale_mm_per_px=1), "^scale"),
-    "E 5 times too large": (_stated(young_kpa=5.0), "stiffness|E "),
+    "E 5 times too large": (_stated(young_kpa=5.0), "^(stiffness|force)"),
     "E in Pa": (_stated(young_kpa=1000.0), "^stiffness"),
     "E in MPa": (_stated(young_kpa=0.001), "^stiffness"),
     "tissue.png inverted": (lambda video: replace(video, tissue=~video.tissue), "^tissue|marks no tissue"),
-    "sensor: 2 times too large": (_sensor(lambda t, f: (t, 2 * f)), "sensor|E "),
+    "sensor: 2 times too large": (_sensor(lambda t, f: (t, 2 * f)), "^(sensor|force)"),
     "sensor: grams": (_sensor(lambda t, f: (t, f * 1000 / 9.81)), _UNITS),
     "sensor: mN": (_sensor(lambda t, f: (t, f * 1000)), _UNITS),
     "sensor: sign": (_sensor(lambda t, f: (t, -f)), "^sensor"),

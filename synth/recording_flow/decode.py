@@ -160,7 +160,7 @@ class Decoder:
         shrink = shrink or max(1, size[1] // LEAST_COLUMNS)
         given, bars = self._footage.tissue, find_bars(picture.rgb)
         tissue, findings = np.ones(size, bool) if given is None else given(size), [*self._footage.findings]
-        if is_inside_out(tissue):
+        if given is not None and not findings and is_inside_out(tissue):
             inverted = "tissue.png marks the border of the picture but not its middle: is it inverted?"
             findings.append(Finding("warning", "tissue", inverted))
         if (tissue & bars).any():

@@ -36,6 +36,7 @@ class TissueConstants:
     sure: float = 0.7  # confidence above which a pixel is tracked
     visible: float = 0.7  # share of frames in which a pixel has to be tracked
     rounds: int = 5  # of GrabCut
+    small: float = 0.05  # share of the picture below which what is found is doubtful
     solid: float = (
         0.93  # share of its convex hull below which the result is doubtful: right ones 0.95 and more
     )
@@ -56,6 +57,8 @@ def choose_frames(footage: Footage) -> frozenset[int]:
         rest = some if rest is None else rest
         number.append(picture.index)
         change.append(float(np.abs(some - rest).mean()) if some.shape == rest.shape else 0.0)
+    if not number:  # `Decoder` reports it
+        return frozenset()
     parts = np.array_split(np.arange(1, len(number)), CONSTANTS.frames)
     return frozenset(
         number[k] for k in [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
@@ -114,7 +117,9 @@ class TissueSearch:
         tissue, solid = max(
             (self._region(colours, one, core, hidden) for one in guesses), key=lambda one: one[1]
         )
-        text = f"found by motion and colour, {100 * tissue.mean():.0f}% of the picture"
+        text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
+        if tissue.mean() < CONSTANTS.small:
+            return tissue, _state(f"{text}: is it an instrument that moves?", "warning")
         if solid < CONSTANTS.solid:
             return tissue, _state(
                 f"{text}, but with an uneven outline: see the picture of the masks", "warning"
@@ -124,7 +129,7 @@ class TissueSearch:
     def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
         near, wide = (max(1, round(share * len(core))) for share in (CONSTANTS.near, CONSTANTS.wide))
-        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near)
+        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
         tissue = _largest(_with_hidden(tissue, core, hidden), core)
         tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
         hull = _hull(tissue)

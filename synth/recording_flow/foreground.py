@@ -87,7 +87,7 @@ class ForegroundSearch:
         lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(LIMITS.near_px)) > 0
         self._note("hides tissue that is visible at rest", lost, frame, LIMITS.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
-        if motion > LIMITS.least_px:
+        if motion > LIMITS.least_px and self._has_masks:  # else it would be that of an instrument
             inner = cv2.erode(free.astype(np.uint8), _square(2 * LIMITS.across_px), borderValue=0) > 0
             jump = flow_jump(frame.flow) > max(LIMITS.step_px, LIMITS.step * motion)
             edge = jump & inner & (frame.confidence > LOW_CONFIDENCE)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bench.methods import physics, posterior
+from bench.methods import force_mixture, physics, posterior
 from bench.methods.compliance import ElasticBlock, TissueKind
 from bench.methods.posterior import LoadBasis, Observation
 from bench.methods.protocol import MethodContext
@@ -159,3 +159,28 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
     nothing = physics.weigh_tissues(scene, [], STILL)
     membranes = np.array(physics.TISSUES.membranes_mm)
     assert nothing.membrane == pytest.approx(0.33 * sum(membranes > 5) / sum(membranes > 0), abs=0.01)
+
+
+def test_the_quietest_frames_bound_the_tissues_own_motion() -> None:
+    """A pulse of known amplitude, with a contact in a half of the frames."""
+    time_s, none = np.arange(100) / 10, np.full((2, 9), 0.001)
+    pulse_mm = 0.2 * (1 - np.cos(2 * np.pi * 0.25 * time_s)) + (time_s > 5) * 1.0
+    still = [posterior.Observation(np.full((2, 9), 0.001 + (k > 50)), none) for k in range(100)]
+    frames = [posterior.Observation(np.full((2, 9), size), none) for size in pulse_mm]
+    for of, low, high in ((frames, 0.1, 0.5), (still, 0.0, 0.03)):
+        quiet, factor = physics.quietest_frames(time_s, of)
+        assert low <= factor * max(of[k].size_mm for k in quiet) <= high
+    # A tenth of a second may be where breath turns.
+    assert physics.quietest_frames(time_s[:2], still[:2])[1] > 100
+
+
+def test_an_interval_holds_every_assumption_however_unlikely() -> None:
+    one, other = (
+        force_mixture.ForceMixture(np.ones(1), np.array([[size, 0, 0]]), 1e-4 * np.eye(3)[None])
+        for size in (1.0, 4.0)
+    )
+    both = force_mixture.mix([one, other], np.array([1 - 1e-9, 1e-9]), [0, 1])
+    low, high = force_mixture.size_interval(both, 0.0)
+    assert np.linalg.norm(both.mean) == pytest.approx(1)
+    assert low < 1
+    assert high > 3.9
