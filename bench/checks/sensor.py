@@ -80,7 +80,8 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
     size = np.linalg.norm(force.force_mn[known], axis=1)
     least, most = float(size.min()), float(size.max())
     there = float(np.interp(rest_s, t, size))
-    if not t[0] <= rest_s <= t[-1] or there - least <= _LOADED * (most - least):
+    near_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # the sensor may start a sample later
+    if not t[0] - near_s <= rest_s <= t[-1] + near_s or there - least <= _LOADED * (most - least):
         return []
     lowest = f"the minimum is {least:.3g} mN at {t[size.argmin()]:.3g} s"
     message = f"the sensor measures {there:.3g} mN at the rest frame; {lowest}"
@@ -197,7 +198,7 @@ def find_sensor_motion(
         axes if sensor.in_camera_axes else 0,
         leading,
         np.array(tracked.bounds[main], np.float64)[known],
-        sensor.axes_mn[0] if np.isfinite(sensor.axes_mn[0]).all() else None,
+        next((one for one in sensor.axes_mn[:2] if np.isfinite(one).all()), None),  # it may start later
         sensor.noise_floor_mn,
         bool(tracked.pulse),
     )

@@ -149,9 +149,9 @@ def test_a_membrane_is_estimated_from_the_video_and_restricted_by_meta(basis: Lo
     for tissue in (BARE, TissueKind("bonded", 40.0, 0.45)):
         frames = [observed(pressed(basis, tissue, [1.0, 0.0, level]), 0.01) for level in (2.0, 4.0)]
         found = physics.weigh_tissues(scene, frames, STILL)
-        stiff.append(float(found.weight @ [one.membrane for one in found.tissues]))
+        stiff.append(found.tissues[0].membrane)
     # On another mesh bare tissue may be taken for a thin membrane, never for a thick one.
-    assert stiff[0] <= 5 + 1e-9
+    assert stiff[0] <= 5
     assert stiff[1] > 20
     stated = MethodContext(scene.tissue, scene.scale_mm_per_px, 2.0, "stripped", (0.48, 0.49))
     assert {(one.membrane, one.poisson) for one in physics.candidate_tissues(stated)} == {(0.0, 0.49)}
