@@ -30,7 +30,7 @@ class Thresholds:
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = (
-        0.2  # least width of a hand that is detected as a tool, over that of the picture; tools: 0.1
+        0.15  # least width of a hand that is detected as a tool, over that of the picture; tools: 0.1
     )
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 

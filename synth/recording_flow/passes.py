@@ -40,7 +40,7 @@ from synth.recording_flow.stereo import DepthCamera, RightCamera, RightVideo
 from synth.system.stopwatch import Stopwatch
 from synth.video.read import Picture
 
-_SEARCHED = 12, 6  # the first frames, and then one in so many, are searched for foreground
+_SEARCHED = 12, 3  # the first frames, and then one in so many, are searched for foreground
 
 
 class Pace(Protocol):
@@ -259,7 +259,7 @@ class VideoPass:
             return stage.process(frame)
 
     def _search_foreground(self, frame: FrameMotion) -> None:
-        """Searches the first frames, and then each sixth, for foreground."""
+        """Searches the first frames, and then each third, for foreground."""
         count = self.summary.frames
         if self._foreground is not None and (count <= _SEARCHED[0] or count % _SEARCHED[1] == 0):
             with self.watch.stage("mask"):
