@@ -4,8 +4,7 @@ Each hypothesis on the recording is a transformation of the sensor's force after
 estimate up to a gain. Within the stated interval a gain needs no explanation. A residual r has the Laplace
 likelihood, which spikes hardly change: n log(mean |r|) over n independent frames, where mean |r| counts from
 the noise on; a hypothesis that is one of N of its kind pays log N. Magnitudes and, if their axes are known,
-components count separately. The rates of detections and false alarms are those of
-`tests/bench/scoring/test_judgement.py`.
+components count separately. Tested by `tests/bench/scoring/test_judgement.py`.
 """
 
 from __future__ import annotations
@@ -86,16 +85,14 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
 
 def find_missed(sensor: SensorMotion) -> str:
     """Which frames' 90% interval holds clearly fewer of the sensor's readings than stated; empty: none."""
-    if (
-        sensor.leading_mn is None
-        or sensor.bounds_mn is None
-        or not np.isfinite(sensor.bounds_mn).all(1).any()
-    ):
+    if sensor.leading_mn is None or sensor.bounds_mn is None:
         return ""
-    size = sensor.size_mn
-    margin = 0.5 * sensor.contact_mn
     low, high = sensor.bounds_mn.T
-    held, known = (size >= low - margin) & (size <= high + margin), np.isfinite(low + high)
+    known = np.isfinite(sensor.bounds_mn).all(axis=1)
+    if not known.any():
+        return ""
+    size, margin = sensor.size_mn, 0.5 * sensor.contact_mn
+    held = (size >= low - margin) & (size <= high + margin)
     count = independent(size - np.linalg.norm(sensor.leading_mn, axis=1)) / len(size)
     contact = size > sensor.contact_mn
     parts, few = {"": known, " in contact": known & contact, " without": known & ~contact}, False

@@ -67,11 +67,12 @@ class Fusion:
             square = float(off @ off)
             # The weight is in 0..1: components that lose weight must not move the estimate beyond both.
             share = float((both.mean - physics.force_mn) @ off) / max(square, 1e-12)
-            force = both.mean + (float(np.clip(share, 0, 1)) - share) * off
+            weight = min(max(share, 0.0), 1.0)
+            force = both.mean + (weight - share) * off
             size = float(np.linalg.norm(force))
             low, high = min(low, physics.low_mn, size), max(high, physics.high_mn, size)
             found.append(ForceEstimate(force, None, low, high))
-            pulled, apart = pulled + float(np.clip(share, 0, 1)) * square, apart + square
+            pulled, apart = pulled + weight * square, apart + square
         self._share = pulled / apart if apart else 0.0
         return widen_small_forces(found)
 

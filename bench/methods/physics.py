@@ -39,9 +39,7 @@ class TissueConstants:
     thin_mm: float = 5.0  # on another mesh bare tissue is taken for a membrane of up to this (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
-    cut: float = (
-        0.25  # share of the tissue's outline on the picture's border, from which the edge is not known
-    )
+    cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
     wide: float = 1.2  # radius of the visible tissue, in openings, above which no skull edge is assumed
     temper: float = 0.1  # share of the evidence that counts: errors are correlated (design.md)
     strongest: int = 8  # frames that weight the tissues, every third
@@ -110,7 +108,10 @@ class Physics:
         assert self._scene is not None
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
         if contact_free.any() or not self._scene.living or not any(self._trusted):
-            own_mm = posterior.own_motion(basis, [self._frames[k] for k in np.flatnonzero(contact_free)])
+            free = [self._frames[k] for k in np.flatnonzero(contact_free)]
+            own_mm = posterior.own_motion(
+                basis, [one for one in free if one.size_mm > 0]
+            )  # not the rest frame
         else:
             tracked = np.flatnonzero(self._trusted)
             frames = [self._frames[k] for k in tracked]

@@ -15,8 +15,7 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds for foreground, chosen by hand on videos: it is reported in 13 of 17 with foreign objects
-    and in none of 19 clean ones (docs/design.md)."""
+    """Thresholds for foreground, chosen by hand on videos with foreign objects and without."""
 
     front_mm: float = 2.5  # least height above the surface of the tissue: more than its relief
     sigmas: float = 5.0  # least height in standard deviations of the depth
@@ -29,9 +28,7 @@ class Thresholds:
     lost: float = 0.02  # least share of the tissue that an occluder covers
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
-    wide: float = (
-        0.15  # least width of a hand that is detected as a tool, over that of the picture; tools: 0.1
-    )
+    wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
 

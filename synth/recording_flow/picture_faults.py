@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from synth.arrays import Map, Mask, Pixels
 from synth.recording_flow.finding import Finding
@@ -143,8 +144,10 @@ class VideoFaults:
         # Noise on copies of a picture hides that they are equal, but each new exposure has noise of its own.
         # It must be usual before and after: a change of light or gain changes it for good.
         levels = np.column_stack([quiet, median])
-        spans = [(levels[max(k - _AROUND, 0) : k + 1], levels[k : k + _AROUND]) for k in range(len(levels))]
-        floor = np.array([np.minimum(*(np.median(span, axis=0) for span in pair)) for pair in spans])
+        padded = np.pad(levels, ((_AROUND, _AROUND - 1), (0, 0)), constant_values=np.nan)
+        before = np.nanmedian(sliding_window_view(padded, _AROUND + 1, axis=0)[: len(levels)], axis=-1)
+        after = np.nanmedian(sliding_window_view(padded, _AROUND, axis=0)[_AROUND:], axis=-1)
+        floor = np.minimum(before, after)
         stale = ((floor > LIMITS.noise) & (levels < LIMITS.stale * floor)).all(axis=1)
         same = np.concatenate([[False], stale | (change < LIMITS.same * usual), [False]]).astype(int)
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
