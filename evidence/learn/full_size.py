@@ -2,6 +2,7 @@
 
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -18,6 +19,7 @@ from learn.inference.predict import load_model
 from learn.settings import preset, replace
 from learn.training.threads import make_fabric, set_threads
 from learn.training.train import train
+from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.job import reader
 from synth.job.schema import Job
 
@@ -39,8 +41,8 @@ def measure(
     job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences, "frames": frames})
     base = preset("paper", size=size, epochs=epochs, batch=64)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        list(pool.map(partial(_make, job, size, cache), range(sequences)))
-    clips = [labels.whole(job, index, base.grid, cache) for index in range(sequences)]
+        made = [index for index in pool.map(partial(_make, job, size, cache), range(sequences)) if index >= 0]
+    clips = [labels.whole(job, index, base.grid, cache) for index in made]
     on_gpu = accelerator != "cpu" and torch.cuda.is_available()
     settings = replace(
         base,
@@ -60,6 +62,7 @@ def measure(
     count = sum(clips[i].frames for i in split.fit)
     result = {
         "device": torch.cuda.get_device_name() if on_gpu else "cpu",
+        "sequences_made": len(made),
         "frames_fit": count,
         "training_s": trained if whole_run else None,
         "frames_per_s": count * epochs / trained if whole_run else None,
@@ -69,9 +72,13 @@ def measure(
     print(result)
 
 
-def _make(job: Job, size: int, cache: Path, index: int) -> None:
+def _make(job: Job, size: int, cache: Path, index: int) -> int:
+    """Makes the labels of a sequence; returns its index, or -1 if its load has no solution."""
     set_threads(1)
-    labels.whole(job, index, preset("paper", size=size).grid, cache)
+    with suppress(InvertedElement, NoEquilibrium):
+        labels.whole(job, index, preset("paper", size=size).grid, cache)
+        return index
+    return -1
 
 
 STUDY = Study(measure, steps=())

@@ -1,5 +1,6 @@
 """The renderer on every variant that runs here."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -131,7 +132,7 @@ def test_traction_is_in_camera_axes() -> None:
 @pytest.mark.slow
 def test_without_llvm_the_scalar_variant_is_taken() -> None:
     code = "from synth.render.mitsuba.adapter import pick; print(pick('auto'))"
-    environment = {"PATH": "/usr/bin:/bin", "SULCUS_LLVM": ""}
+    environment = os.environ | {"PATH": "/usr/bin:/bin", "SULCUS_LLVM": ""}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == "scalar_rgb"
 
