@@ -29,7 +29,7 @@ def set_threads(wanted: int | None = None) -> int:
 
 
 def make_fabric(**settings: Any) -> Fabric:
-    """`Fabric(**settings)` without its hints; a GPU multiplies in TF32 where it has no narrower type to use."""
+    """`Fabric(**settings)` without its hints; a GPU multiplies 32-bit numbers in TF32."""
     from lightning_fabric import Fabric
 
     if settings.get("accelerator") != "cpu" and torch.cuda.is_available():
