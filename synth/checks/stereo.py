@@ -30,8 +30,7 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     rows, columns = (at[::_EVERY] for at in np.nonzero(core & (rest_depth > 0)))
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)
     points = cameras.rays(left, pixels) * rest_depth[rows, columns][:, None]
-    baseline, shift = left.translation[0] - right.translation[0], right.K[0, 2] - left.K[0, 2]
-    expected = left.K[0, 0] * baseline / points[:, 2] - shift
+    expected, (turn, shift) = cameras.disparity(left, right, points), cameras.between(left, right)
     found = sequence["disparity"][:][rows, columns]
     yield Measure(float(np.abs(found - expected).max(initial=0)), 1e-3, "rest disparity from depth", "px")
     half = _HALF_PX if sequence["flow"].stored == np.float16 else 0.0
@@ -43,8 +42,8 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
         # Medians, as interpolation is wrong at edges.
         visible = sequence["visible"][t][rows, columns]
         yield from _depth(sequence, t, "depth", cameras.to_pixels(left, moved), moved, visible)
-        aside = np.array([right.translation - left.translation])
-        start, end = cameras.to_pixels(right, points + aside), cameras.to_pixels(right, moved + aside)
+        there = moved @ turn.T + shift
+        start, end = (cameras.to_pixels(right, one) for one in (points @ turn.T + shift, there))
         if {"flow_right", "visible_right"} <= set(sequence.fields):
             visible &= _sampled(sequence["visible_right"][t].astype(np.float32), start) > 0.99
             if visible.sum() > _FEWEST:
@@ -52,7 +51,7 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
                 middle, most = np.quantile(off_px.max(axis=1), (0.5, 0.95)).tolist()
                 yield Measure(middle, 5e-3 + half, f"frame {t}: right flow from motion", "px")
                 yield Measure(most, 0.1 + half, f"frame {t}: right flow of 95%", "px")
-        yield from _depth(sequence, t, "depth_right", end, moved, visible)
+        yield from _depth(sequence, t, "depth_right", end, there, visible)
 
 
 def right_of(sequence: Sequence) -> cameras.Camera:

@@ -20,7 +20,6 @@ from synth.errors import UserError
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.publish import card, croissant, sequence_video
-from synth.render.camera import camera as cameras
 
 _TRIES = 3  # attempts per sequence
 _VERDICT = 5  # the job is refused if so many sequences fail because of it before any succeeds
@@ -93,7 +92,10 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
     share = share_of_memory(workers) if memory is None else int(memory * 1e9)
     if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)
-    cameras.refuse_unfit(job.render)
+    if job.render.calibration is not None:
+        from synth.sequence.scene import refuse_unfit  # slow to import
+
+        refuse_unfit(job.render)
     gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
     with claim(root, job, mix_versions=options.mix_versions) as folder:
         finished, failures = folder.sealed(), folder.failures()

@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
 
+from synth.errors import UserError
 from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Section, Share, Weights
+from synth.system import checked_file
 
 
 class LightSection(Section):
@@ -67,15 +70,16 @@ class RenderSection(Section):
     """Width of the field of view at the craniotomy [mm]."""
     working_distance_mm: Range[Positive] = (280.0, 320.0)
     """Distance from the front lens to the craniotomy [mm]."""
-    tilt_deg: Range[NonNegative] = (0.0, 20.0)
-    """Angle between the optical axis and the craniotomy's normal."""
+    tilt_deg: Range[Annotated[FiniteFloat, Field(ge=0, le=60)]] = (0.0, 20.0)
+    """Angle between the optical axis and the craniotomy's normal, 0-60."""
     aperture_mm: NonNegative = 4.0
     """Radius of the lens aperture [mm]; 0 is a pinhole."""
     distortion: Distortion = (-0.05, 0.01, 0.0, 0.0, 0.0)
     """Brown-Conrady k1, k2, p1, p2, k3."""
     calibration: Path | None = None
     """Camera calibration written by OpenCV (YAML, XML, JSON), relative to the job file; it replaces field_mm
-    and distortion, and sets the principal point."""
+    and distortion, and sets the principal point. One of a pair (K1, D1, K2, D2, R, T in mm of
+    `stereoCalibrate`) gives a stereo dataset with that right camera, and replaces stereo_mm."""
     drift_mm: Range[NonNegative] = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
     stereo_mm: NonNegative = 0.0
@@ -86,3 +90,29 @@ class RenderSection(Section):
     scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()
     """Objects around the opening, each in three of four sequences: a retractor's blade and cotton patties
     over its edge, the bone's cut edge, drapes in the corners. They hide tissue and don't count as tissue."""
+
+    @model_validator(mode="after")
+    def _calibration_replaces_keys(self) -> RenderSection:
+        if self.calibration is None:
+            return self
+        found = round(baseline_mm(self.calibration), 9)
+        fixed: dict[str, float | None] = {"field_mm": None, "distortion": None}
+        if found:
+            fixed["stereo_mm"] = found
+        for name, own in fixed.items():
+            if getattr(self, name) not in (type(self).model_fields[name].default, own):
+                raise ValueError(f"{name}: render.calibration sets it; leave one of the two out")
+        if found:
+            object.__setattr__(self, "stereo_mm", found)
+        return self
+
+
+def baseline_mm(calibration: Path) -> float:
+    """Distance of the two cameras of a stereo calibration; 0 for another file, or one that can't be read."""
+    try:
+        held = checked_file.read_storage(calibration)
+    except UserError:
+        return 0.0  # reported by those that read the cameras
+    shift = held.get("T")
+    pair = "R" in held and isinstance(shift, np.ndarray) and any(name.endswith("2") for name in held)
+    return float(np.linalg.norm(shift)) if pair else 0.0

@@ -18,6 +18,7 @@ from synth.dataset.attributes import name_gestures
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.publish import picture
+from synth.render.camera.camera import between
 
 _JPEG_QUALITY = 90
 
@@ -83,8 +84,9 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
     stream.log("camera", rerun.Pinhole(image_from_camera=left.K, resolution=left.size), static=True)
     if "right" in sequence.attrs:
         right = stereo.right_of(sequence)
-        aside = right.rotation @ (right.centre - left.centre)
-        stream.log("right", rerun.Transform3D(translation=aside), static=True)
+        turn, shift = between(left, right)  # from the left camera; the viewer wants the way back
+        pose = rerun.Transform3D(translation=-turn.T @ shift, mat3x3=turn.T)
+        stream.log("right", pose, static=True)
         stream.log("right", rerun.Pinhole(image_from_camera=right.K, resolution=right.size), static=True)
     stream.log("force", rerun.SeriesLines(names=["x mN", "y mN", "z mN", "length mN"]), static=True)
     stream.log("about", rerun.TextDocument(about, media_type="text/markdown"), static=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from synth.render import truth
 from synth.render.anatomy import noise
 from synth.render.appearance import light
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera import Camera, blur_radius, right_camera
+from synth.render.camera.camera import Camera, blur_radius, disparity, right_camera
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.content import SceneContent
 from synth.render.materials import Body, Metal, Wet
@@ -87,6 +88,7 @@ class Renderer:
         sensor: its chip and video processor.
         settings: of them variant, light paths and the right camera's baseline are used.
         extra: names of optional fields of a `RenderedFrame` to fill.
+        right: the right camera of the left one in any pose; by default parallel to it, at that baseline.
 
     Raises:
         UserError: the variant cannot run here.
@@ -100,6 +102,7 @@ class Renderer:
         sensor: CameraSensor = CameraSensor(),
         settings: RenderSection = RenderSection(),
         extra: Sequence[str] = (),
+        right: Callable[[Camera], Camera] | None = None,
     ) -> None:
         forget()  # earlier renderers
         self.variant = pick(settings.variant)
@@ -116,8 +119,9 @@ class Renderer:
         self.right: Camera | None = None
         """The right camera at rest, if there is one."""
         self._right_rest: RestFrame | None = None
+        self._right_of = right or partial(right_camera, baseline_mm=settings.stereo_mm)
         if settings.stereo_mm:
-            self.right = right_camera(camera, settings.stereo_mm)
+            self.right = self._right_of(camera)
             self._right_rest = truth.trace_rest(self.right, content.tissue.shape, self._static)
         self._stage: Stage | None = None
 
@@ -152,8 +156,7 @@ class Renderer:
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, own.depth)
         if self._right_rest is not None:
-            lens = right_camera(camera, self._settings.stereo_mm)
-            other = truth.trace_frame(lens, self._right_rest, *shapes)
+            other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
             picture = self.develop(others[0], seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
@@ -176,12 +179,9 @@ class Renderer:
         """
         if self.right is None:
             raise ValueError("the scene is monocular")
-        width, height = self.camera.size
-        depth = self.rest.points[:, 2].reshape(height, width)
-        shift = self.right.K[0, 2] - self.camera.K[0, 2]
-        away = np.where(self.rest.tissue, depth, 1.0)
-        wide = self.camera.K[0, 0] * self._settings.stereo_mm / away - shift
-        return np.where(self.rest.tissue, wide, 0.0).astype(np.float32)
+        on, found = self.rest.tissue, np.zeros(self.rest.tissue.shape, np.float32)
+        found[on] = disparity(self.camera, self.right, self.rest.points[on.ravel()])
+        return found
 
     def traction(self, nodal: Floats) -> Map:
         """Traction (V, 3) kPa, world axes, at rest pixels: (H, W, 3) kPa, camera axes; 0 off tissue."""
@@ -226,7 +226,7 @@ class Renderer:
                 self.move(self._stage, state)
             cameras = [state.camera or self.camera]
             if self.right is not None:
-                cameras.append(right_camera(cameras[0], self._settings.stereo_mm))
+                cameras.append(self._right_of(cameras[0]))
             shots.append([])
             for side, camera in enumerate(cameras):
                 taken = self._stage.render((seed + side + 7919 * k) % 2**32, camera)

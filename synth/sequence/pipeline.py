@@ -20,7 +20,7 @@ from synth.job import identity
 from synth.job.laws import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
-from synth.render.camera.camera import Camera
+from synth.render.camera.camera import Camera, between
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scene import Scene
@@ -178,10 +178,9 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
-            left=rig.Intrinsics(scene.view.K, scene.view.distortion),
-            right=rig.Intrinsics(lens.K, lens.distortion),
-            rotation=np.eye(3),
-            translation=np.array([-job.render.stereo_mm, 0.0, 0.0]),
+            rig.Intrinsics(scene.view.K, scene.view.distortion),
+            rig.Intrinsics(lens.K, lens.distortion),
+            *between(scene.view, lens),
             size=job.render.size,
         )
         still = stereo.still_frames(flow.flow, scene.tissue)

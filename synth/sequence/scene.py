@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -14,10 +14,13 @@ from synth.fem.deformation import Deformation
 from synth.fem.surface_embedding import vertex_area
 from synth.flow import track
 from synth.flow.estimator import Estimator
+from synth.flow.stereo.calibration import read_rig
+from synth.flow.stereo.rig import Rectified
 from synth.flow.track import Track
 from synth.geometry.brain_surface import Brain, load_brain
 from synth.geometry.triangles import Shape
-from synth.job.schema import AnatomySection, Job
+from synth.job.microscope import baseline_mm
+from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
@@ -28,6 +31,8 @@ from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
+
+_LEAST_APART_MM = 0.5  # cameras of a pair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +94,11 @@ class RestScene:
         drawn, own = content.tissue.shape, self.shape
         if not (np.array_equal(drawn.faces, own.faces) and np.array_equal(drawn.vertices, own.vertices)):
             raise UserError("content: its tissue must have the vertices and faces of the scene's surface")
-        return Renderer(content, self.view, sensor, job.render, job.store.extra)
+        right = right_of(job.render, self.view)
+        made = Renderer(content, self.view, sensor, job.render, job.store.extra, right)
+        if not made.rest.tissue.any():
+            raise UserError("render: the camera shows no tissue; change render.tilt_deg or the opening")
+        return made
 
     @property
     def tissue(self) -> Mask:
@@ -230,6 +239,46 @@ def at_rest(
         job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
     )
     return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy)
+
+
+def refuse_unfit(render: RenderSection) -> None:
+    """Raises UserError for a calibration that cannot be read, does not fit the picture, or whose right camera
+    does not show the opening."""
+    if render.calibration is not None:
+        right_of(render, camera.place(scenario.draw_view(render, np.random.default_rng(0)), render))
+
+
+def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] | None:
+    """The right camera of the left one in any pose, by the job's stereo calibration; None without one.
+
+    `view`: the left camera at rest; its picture may have another size than those of the calibration.
+    Raises UserError for a pair that is none, or whose right camera does not show the opening's centre.
+    """
+    if render.calibration is None or not baseline_mm(render.calibration):
+        return None
+    pair = read_rig(render.calibration, render.size)
+    if pair.baseline_mm < _LEAST_APART_MM:
+        raise UserError(f"render.calibration: its cameras are {pair.baseline_mm:.3g} mm apart; T must be in mm")
+    K, scale = pair.right.K.copy(), np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
+    K[:2] *= scale[:, None]
+    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers
+    lens = pair.right.distortion
+    if lens.size > 8 and lens[8:].any():
+        raise UserError(f"{render.calibration}: thin-prism distortion of the right camera is not supported")
+    lens = np.append(lens, np.zeros(4))[: 8 if lens.size >= 8 else 5]
+    place = partial(
+        camera.calibrated_right, K=K, distortion=lens, rotation=pair.rotation, translation=pair.translation
+    )
+    Rectified(pair)  # refuses a right camera that is not to the right
+    right = place(view)
+    at = camera.project(right, np.zeros((1, 3)))[0]
+    if right.translation[2] <= 0 or (at < 0).any() or (at >= right.size).any():
+        away = view.translation[2]
+        raise UserError(
+            f"render.calibration: {away:.4g} mm away the right camera does not show the opening's centre, which "
+            f"is at pixel ({at[0]:.0f}, {at[1]:.0f}); change render.working_distance_mm (T must be in mm)"
+        )
+    return place
 
 
 @lru_cache(maxsize=4)

@@ -20,7 +20,7 @@ from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import write_png
-from synth.render.camera.camera import Camera
+from synth.render.camera.camera import Camera, between
 
 UNIT_MM = 0.01  # one step of a depth picture, and the unit of lengths: 16 bits reach to 655 mm
 
@@ -68,18 +68,19 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             "young_kpa": sequence.attrs["young_kpa"],
         }
         if "rgb_right" in sequence:
-            maps = _maps(stereo.right_of(sequence), focal)
+            right = stereo.right_of(sequence)
+            maps = _maps(right, focal, between(optics.camera_of(sequence), right)[0].T)
             for t in range(sequence.frames):
                 write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
             about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
         (here / "scene.json").write_text(json.dumps(about, indent=1), "utf-8")
 
 
-def _maps(view: Camera, focal: float) -> _Maps:
-    """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume."""
+def _maps(view: Camera, focal: float, turn: Floats = np.eye(3)) -> _Maps:
+    """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume, turned."""
     width, height = view.size
     middle = np.array([[focal, 0, width // 2], [0, focal, height // 2], [0, 0, 1]], np.float64)
-    x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, np.eye(3), middle, view.size, cv2.CV_32FC1)
+    x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, turn, middle, view.size, cv2.CV_32FC1)
     return _Maps(np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import Array, Ints
-from synth.checks import optics
+from synth.checks import optics, stereo
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import as_png
-from synth.render.camera.camera import rays
+from synth.render.camera.camera import depth_of, rays
 
 _POINTS = 1024
 
@@ -70,11 +70,11 @@ def _choose(sequence: Sequence) -> Ints:
 
 def _in_depth(sequence: Sequence, pixels: Ints) -> dict[str, Array]:
     """Tracks of pixels (N, 2) of frame 0 in space, and the camera's intrinsics."""
-    view, right = optics.camera_of(sequence), sequence.attrs["right"]
+    view, right = optics.camera_of(sequence), stereo.right_of(sequence)
     (fx, _, cx), (_, fy, cy), _ = view.K
     columns, rows = pixels.T
-    disparity = sequence["disparity"][:][rows, columns] + right["K"][0][2] - cx
-    rest = rays(view, pixels.astype(np.float64)) * (fx * right["baseline_mm"] / disparity)[:, None]
+    along = rays(view, pixels.astype(np.float64))
+    rest = along * depth_of(view, right, along, sequence["disparity"][:][rows, columns])[:, None]
     tracks = np.stack([rest + sequence["motion"][t][rows, columns] for t in range(sequence.frames)])
     return {
         "tracks_XYZ": (tracks / 1000).astype(np.float32),

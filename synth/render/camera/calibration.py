@@ -12,7 +12,8 @@ from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
 
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1", "intrinsic_matrix", "mtx")
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "K1", "M1", "intrinsic_matrix", "mtx")
+_MATRIX += ("cameraMatrix1", "camera_matrix_1", "CM1")  # the left one of a pair
 _LENS = (
     "distortion_coefficients",
     "distCoeffs",
@@ -21,8 +22,11 @@ _LENS = (
     "distortion",
     "D",
     "D1",
+    "distCoeffs1",
+    "dist_coeffs_1",
     "dist",
 )
+_TERMS = (4, 5, 8, 12, 14)  # numbers of coefficients in OpenCV
 _LARGEST = 1e6  # of any value in px, and of a distortion coefficient
 _SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
@@ -35,11 +39,12 @@ def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
         size: width, height [px].
 
     Returns:
-        K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (5,) k1, k2, p1, p2, k3.
+        K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (5,) k1, k2, p1, p2, k3, or
+        (8,) with k4, k5, k6; of a stereo calibration those of the left camera.
 
     Raises:
-        UserError: it cannot be read, is not of a pinhole camera with Brown-Conrady distortion, or was made
-            from pictures of another shape.
+        UserError: it cannot be read, is not of a pinhole camera with Brown-Conrady distortion, perhaps
+            rational, or was made from pictures of another shape.
     """
     largest, is_json = identity.FILES["render", "calibration"], path.suffix.lower() == ".json"
     try:
@@ -57,13 +62,14 @@ def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
     ):
         raise _error(path, "the camera matrix has skew, or values out of range")
     lens = _array(path, found, _LENS, "distortion coefficients").ravel()
-    if not (np.abs(lens) < _LARGEST).all() or len(lens) < 4 or np.abs(lens[5:]).max(initial=0) > 0:
+    if not (np.abs(lens) < _LARGEST).all() or len(lens) not in _TERMS or lens[8:].any():
         raise _error(
             path,
             f"{len(lens)} distortion coefficients; "
-            "needed are k1 k2 p1 p2 and perhaps k3 (no rational, thin-prism or fisheye model)",
+            "needed are k1 k2 p1 p2 and perhaps k3 to k6 (no thin-prism or fisheye model)",
         )
-    return _resized(path, K, found, size), np.resize(np.append(lens, np.zeros(5)), 5)
+    terms = 8 if lens[5:].any() else 5
+    return _resized(path, K, found, size), np.append(lens, np.zeros(8))[:terms]
 
 
 def _resized(path: Path, K: Floats, found: dict[str, Any], size: tuple[int, int]) -> Floats:

@@ -1,7 +1,9 @@
 """The microscope camera: one model for rays, ground truth, flow and bench.
 
-OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3), the centre
-of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera calibration", 1971.
+OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3) or OpenCV's
+rational model of it (k4, k5, k6 as well), the centre of the top-left pixel at (0, 0). D. C. Brown,
+"Close-range camera calibration", 1971; D. Claus, A. W. Fitzgibbon, "A rational function lens distortion model
+for general cameras", 2005.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ class Camera:
     K: Floats
     """(3, 3) px."""
     distortion: Floats
-    """(5,) k1, k2, p1, p2, k3."""
+    """(5,) k1, k2, p1, p2, k3, or (8,) with k4, k5, k6."""
     rotation: Floats
     """(3, 3) world to camera."""
     translation: Floats
@@ -119,17 +121,53 @@ def visible_radius(camera: Camera) -> float:
     return float(np.hypot(met[:, 0], met[:, 1]).min())
 
 
-def refuse_unfit(render: RenderSection) -> None:
-    """Raises UserError for a calibration that cannot be read or was made from pictures of another shape."""
-    if render.calibration is not None:
-        calibration.read(render.calibration, render.size)
-
-
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     """The right camera of a stereo pair; its principal point is shifted so that both show the same field."""
     K = camera.K.copy()
     K[0, 2] += K[0, 0] * baseline_mm / camera.translation[2]
     return replace(camera, K=K, translation=camera.translation - np.array([baseline_mm, 0.0, 0.0]))
+
+
+def calibrated_right(
+    camera: Camera, K: Floats, distortion: Floats, rotation: Floats, translation: Floats
+) -> Camera:
+    """The right camera of a calibrated pair: x_right = rotation @ x_left + translation, (3, 3) and (3,) mm.
+
+    It is focused on the plane that the left one is focused on.
+    """
+    moved = rotation @ camera.translation + translation
+    return replace(
+        camera,
+        K=K,
+        distortion=distortion,
+        rotation=rotation @ camera.rotation,
+        translation=moved,
+        focus_mm=float(moved[2] + camera.focus_mm - camera.translation[2]),
+        mm_per_px=float(moved[2] / K[0, 0]),
+    )
+
+
+def between(left: Camera, right: Camera) -> tuple[Floats, Floats]:
+    """Rotation (3, 3) and translation (3,) mm from the axes of the left camera to those of the right one."""
+    turn = right.rotation @ left.rotation.T
+    return turn, right.translation - turn @ left.translation
+
+
+def disparity(left: Camera, right: Camera, points: Floats) -> Floats:
+    """Column [px] of points (N, 3) mm, left camera's axes, in the left picture less that in the right one,
+    (N,), without distortion."""
+    turn, shift = between(left, right)
+    there = points @ turn.T + shift
+    (x, z), (x_there, z_there) = (one[:, ::2].T for one in (points, there))
+    return (left.K[0, 0] * x / z + left.K[0, 2]) - (right.K[0, 0] * x_there / z_there + right.K[0, 2])
+
+
+def depth_of(left: Camera, right: Camera, along: Floats, disparity_px: Floats) -> Floats:
+    """Depth (N,) mm in the left camera of points on its rays `along` (N, 3), z = 1, with those disparities."""
+    turn, shift = between(left, right)
+    there = along @ turn.T
+    x = (left.K[0, 0] * along[:, 0] + left.K[0, 2] - disparity_px - right.K[0, 2]) / right.K[0, 0]
+    return (x * shift[2] - shift[0]) / (there[:, 0] - x * there[:, 2])
 
 
 def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> Map:
@@ -184,29 +222,43 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
         step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], 1)
         guess = guess - step / determinant[:, None]
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
-        raise UserError("render.distortion: folds the picture over itself; choose smaller coefficients")
+        raise UserError(
+            "render.distortion or the calibration's: folds the picture over itself; choose smaller coefficients"
+        )
     return guess
 
 
 def _distort(flat: Floats, distortion: Floats) -> Floats:
     if not distortion.any():
         return flat
-    k1, k2, p1, p2, k3 = distortion
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    (p1, p2), (radial, _) = distortion[2:4], _radial(r2, distortion)
     across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     down = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
     return np.stack([across, down], axis=1)
 
 
+def _radial(r2: Floats, distortion: Floats) -> tuple[Floats, Floats]:
+    """Radial factor at squared radii, and twice its derivative by them."""
+    k1, k2, _, _, k3, *below = distortion
+    top, rise = _cubic(r2, k1, k2, k3)
+    if not below:
+        return top, 2 * rise
+    bottom, fall = _cubic(r2, *below)
+    return top / bottom, 2 * (rise - top / bottom * fall) / bottom
+
+
+def _cubic(r2: Floats, a: float, b: float, c: float) -> tuple[Floats, Floats]:
+    """1 + a r2 + b r2^2 + c r2^3, and its derivative."""
+    return 1 + r2 * (a + r2 * (b + r2 * c)), a + r2 * (2 * b + 3 * c * r2)
+
+
 def _slope(flat: Floats, distortion: Floats) -> tuple[Floats, Floats, Floats]:
     """Jacobian of the distortion, which is symmetric: (0, 0), (0, 1) and (1, 1)."""
-    k1, k2, p1, p2, k3 = distortion
     x, y = flat[:, 0], flat[:, 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    growth = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
+    (p1, p2), (radial, growth) = distortion[2:4], _radial(r2, distortion)
     cross = growth * x * y + 2 * p1 * x + 2 * p2 * y
     across = radial + growth * x * x + 2 * p1 * y + 6 * p2 * x
     return across, cross, radial + growth * y * y + 2 * p2 * x + 6 * p1 * y
