@@ -151,9 +151,10 @@ def preview(
         print(json_.dumps({"sheet": str(out), "openings": places}) if json else text)
         return
     read = reader.load_job(job, overrides or [])
-    with counting("Compiling the first time, drawing, then measuring the cost of a sequence") as progress:
-        picture, spent_s = contact_sheet.draw_sheet(read, count, progress)
-    write_picture(out, picture)
+    with counting("Compiling the first time, measuring the cost of a sequence, then drawing") as progress:
+        sheet = contact_sheet.draw_sheet(read, count, progress)
+    write_picture(out, sheet.picture)
+    spent_s = sheet.cpu_s
     cpu_s, disk_bytes = sum(spent_s.values()), estimate(read) * read.sequences
     if json:
         about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": disk_bytes}
@@ -161,7 +162,7 @@ def preview(
         return
     stages = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent_s.items())
     print(
-        f"wrote {out}\nthe whole job: {read.sequences} sequences of {read.frames} frames, about "
+        f"wrote {out}{sheet.drawn and ', ' + sheet.drawn}\nthe whole job: {read.sequences} sequences of {read.frames} frames, about "
         f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(disk_bytes)} of disk"
     )
 

@@ -2,63 +2,80 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 import tempfile
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from synth.arrays import Floats
-from synth.dataset.store import open_sequence
+from synth.errors import UserError
 from synth.fem import tool_gesture
 from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface
+from synth.render.camera.camera import resized
 from synth.render.scene import SceneState
 from synth.sequence import pipeline, scenario
-from synth.sequence.scene import at_rest
+from synth.sequence.scene import Scene, at_rest
+from synth.sequence.simulation import simulate
+from synth.system.stopwatch import Stopwatch
 from synth.system.terminal import ProgressCallback
 
 _TILE_PX = 320
-_PROBES = 3  # sequences that are computed with few frames, after one for the compilation
-_SHORT, _LONG = 3, 9  # frames: their difference is the cost of further frames
+_LEAST_VERTICES = 2000
+_SHORT, _LONG = 3, 9  # frames: their difference is the cost of further load steps
+_PER_SEQUENCE = "mesh", "scene"  # stages whose cost is the same for any number of frames
+_IN_PICTURE = "scene", "render", "store", "flow", "stereo"  # stages whose cost grows with the picture
+_GROWTH = 0.92  # power of the number of pixels; measured from 320 x 240 to 640 x 480
 
 
-def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dict[str, float]]:
-    """The picture (H, W, 3) of `count` scenarios spread over the job, and the job's CPU time by stage [s].
+@dataclass(frozen=True)
+class Sheet:
+    """A contact sheet."""
+
+    picture: Rgb
+    cpu_s: dict[str, float]
+    """CPU time of the whole job by stage [s], without the start of workers; an estimate."""
+    drawn: str
+    """How its pictures differ from those of the job; empty if in nothing."""
+
+
+def draw_sheet(job: Job, count: int, report: ProgressCallback) -> Sheet:
+    """The pictures of `count` scenarios spread over the job, and the job's cost.
 
     Each is drawn just before its load: nothing is deformed, the sheet shows anatomy, appearance, light, view
-    and instrument. The cost is measured on a few sequences with few frames. UserError: an impossible job.
+    and instrument. Wide pictures are drawn smaller, with fewer vertices. The cost is estimated from three
+    frames of one sequence in that size, and from its deformation alone. UserError: an impossible job.
     """
-    chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int))
+    chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
     width, height = job.render.size
-    scale = min(1.0, _TILE_PX / width)
-    small = (max(16, round(width * scale)), max(16, round(height * scale)))
-    quick = job.model_copy(
-        update={
-            "render": job.render.model_copy(update={"size": small}),
-            "anatomy": job.anatomy.model_copy(update={"vertices": min(job.anatomy.vertices, 20_000)}),
-        }
-    )
-    parts = itertools.count(1)
-
-    def step() -> None:
-        report(next(parts), len(chosen) + _PROBES + 1)
-
+    share = min(1.0, _TILE_PX / width)
+    small = (max(16, round(width * share)), max(16, round(height * share)))
+    full = job.anatomy.vertices
+    vertices = max(round(full * share**2), min(full, _LEAST_VERTICES))
+    quick = job.model_copy(update={"anatomy": job.anatomy.model_copy(update={"vertices": vertices})})
+    spent = _measure_cost(quick, chosen[len(chosen) // 2], small)  # first, as further scenes of it are cached
     tiles = []
-    for index in chosen.tolist():
-        tiles.append(_draw_scenario(quick, index))
-        step()
-    return tile(tiles), _measure_cost(job, step)
+    for done, index in enumerate(chosen):
+        report(done + 1, len(chosen) + 1)
+        tiles.append(_draw_scenario(quick, index, small))
+    drawn = (
+        ""
+        if small == job.render.size
+        else f"drawn in {small[0]} x {small[1]} px with {vertices} vertices; the job has {width} x {height} px "
+        f"and {full}"
+    )
+    return Sheet(tile(tiles), {name: job.sequences * each for name, each in spent.items()}, drawn)
 
 
-def _draw_scenario(job: Job, index: int) -> Rgb:
+def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     """A scenario's picture, (H, W, 3); for a stereo job those of the left and right camera side by side."""
     scene = at_rest(job, index)
+    scene = replace(scene, view=resized(scene.view, size))
     gestures = scene.scenario.gestures
     ready = [poised(gesture, scene.surface) for gesture in gestures]
     tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
@@ -66,7 +83,7 @@ def _draw_scenario(job: Job, index: int) -> Rgb:
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
     label = f"{index}  {scene.scenario.family}  {' + '.join(one.kind for one in gestures)}"
-    return caption(picture, label, job.render.size[1] - 8)
+    return caption(picture, label, size[1] - 8)
 
 
 def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
@@ -77,32 +94,51 @@ def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
     return tips[0], shafts[0]
 
 
-def _measure_cost(job: Job, step: Callable[[], None]) -> dict[str, float]:
-    """Processor time [s] of the whole job by stage, without the start of workers.
+def _measure_cost(job: Job, index: int, size: tuple[int, int]) -> dict[str, float]:
+    """Processor time [s] of sequence `index` by stage, without the start of workers.
 
-    The gesture is the same for any number of frames, so frames of a short sequence cost as much, except for
-    the larger load steps. `step` is called after each part.
+    Computed are the rest frame, that of the largest load and the last, in pictures of `size`.
     """
-    chosen = np.unique(np.linspace(0, job.sequences - 1, _PROBES).round().astype(int)).tolist()
-    total: dict[str, float] = {}
-    more = max(job.frames - _LONG, 0) / (_LONG - _SHORT)
+    longer, watch = Stopwatch(), Stopwatch()
+    first: dict[str, float] = {}  # spent on a stage before the first frame after rest
+
+    def report(stage: str, done: int, of: int) -> None:
+        if done == 1:
+            first[stage] = watch.cpu_s(stage)
+            first.setdefault("store", watch.cpu_s("store"))
+
+    _simulate(job, index, _LONG, longer)
+    scene = _simulate(job, index, _SHORT, watch)
     with tempfile.TemporaryDirectory() as folder:
-        _stages(job, chosen[0], 2, folder)
-        step()
-        for index in chosen:
-            long = _stages(job, index, min(job.frames, _LONG), folder)
-            short = _stages(job, index, _SHORT, folder) if more else long
-            for name, spent in long.items():
-                each = spent + max(more * (spent - short[name]), 0.0)
-                total[name] = total.get(name, 0.0) + job.sequences / len(chosen) * each
-            step()
-    return total
+        for part in (4, 1):  # the first one compiles
+            less = max(16, size[0] // part), max(16, size[1] // part)
+            small = scene.job.model_copy(update={"render": job.render.model_copy(update={"size": less})})
+            drawn = replace(scene, job=small, view=resized(scene.view, less))
+            timed = (report, watch) if part == 1 else ()
+            shutil.rmtree(pipeline.write_scene(drawn, Path(folder), *timed))
+    growth = (job.render.size[0] * job.render.size[1] / (size[0] * size[1])) ** _GROWTH
+    found = {}
+    for name in ("mesh", "fem", *_IN_PICTURE):
+        spent = (longer if name == "mesh" else watch).cpu_s(name)
+        each = (spent - first.get(name, 0.0)) / (_SHORT - 1)
+        if name == "fem":
+            each = max(longer.cpu_s(name) - spent, 0.0) / (_LONG - _SHORT)
+        further = 0.0 if name in _PER_SEQUENCE else (job.frames - _SHORT) * each
+        found[name] = (spent + further) * (growth if name in _IN_PICTURE else 1.0)
+    return {name: each for name, each in found.items() if each > 0}
 
 
-def _stages(job: Job, index: int, frames: int, folder: str) -> dict[str, float]:
-    """Processor time [s] of a sequence with that number of frames, by stage."""
-    short = job.model_copy(update={"frames": frames})
-    path = pipeline.render_sequence(short, index, Path(folder), lambda stage, done, of: None)
-    spent_s = open_sequence(path).stages_cpu_s
-    shutil.rmtree(path)
-    return spent_s
+def _simulate(job: Job, index: int, count: int, watch: Stopwatch) -> Scene:
+    """`count` frames of the sequence, with the instruments' motion in the job's own frames: rest, largest
+    load, last, and others between. UserError with the numbers of those frames."""
+    case = scenario.draw_scenario(job, index)
+    moves = [tool_gesture.trajectory(gesture, job.frames) for gesture in case.gestures]
+    strongest = int(np.argmax(np.max([move.load for move in moves], axis=0)))
+    further = np.linspace(0, job.frames - 1, count - 1).round().astype(int)
+    frames = np.unique([*further, strongest])
+    motions = [ToolMotion(move.load[frames], move.away[frames], move.shift[frames]) for move in moves]
+    short = job.model_copy(update={"frames": len(frames)})
+    try:
+        return simulate(short, index, watch=watch, motions=motions)
+    except UserError as error:
+        raise UserError(f"sequence {index}, of which frames {frames.tolist()} were tried: {error}") from None

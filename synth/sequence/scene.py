@@ -259,9 +259,8 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
     pair = read_rig(render.calibration, render.size)
     if pair.baseline_mm < _LEAST_APART_MM:
         raise UserError(f"render.calibration: its cameras are {pair.baseline_mm:.3g} mm apart; T must be in mm")
-    K, scale = pair.right.K.copy(), np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
-    K[:2] *= scale[:, None]
-    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers
+    scale = np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
+    K = camera.scaled(pair.right.K, scale)
     lens = pair.right.distortion
     if lens.size > 8 and lens[8:].any():
         raise UserError(f"{render.calibration}: thin-prism distortion of the right camera is not supported")

@@ -121,6 +121,21 @@ def visible_radius(camera: Camera) -> float:
     return float(np.hypot(met[:, 0], met[:, 1]).min())
 
 
+def resized(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera with pictures of another size (width, height) px of the same field."""
+    scale = np.array(size) / camera.size
+    return replace(
+        camera, K=scaled(camera.K, scale), size=size, mm_per_px=camera.mm_per_px / float(scale[0])
+    )
+
+
+def scaled(K: Floats, scale: Floats) -> Floats:
+    """K (3, 3) of pictures that are wider and higher by factors (2,)."""
+    K = K * np.append(scale, 1.0)[:, None]
+    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers
+    return K
+
+
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:
     """The right camera of a stereo pair; its principal point is shifted so that both show the same field."""
     K = camera.K.copy()
