@@ -33,7 +33,15 @@ class Measure:
         return 0.0 if self.good else np.inf
 
 
-Invariant = Callable[[Sequence, list[int]], Iterator[Measure]]  # measures of a sequence in some frames
+@dataclass(frozen=True)
+class Nothing:
+    """A sequence in which there is nothing to measure."""
+
+    why: str
+
+
+Invariant = Callable[[Sequence, list[int]], Iterator[Measure | Nothing]]
+"""Measures of a sequence in some frames, or the reason why there is none."""
 
 
 def truth(good: bool, where: str) -> Measure:

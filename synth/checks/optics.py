@@ -9,23 +9,39 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Floats
-from synth.checks.measure import Measure, inner, truth
+from synth.checks.measure import Measure, Nothing, inner, truth
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera_motion import CameraMotion
+from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 
 
-def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+def picture(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """There is tissue in view, and it is neither black nor burnt out in either camera (share of pixels)."""
+    tissue = sequence["tissue"][:]
+    yield truth(bool(tissue.any()), "no tissue in view")
+    for t in frames:
+        free = tissue & ~sequence["tool"][t]
+        if free.any():
+            blank = blank_share(sequence["rgb"][t][free])
+            yield Measure(blank, MOST_BLANK, f"frame {t}: tissue black or burnt out")
+        if "rgb_right" in sequence:
+            blank = blank_share(sequence["rgb_right"][t])
+            yield Measure(blank, MOST_BLANK, f"frame {t}: right picture black or burnt out")
+
+
+def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """The area per pixel and the scale agree with K, distortion and depth (relative)."""
     if "depth" not in sequence:
+        yield Nothing("no depth is stored")
         return
     view, (height, width) = camera_of(sequence), sequence.size
     depth = sequence["depth"][0].astype(np.float64)
     on = sequence["tissue"][:] & ~sequence["tool"][0] & (depth > 0)
     core = inner(on, 4)
-    yield truth(bool(core.any()), "no tissue in view")
     if not core.any():
+        yield Nothing("no tissue wider than 8 px in view")
         return
     points = cameras.rays(view, cameras.pixel_grid(view.size)).reshape(height, width, 3) * depth[..., None]
     across, down = 0.5 * (points[1:-1, 2:] - points[1:-1, :-2]), 0.5 * (points[2:, 1:-1] - points[:-2, 1:-1])
@@ -39,10 +55,11 @@ def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     yield Measure(abs(scale / view.mm_per_px - 1), 0.08, "scale")
 
 
-def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """The centre of the load, moved by the flow, is at the projection of the instrument's tips [mm]."""
     instruments = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
     if len(instruments) != 1:
+        yield Nothing(f"{len(instruments) or 'no'} instruments")
         return
     at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     footprint = float(sequence.attrs["scenario"]["gestures"][0]["footprint_mm"])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import Map, Mask, Pixels
-from synth.checks.measure import Measure, inner
+from synth.checks.measure import Measure, Nothing, inner
 from synth.dataset.store import Sequence
 
 Floats = NDArray[np.floating]
@@ -32,22 +32,29 @@ def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     yield Measure(least, 1e-6 * max(most, 1e-9), "traction in frame 0", "kPa")
 
 
-def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Traction times area, summed over the pixels, equals the force (relative) if the contact is in view."""
+def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
+    """Traction times area, summed over the pixels, equals the force (relative); half of it, if a part of the
+    contact is outside the view."""
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     applied = sequence["force"][:]
-    peak = np.linalg.norm(applied, axis=1).max()
+    shown = np.zeros_like(applied)
+    whole = np.ones(len(applied), bool)
     for t in frames:
         traction = sequence["traction"][t]
         size = np.linalg.norm(traction, axis=-1)
-        in_view = bool((size[~inside] <= 0.02 * size.max()).all())
-        norm = float(np.linalg.norm(applied[t]))
-        if in_view and norm > 0.05 * peak:
-            total = (traction * area[..., None]).sum(axis=(0, 1), dtype=np.float64)
-            yield Measure(float(np.linalg.norm(total - applied[t])) / norm, 0.01, f"frame {t}")
+        whole[t] = (size[~inside] <= 0.02 * size.max()).all()
+        shown[t] = (traction * area[..., None]).sum(axis=(0, 1), dtype=np.float64)
+    size = np.maximum(*(np.linalg.norm(one, axis=1) for one in (applied, shown)))
+    if not size.max() > 0:
+        yield Nothing("no force in any frame")
+        return
+    for t in frames:
+        if size[t] > 0.05 * size.max():
+            off = float(np.linalg.norm(shown[t] - applied[t])) / float(size[t])
+            yield Measure(off, 0.01 if whole[t] else 0.5, f"frame {t}{'' if whole[t] else ', partly in view'}")
 
 
-def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """The compliance changes from frame to frame by no more than the force, plus a quarter.
 
     Compliance is 2 energy / |force|^2, the load-weighted mean of the displacement along the force, per force.
@@ -59,10 +66,16 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     raised = mechanics.get("pulse_work_mn_mm")
     known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
     instruments = mechanics.get("instruments")
-    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics or not instruments:
+    without = {
+        "no instruments": not instruments,
+        "inertia, relaxation or other mechanics": not (mechanics.get("elastic") or raised is not None),
+        "no energy is stored": known not in mechanics,
+        # Their shares of the pulse may cancel, but not their uncertainties.
+        "a pulse and several instruments": raised is not None and len(instruments or ()) > 1,
+    }
+    for why in (why for why, holds in without.items() if holds):
+        yield Nothing(why)
         return
-    if raised is not None and len(instruments) > 1:
-        return  # the instruments' shares of the pulse may cancel, but not their uncertainties
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)
     work = np.asarray(mechanics[known], np.float64)
     pulse = np.zeros(len(work)) if raised is None else _PULSE_KNOWN * np.abs(np.asarray(raised, np.float64))
@@ -83,11 +96,13 @@ def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     for t in frames:
         x, y = _targets(sequence["flow"][t])
         visible = sequence["visible"][t] & sequence["tissue"][:]
+        if not visible.any():
+            continue
         outside = (x < -0.6) | (y < -0.6) | (x > width - 0.4) | (y > height - 0.4)
         # A point near the instrument's outline may fall on either side of it.
         core = cv2.erode(sequence["tool"][t].astype(np.uint8), np.ones((5, 5), np.uint8))
         covered = cv2.remap(core, x, y, cv2.INTER_NEAREST, borderValue=0).astype(bool)
-        count = max(int(visible.sum()), 1)
+        count = int(visible.sum())
         yield Measure(float((visible & outside).sum()) / count, 0.0, f"frame {t}: outside the picture")
         yield Measure(float((visible & covered).sum()) / count, 0.002, f"frame {t}: behind the instrument")
 
@@ -117,7 +132,9 @@ def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]
     for t in frames:
         x, y = _targets(sequence["flow"][t])
         visible = sequence["visible"][t] & sequence["tissue"][:]
-        count = max(int(visible.sum()), 1)
+        if not visible.any():
+            continue
+        count = int(visible.sum())
         cell = np.stack([y[visible].round(), x[visible].round()], axis=1)
         _, landed, times = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
         landed, off = landed.ravel(), np.zeros(len(landed))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import Floats, Map, Mask
 from synth.checks import optics
-from synth.checks.measure import Measure, inner
+from synth.checks.measure import Measure, Nothing, inner
 from synth.dataset.store import Sequence
 from synth.render.camera import camera as cameras
 
@@ -19,10 +19,11 @@ _FEWEST = 50  # least number of points for a median
 _HALF_PX = 0.008  # rounding of a flow below 32 px in float16
 
 
-def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """Flows and depths of both cameras, rest disparity and motion in space agree [px, relative]."""
     needed = {"motion", "disparity", "depth"}
     if any(name not in sequence for name in needed):
+        yield Nothing("no depth is stored" if "motion" in sequence else "one camera")
         return
     left, right = optics.camera_of(sequence), right_of(sequence)
     rest_depth = sequence["depth"][0].astype(np.float64)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from synth.checks import contents, optics, physics, stereo
-from synth.checks.measure import Invariant, Measure, truth
+from synth.checks.measure import Invariant, Measure, Nothing, truth
 from synth.dataset import index, location, provenance, split
 from synth.dataset.folder import Folder
 from synth.dataset.store import open_sequence
@@ -33,6 +33,7 @@ INVARIANTS: dict[str, Invariant] = {
         physics.visibility,
         physics.warp,
         physics.forward_backward,
+        optics.picture,
         optics.camera,
         optics.contact,
         stereo.stereo,
@@ -49,6 +50,15 @@ MEANINGS = {
 }
 """The condition of each check by its name."""
 
+_NOTHING = {
+    "contact": "no whole contact in view",
+    "compliance": "no load in two frames in turn",
+    "warp": "no 200 visible pixels move by over 3 px",
+    "visibility": "no tissue is visible",
+    "forward_backward": "no tissue is visible",
+}
+"""The reason for which a check has measured nothing in any frame, where it states none itself."""
+
 
 @dataclass
 class Check:
@@ -58,7 +68,8 @@ class Check:
     meaning: str
     count: int = 0
     bad: int = 0
-    skipped: int = 0  # sequences that lack what it needs, or in which there is nothing to measure
+    skipped: int = 0  # sequences in which there is nothing to measure
+    why: dict[str, int] = field(default_factory=dict)  # the reasons, each with its number of sequences
     worst: float = 0.0
     limit: float = 0.0
     unit: str = "-"  # of worst and limit
@@ -66,7 +77,11 @@ class Check:
     cpu_s: float = 0.0
     failures: list[str] = field(default_factory=list)  # places of all bad measures
 
-    def add(self, measure: Measure, who: str) -> None:
+    def add(self, measure: Measure | Nothing, who: str) -> None:
+        if isinstance(measure, Nothing):
+            self.skipped += 1
+            self.why[measure.why] = self.why.get(measure.why, 0) + 1
+            return
         self.count += 1
         where = f"{who}: {measure.where}"
         if not measure.good:
@@ -90,8 +105,21 @@ class VerifyReport:
     def good(self) -> bool:
         return not any(check.bad for check in self.checks)
 
+    @property
+    def verdict(self) -> str:
+        """Whether it is good, by how many checks, and which of them had nothing to look at, and why."""
+        bad = [check.name for check in self.checks if check.bad]
+        done = sum(check.count > 0 for check in self.checks)
+        found = f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}" if bad else f"good: {done} checks"
+        for what, some in ("nothing", False), ("in some sequences nothing", True):
+            empty = [one for one in self.checks if one.skipped and bool(one.count) == some]
+            if empty:
+                named = ", ".join(f"{one.name} ({' or '.join(one.why)})" for one in empty)
+                found += f"; {len(empty)} had {what} to check: {named}"
+        return found
+
     def as_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "good": self.good}
+        return {**asdict(self), "good": self.good, "verdict": self.verdict}
 
     def lines(self) -> list[str]:
         """Lines of text: a table of the checks with their worst measures, then every failure."""
@@ -106,7 +134,7 @@ class VerifyReport:
             front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=False))
             table += hang(front, where)
         failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
-        return [*table, *failures, "good" if self.good else "not good"]
+        return [*table, *failures, self.verdict]
 
 
 def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
@@ -124,20 +152,19 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     if fast and len(sealed) > _FAST_SEQUENCES:
         sealed = [sealed[k] for k in np.linspace(0, len(sealed) - 1, _FAST_SEQUENCES).astype(int)]
     for key in sealed:
-        path, measured = location.store(folder.root, key), set[str]()
+        path = location.store(folder.root, key)
         for name, measure in check_sequence(path, described["identity"], watch, fast=fast):
             checks[name].add(measure, path.name)
-            measured.add(name)
-        for name in INVARIANTS.keys() - measured:
-            checks[name].skipped += 1
     for name, check in checks.items():
         check.cpu_s = watch.cpu_s(name)
+        if not check.count + check.skipped:
+            check.add(Nothing("not with --fast" if fast and sealed else "no sequence could be read"), str(root))
     return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
 
 
 def check_sequence(
     path: Path, job: str, watch: Stopwatch, *, fast: bool = False
-) -> Iterator[tuple[str, Measure]]:
+) -> Iterator[tuple[str, Measure | Nothing]]:
     """Measures of one store by name of check; `job` is the dataset's identity, `watch` times each check.
 
     `fast`: only some frames, without checksums.
@@ -163,7 +190,7 @@ def check_sequence(
     for name, invariant in INVARIANTS.items():
         try:
             with watch.stage(name):
-                measures = list(invariant(sequence, frames))
+                measures = list(invariant(sequence, frames)) or [Nothing(_NOTHING.get(name, "no frame fits"))]
         except UserError as error:
             broken = broken or without_path(error)
             continue

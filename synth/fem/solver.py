@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from synth.arrays import Floats
+from synth.errors import UserError
 from synth.fem import surface_embedding, tool_gesture
 from synth.fem.deformation import Deformation
 from synth.fem.equilibrium import solve_path
@@ -65,10 +66,16 @@ def deform(
     if pulse is not None:
         height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
         loads += height[:, None, None] * raising
-    if fem.time == "dynamic" or fem.relaxation:
-        path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
-    else:
-        path = solve_path(system, loads, load_parameter)
+    try:
+        if fem.time == "dynamic" or fem.relaxation:
+            path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
+        else:
+            path = solve_path(system, loads, load_parameter)
+    except UserError as error:
+        stated = ", ".join(
+            f"{one.kind} of {one.force_mn:.3g} mN on contacts of {one.footprint_mm:.3g} mm radius" for one in gestures
+        )
+        raise type(error)(f"{error}: {stated}, E = {tissue.young_kpa:.3g} kPa") from None
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))

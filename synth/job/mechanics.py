@@ -161,7 +161,7 @@ class FemSection(Section):
 
     @model_validator(mode="after")
     def _loads_are_in_the_laws_range(self, info: ValidationInfo) -> FemSection:
-        for name, loads in () if info.context is STORED else self._load_ranges:
+        for name, loads in () if info.context is STORED else self.load_ranges:
             check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
         return self
 
@@ -171,7 +171,7 @@ class FemSection(Section):
         return LoadRange(own.load or self.load, own.force_mn, instrument.footprint_mm or self.footprint_mm)
 
     @property
-    def _load_ranges(self) -> list[tuple[str, LoadRange]]:
+    def load_ranges(self) -> list[tuple[str, LoadRange]]:
         """Ranges of instruments that are drawn freely, and of each in `instrument_list`, by label."""
         given = self.instrument_list
         drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(given) else []
@@ -187,4 +187,4 @@ class FemSection(Section):
     @property
     def largest_load(self) -> float:
         """Largest P = F/(E a^2) that can be drawn."""
-        return max(loads.largest(self.young_kpa[0]) for _, loads in self._load_ranges)
+        return max(loads.largest(self.young_kpa[0]) for _, loads in self.load_ranges)

@@ -70,8 +70,8 @@ class RenderSection(Section):
     """Width of the field of view at the craniotomy [mm]."""
     working_distance_mm: Range[Positive] = (280.0, 320.0)
     """Distance from the front lens to the craniotomy [mm]."""
-    tilt_deg: Range[Annotated[FiniteFloat, Field(ge=0, le=60)]] = (0.0, 20.0)
-    """Angle between the optical axis and the craniotomy's normal, 0-60."""
+    tilt_deg: Range[Annotated[FiniteFloat, Field(ge=0, le=85)]] = (0.0, 20.0)
+    """Angle between the optical axis and the craniotomy's normal, 0-85."""
     aperture_mm: NonNegative = 4.0
     """Radius of the lens aperture [mm]; 0 is a pinhole."""
     distortion: Distortion = (-0.05, 0.01, 0.0, 0.0, 0.0)
@@ -82,7 +82,7 @@ class RenderSection(Section):
     `stereoCalibrate`) gives a stereo dataset with that right camera, and replaces stereo_mm."""
     drift_mm: Range[NonNegative] = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
-    stereo_mm: NonNegative = 0.0
+    stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Baseline to a right camera [mm], for a stereo dataset: its pictures, and motion in three dimensions,
     true and recovered; 0: monocular."""
     tool: bool = True

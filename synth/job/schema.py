@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat, ValidationInfo, model_validator
 
 from synth.errors import did_you_mean
 from synth.fields import EXTRA, FIELDS, SPARED
@@ -18,7 +18,7 @@ from synth.job.microscope import LightSection as LightSection
 from synth.job.microscope import RenderSection as RenderSection
 from synth.job.microscope import SensorSection as SensorSection
 from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
-from synth.plugins import ESTIMATORS
+from synth.plugins import ESTIMATORS, STORED
 
 
 class PlaceSection(Section):
@@ -66,8 +66,8 @@ class AnatomySection(Section):
     """Whether holes of the mesh are closed, each by a fan of triangles; an error if that is not possible."""
     dome_mm: Positive = 70.0
     """Procedural block: radius of curvature of the brain surface [mm]."""
-    gyrus_mm: Range[Positive] = (10.0, 15.0)
-    """Procedural relief: spacing of the gyri [mm]."""
+    gyrus_mm: Range[Annotated[FiniteFloat, Field(ge=1, le=100)]] = (10.0, 15.0)
+    """Procedural relief: spacing of the gyri [mm], 1-100."""
     sulcus_mm: Range[NonNegative] = (1.6, 2.8)
     """Procedural relief: visible depth of the sulci below the crests of the gyri [mm]."""
     vertices: Annotated[int, Field(ge=400, le=400_000)] = 40_000
@@ -167,7 +167,7 @@ class Job(Section):
     """Number of sequences."""
     frames: Annotated[int, Field(ge=3, le=10_000)] = 24
     """Frames per sequence; the first is the rest frame, in the last the tissue is released."""
-    fps: Positive = 25.0
+    fps: Annotated[FiniteFloat, Field(gt=0, le=100_000)] = 25.0
     """Frames per second of the recorded video."""
     anatomy: AnatomySection = AnatomySection()
     appearance: AppearanceSection = AppearanceSection()
@@ -201,8 +201,14 @@ class Job(Section):
         return self
 
     @model_validator(mode="after")
-    def _contacts_are_inside_the_opening(self) -> Job:
+    def _contacts_are_inside_the_opening(self, info: ValidationInfo) -> Job:
         radius = self.anatomy.craniotomy.radius_mm
+        for name, loads in () if info.context is STORED else self.fem.load_ranges:
+            if (least := loads.footprint_mm[0]) > radius:
+                raise ValueError(
+                    f"fem.{name.replace(': ', '.')}footprint_mm: a contact of {least:g} mm radius is wider than an "
+                    f"opening of {radius:g} mm (anatomy.craniotomy.radius_mm)"
+                )
         for k, one in enumerate(self.fem.instrument_list):
             least = self.fem.load_range(one).footprint_mm[0]
             if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:

@@ -10,6 +10,7 @@ import numpy as np
 
 from synth.arrays import Mask, Pixels
 from synth.dataset.store import Writer
+from synth.errors import UserError
 from synth.fields import FIELDS
 from synth.flow import mask_detection, track
 from synth.flow.estimator import create
@@ -21,6 +22,7 @@ from synth.job.laws import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
 from synth.render.camera.camera import Camera, between
+from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
 from synth.sequence.scene import Scene
@@ -85,6 +87,7 @@ def write_scene(
     with watch.stage("scene"):
         renderer = scene.renderer
 
+    _refuse_unseen(scene)
     width, height = job.render.size
     writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
     writer.put("time", scene.time)
@@ -103,6 +106,18 @@ def write_scene(
         if writer.wants("motion_recovered"):
             _recover_motion(task, videos[0], videos[1], recovered)
     return _seal(task)
+
+
+def _refuse_unseen(scene: Scene) -> None:
+    """Raises UserError if most of the largest force is outside the view, so that it has no label."""
+    t = scene.strongest
+    label = scene.renderer.traction(scene.motion.traction[t]) * scene.area[..., None]
+    size = float(np.linalg.norm(scene.force[t]))
+    if np.linalg.norm(label.sum(axis=(0, 1), dtype=np.float64) - scene.force[t]) > 0.5 * size:
+        raise UserError(
+            f"frame {t}: most of the force of {size:.3g} mN is on tissue that the camera does not show; change "
+            "the contact's place, or widen render.field_mm"
+        )
 
 
 def _render_frames(task: _Task) -> list[_Video]:
@@ -126,6 +141,9 @@ def _render_frames(task: _Task) -> list[_Video]:
         task.report("render", t, job.frames)
         with task.watch.stage("render"):
             frame = scene.frame(t)
+        free = scene.tissue & ~frame.tool
+        if t == 0 and blank_share(frame.rgb[free] if free.any() else frame.rgb) > MOST_BLANK:
+            raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
         with task.watch.stage("store"):
             made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
             for name in names:

@@ -158,7 +158,8 @@ def draw_gestures(
         for k in order:
             for _ in range(_TRIES):
                 trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, wanted[k], visible_mm)
-                fits = not given or trial.reach_mm <= max(opening_mm - CLEAR_MM, trial.footprint_mm) + 1e-9
+                clear = max(opening_mm - CLEAR_MM, trial.footprint_mm) if given else opening_mm
+                fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 if fits and all(tool_gesture.clearance(trial, other) >= 0 for other in found.values()):
                     found[k] = trial
                     break

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from synth.errors import UserError
 from synth.fem.deformation import check_deformation
-from synth.fem.tool_gesture import ToolMotion
+from synth.fem.tool_gesture import ToolMotion, trajectory
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
-from synth.sequence.scenario import Scenario
+from synth.sequence.scenario import Scenario, draw_scenario
 from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -54,6 +54,8 @@ def simulate(
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
+    if mechanics is None and not len(motions):
+        _refuse_untouched(job, case or draw_scenario(job, index))
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     with watch.stage("mesh"):
@@ -61,3 +63,14 @@ def simulate(
     motion = (mechanics or FemMechanics(motions)).deform(rest, report, watch)
     check_deformation(motion, rest.shape, job.frames, len(rest.scenario.gestures))
     return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, rest.content, motion)
+
+
+def _refuse_untouched(job: Job, case: Scenario) -> None:
+    """Raises UserError for an instrument whose contact falls between two frames."""
+    for k, gesture in enumerate(case.gestures):
+        if not trajectory(gesture, job.frames).load.max() > 1e-6:
+            touch, leave = (f"{part * (job.frames - 1) / job.fps:.3g}" for part in gesture.timing[::3])
+            raise UserError(
+                f"instrument {k}: its contact from {touch} to {leave} s falls between two frames, {1 / job.fps:.3g} s "
+                "apart; make it longer, or raise frames"
+            )

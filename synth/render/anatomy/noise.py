@@ -54,7 +54,7 @@ def sample(image: Map, xy: Floats, extent_mm: float) -> Map:
     """Map (n, n, ...) at world x, y (N, 2) mm, bilinear, constant beyond its border: (N, ...)."""
     pixel = ((xy / extent_mm + 0.5) * image.shape[0] - 0.5).astype(np.float32)
     width = 32_000  # cv2.remap takes pictures no longer than a short integer
-    padding = -len(pixel) % width
+    padding = -len(pixel) % width or width * (len(pixel) == 0)  # nor of no rows
     grid = np.pad(pixel, ((0, padding), (0, 0))).reshape(-1, width, 2)
     read = cv2.remap(image, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(read, np.float32).reshape(-1, *image.shape[2:])[: len(pixel)]

@@ -16,6 +16,15 @@ from synth.system.jit import vectorised
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
 _STEPS = 4096  # of the tabulated tone curves per full scale
 
+MOST_BLANK = 0.95
+"""Largest share of the tissue's pixels that may be black or burnt out."""
+_BLACK, _WHITE = 6, 250
+
+
+def blank_share(rgb: Pixels) -> float:
+    """Share of colours (..., 3) that are black or burnt out."""
+    return float(((rgb.max(axis=-1) <= _BLACK) | (rgb.min(axis=-1) >= _WHITE)).mean())
+
 
 @dataclass(frozen=True)
 class CameraSensor:
