@@ -110,7 +110,11 @@ class VerifyReport:
         """Whether it is good, by how many checks, and which of them had nothing to look at, and why."""
         bad = [check.name for check in self.checks if check.bad]
         done = sum(check.count > 0 for check in self.checks)
-        found = f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}" if bad else f"good: {done} checks"
+        found = (
+            f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}"
+            if bad
+            else f"good: {done} checks"
+        )
         for what, some in ("nothing", False), ("in some sequences nothing", True):
             empty = [one for one in self.checks if one.skipped and bool(one.count) == some]
             if empty:
@@ -158,7 +162,9 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     for name, check in checks.items():
         check.cpu_s = watch.cpu_s(name)
         if not check.count + check.skipped:
-            check.add(Nothing("not with --fast" if fast and sealed else "no sequence could be read"), str(root))
+            check.add(
+                Nothing("not with --fast" if fast and sealed else "no sequence could be read"), str(root)
+            )
     return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
 
 

@@ -73,7 +73,8 @@ def deform(
             path = solve_path(system, loads, load_parameter)
     except UserError as error:
         stated = ", ".join(
-            f"{one.kind} of {one.force_mn:.3g} mN on contacts of {one.footprint_mm:.3g} mm radius" for one in gestures
+            f"{one.kind} of {one.force_mn:.3g} mN on contacts of {one.footprint_mm:.3g} mm radius"
+            for one in gestures
         )
         raise type(error)(f"{error}: {stated}, E = {tissue.young_kpa:.3g} kPa") from None
     displacement = np.stack([embedding.move(u) for u in path.displacement])

@@ -72,7 +72,7 @@ class RenderSection(Section):
     """Distance from the front lens to the craniotomy [mm]."""
     tilt_deg: Range[Annotated[FiniteFloat, Field(ge=0, le=85)]] = (0.0, 20.0)
     """Angle between the optical axis and the craniotomy's normal, 0-85."""
-    aperture_mm: NonNegative = 4.0
+    aperture_mm: Annotated[FiniteFloat, Field(ge=0, le=100)] = 4.0
     """Radius of the lens aperture [mm]; 0 is a pinhole."""
     distortion: Distortion = (-0.05, 0.01, 0.0, 0.0, 0.0)
     """Brown-Conrady k1, k2, p1, p2, k3."""

@@ -258,7 +258,9 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
         return None
     pair = read_rig(render.calibration, render.size)
     if pair.baseline_mm < _LEAST_APART_MM:
-        raise UserError(f"render.calibration: its cameras are {pair.baseline_mm:.3g} mm apart; T must be in mm")
+        raise UserError(
+            f"render.calibration: its cameras are {pair.baseline_mm:.3g} mm apart; T must be in mm"
+        )
     scale = np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
     K = camera.scaled(pair.right.K, scale)
     lens = pair.right.distortion

@@ -123,12 +123,13 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
     load = np.array([1.0, 0.5, 2.0])
     spot /= (spot * area).sum()
     share = np.arange(frames) / (frames - 1)
-    force = share[:, None] * load * (2.0 if fault == "force" else 1.0)
+    pressing = 0.0 if fault == "still" else 1.0
+    force = share[:, None] * load * {"force": 2.0, "no_force": 0.0}.get(fault, pressing)
 
     writer = Writer(folder, index, frames=frames, size=(height, width), job=job)
     writer.put("time", np.arange(frames) / job.fps)
     writer.put("force", force)
-    writer.put("tissue", tissue)
+    writer.put("tissue", tissue & (fault != "no_tissue"))
     writer.put("area", area)
     for t in range(frames):
         moved = 6.0 * share[t]
@@ -139,7 +140,7 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
         if fault == "fold" and t:
             flow[tissue, 0] -= 2 * (columns - width / 2)[tissue] * (np.abs(columns - width / 2) < 10)[tissue]
         recovered = flow + (0.1 if fault == "recovered_rest" else 0.0)
-        picture = texture(rows, columns - moved)
+        picture = texture(rows, columns - moved) * (fault != "black")
         gone = (columns + flow[..., 0] < 8) | (columns + flow[..., 0] > width - 1)
         writer.put_frame("rgb", t, np.repeat(picture[..., None], 3, axis=-1).astype(np.uint8))
         writer.put_frame("flow", t, flow)
@@ -148,7 +149,7 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
         writer.put_frame("tool", t, covered)
         writer.put_frame("glare", t, np.zeros_like(tissue))
         writer.put_frame("depth", t, np.full((height, width), -1.0 if fault == "depth" and t else distance))
-        pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t]
+        pressed = 1e-3 if fault == "load_rest" and t == 0 else share[t] * pressing
         writer.put_frame("traction", t, pressed * spot[..., None] * load)
         if job.render.stereo_mm:
             aside = np.zeros((height, width, 3))

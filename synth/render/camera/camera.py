@@ -124,9 +124,7 @@ def visible_radius(camera: Camera) -> float:
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with pictures of another size (width, height) px of the same field."""
     scale = np.array(size) / camera.size
-    return replace(
-        camera, K=scaled(camera.K, scale), size=size, mm_per_px=camera.mm_per_px / float(scale[0])
-    )
+    return replace(camera, K=scaled(camera.K, scale), size=size, mm_per_px=camera.mm_per_px / float(scale[0]))
 
 
 def scaled(K: Floats, scale: Floats) -> Floats:

@@ -50,6 +50,9 @@ def test_a_good_dataset_passes_and_every_invariant_was_measured(dataset: Path) -
     ("fault", "check"),
     [
         ("force", "force"),
+        ("no_force", "force"),
+        ("black", "picture"),
+        ("no_tissue", "picture"),
         ("flow", "warp"),
         ("visibility", "visibility"),
         ("rest", "rest"),
@@ -78,6 +81,17 @@ def test_a_faulty_pipeline_is_found_by_the_check_made_for_it(tmp_path: Path, fau
     assert found.cpu_s > 0
     # Checks of integrity pass, as the files are as they were written.
     assert not failing(tmp_path / "out") & {"checksum", "seal", "schema", "readable", "dataset", "finite"}
+
+
+def test_what_had_nothing_to_check_is_not_counted_as_good(tmp_path: Path) -> None:
+    job = Job(seed=1, sequences=1, frames=5, render={"size": (96, 72)}, flow={"backend": "ideal"})
+    in_process(job, tmp_path / "out", fake_work.wrong("still"))
+    report = verify.verify_dataset(tmp_path / "out", fast=True)
+    empty = {check.name: sum(check.why.values()) for check in report.checks if not check.count}
+    assert empty == {"checksum": 1, "force": 1, "compliance": 1, "contact": 1, "stereo": 1}
+    assert report.good
+    assert f" {len(report.checks) - len(empty)} checks" in report.lines()[-1]
+    assert all(name in report.as_dict()["verdict"] for name in empty)
 
 
 def no_number(root: Path) -> None:

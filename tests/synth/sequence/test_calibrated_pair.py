@@ -78,7 +78,8 @@ def test_labels_of_a_converging_pair_are_where_opencv_projects_them(tmp_path: Pa
         right[t] = cv2.projectPoints(moved, *turn, PAIR["K2"], PAIR["D2"])[0][:, 0]
         np.testing.assert_allclose(sequence["flow"][t][rows, columns], left[t] - pixels, atol=0.01)
     x, x_right = (
-        cv2.projectPoints(points, *pose, PAIR[K], None)[0][:, 0, 0] for pose, K in ((still, "K1"), (turn, "K2"))
+        cv2.projectPoints(points, *pose, PAIR[K], None)[0][:, 0, 0]
+        for pose, K in ((still, "K1"), (turn, "K2"))
     )
     np.testing.assert_allclose(sequence["disparity"][:][rows, columns], x - x_right, atol=0.01)
     inside = ((right[0] > 1) & (right[0] < np.array(SIZE) - 2)).all(axis=1)
