@@ -152,9 +152,8 @@ def preview(
         return
     read = reader.load_job(job, overrides or [])
     with counting("Compiling the first time, measuring the cost of a sequence, then drawing") as progress:
-        sheet = contact_sheet.draw_sheet(read, count, progress)
-    write_picture(out, sheet.picture)
-    spent_s = sheet.cpu_s
+        picture, spent_s = contact_sheet.draw_sheet(read, count, progress)
+    write_picture(out, picture)
     cpu_s, disk_bytes = sum(spent_s.values()), estimate(read) * read.sequences
     if json:
         about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": disk_bytes}
@@ -162,7 +161,8 @@ def preview(
         return
     stages = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent_s.items())
     print(
-        f"wrote {out}{sheet.drawn and ', ' + sheet.drawn}\nthe whole job: {read.sequences} sequences of {read.frames} frames, about "
+        f"wrote {out}, each view at most {contact_sheet.TILE_PX} px wide\n"
+        f"the whole job: {read.sequences} sequences of {read.frames} frames, about "
         f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(disk_bytes)} of disk"
     )
 

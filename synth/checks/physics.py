@@ -68,15 +68,12 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
     raised = mechanics.get("pulse_work_mn_mm")
     known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
     instruments = mechanics.get("instruments")
-    without = {
-        "no instruments": not instruments,
-        "inertia, relaxation or other mechanics": not (mechanics.get("elastic") or raised is not None),
-        "no energy is stored": known not in mechanics,
-        # Their shares of the pulse may cancel, but not their uncertainties.
-        "a pulse and several instruments": raised is not None and len(instruments or ()) > 1,
-    }
-    for why in (why for why, holds in without.items() if holds):
-        yield Nothing(why)
+    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics or not instruments:
+        yield Nothing("inertia, relaxation, no instruments, or mechanics without energy")
+        return
+    if raised is not None and len(instruments) > 1:
+        # The instruments' shares of the pulse may cancel, but not their uncertainties.
+        yield Nothing("a pulse and several instruments")
         return
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)
     work = np.asarray(mechanics[known], np.float64)

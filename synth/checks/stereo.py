@@ -30,6 +30,9 @@ def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]
     core = inner(sequence["tissue"][:] & ~sequence["tool"][0], 2)
     rows, columns = (at[::_EVERY] for at in np.nonzero(core & (rest_depth > 0)))
     pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+    if not len(pixels):
+        yield Nothing("no tissue in view")
+        return
     points = cameras.rays(left, pixels) * rest_depth[rows, columns][:, None]
     expected, (turn, shift) = cameras.disparity(left, right, points), cameras.between(left, right)
     found = sequence["disparity"][:][rows, columns]

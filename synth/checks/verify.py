@@ -54,10 +54,8 @@ _NOTHING = {
     "contact": "no whole contact in view",
     "compliance": "no load in two frames in turn",
     "warp": "no 200 visible pixels move by over 3 px",
-    "visibility": "no tissue is visible",
-    "forward_backward": "no tissue is visible",
 }
-"""The reason for which a check has measured nothing in any frame, where it states none itself."""
+"""The reason for which a check has measured nothing in any frame; else no tissue is visible."""
 
 
 @dataclass
@@ -110,11 +108,9 @@ class VerifyReport:
         """Whether it is good, by how many checks, and which of them had nothing to look at, and why."""
         bad = [check.name for check in self.checks if check.bad]
         done = sum(check.count > 0 for check in self.checks)
-        found = (
-            f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}"
-            if bad
-            else f"good: {done} checks"
-        )
+        found = f"good: {done} checks"
+        if bad:
+            found = f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}"
         for what, some in ("nothing", False), ("in some sequences nothing", True):
             empty = [one for one in self.checks if one.skipped and bool(one.count) == some]
             if empty:
@@ -162,9 +158,7 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
     for name, check in checks.items():
         check.cpu_s = watch.cpu_s(name)
         if not check.count + check.skipped:
-            check.add(
-                Nothing("not with --fast" if fast and sealed else "no sequence could be read"), str(root)
-            )
+            check.add(Nothing("not with --fast" if fast else "no sequence is readable"), "")
     return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
 
 
@@ -196,7 +190,9 @@ def check_sequence(
     for name, invariant in INVARIANTS.items():
         try:
             with watch.stage(name):
-                measures = list(invariant(sequence, frames)) or [Nothing(_NOTHING.get(name, "no frame fits"))]
+                measures = list(invariant(sequence, frames)) or [
+                    Nothing(_NOTHING.get(name, "no tissue in view"))
+                ]
         except UserError as error:
             broken = broken or without_path(error)
             continue

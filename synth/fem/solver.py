@@ -72,11 +72,8 @@ def deform(
         else:
             path = solve_path(system, loads, load_parameter)
     except UserError as error:
-        stated = ", ".join(
-            f"{one.kind} of {one.force_mn:.3g} mN on contacts of {one.footprint_mm:.3g} mm radius"
-            for one in gestures
-        )
-        raise type(error)(f"{error}: {stated}, E = {tissue.young_kpa:.3g} kPa") from None
+        each = (f"{one.kind} {one.force_mn:.3g} mN, radius {one.footprint_mm:.3g} mm" for one in gestures)
+        raise type(error)(f"{error}: {', '.join(each)}, E {tissue.young_kpa:.3g} kPa") from None
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))

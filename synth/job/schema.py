@@ -205,10 +205,8 @@ class Job(Section):
         radius = self.anatomy.craniotomy.radius_mm
         for name, loads in () if info.context is STORED else self.fem.load_ranges:
             if (least := loads.footprint_mm[0]) > radius:
-                raise ValueError(
-                    f"fem.{name.replace(': ', '.')}footprint_mm: a contact of {least:g} mm radius is wider than an "
-                    f"opening of {radius:g} mm (anatomy.craniotomy.radius_mm)"
-                )
+                key = f"fem.{name.replace(': ', '.')}footprint_mm"
+                raise ValueError(f"{key}: {least:g} mm is wider than an opening of {radius:g} mm radius")
         for k, one in enumerate(self.fem.instrument_list):
             least = self.fem.load_range(one).footprint_mm[0]
             if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:

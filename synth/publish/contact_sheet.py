@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from synth.sequence.simulation import simulate
 from synth.system.stopwatch import Stopwatch
 from synth.system.terminal import ProgressCallback
 
-_TILE_PX = 320
+TILE_PX = 320
 _LEAST_VERTICES = 2000
 _SHORT, _LONG = 3, 9  # frames: their difference is the cost of further load steps
 _PER_SEQUENCE = "mesh", "scene"  # stages whose cost is the same for any number of frames
@@ -33,19 +33,8 @@ _IN_PICTURE = "scene", "render", "store", "flow", "stereo"  # stages whose cost 
 _GROWTH = 0.92  # power of the number of pixels; measured from 320 x 240 to 640 x 480
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A contact sheet."""
-
-    picture: Rgb
-    cpu_s: dict[str, float]
-    """CPU time of the whole job by stage [s], without the start of workers; an estimate."""
-    drawn: str
-    """How its pictures differ from those of the job; empty if in nothing."""
-
-
-def draw_sheet(job: Job, count: int, report: ProgressCallback) -> Sheet:
-    """The pictures of `count` scenarios spread over the job, and the job's cost.
+def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dict[str, float]]:
+    """The picture (H, W, 3) of `count` scenarios spread over the job, and the job's CPU time by stage [s].
 
     Each is drawn just before its load: nothing is deformed, the sheet shows anatomy, appearance, light, view
     and instrument. Wide pictures are drawn smaller, with fewer vertices. The cost is estimated from three
@@ -53,23 +42,16 @@ def draw_sheet(job: Job, count: int, report: ProgressCallback) -> Sheet:
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
     width, height = job.render.size
-    share = min(1.0, _TILE_PX / width)
+    share = min(1.0, TILE_PX / width)
     small = (max(16, round(width * share)), max(16, round(height * share)))
-    full = job.anatomy.vertices
-    vertices = max(round(full * share**2), min(full, _LEAST_VERTICES))
+    vertices = max(round(job.anatomy.vertices * share**2), min(job.anatomy.vertices, _LEAST_VERTICES))
     quick = job.model_copy(update={"anatomy": job.anatomy.model_copy(update={"vertices": vertices})})
     spent = _measure_cost(quick, chosen[len(chosen) // 2], small)  # first, as further scenes of it are cached
     tiles = []
     for done, index in enumerate(chosen):
         report(done + 1, len(chosen) + 1)
         tiles.append(_draw_scenario(quick, index, small))
-    drawn = (
-        ""
-        if small == job.render.size
-        else f"drawn in {small[0]} x {small[1]} px with {vertices} vertices; the job has {width} x {height} px "
-        f"and {full}"
-    )
-    return Sheet(tile(tiles), {name: job.sequences * each for name, each in spent.items()}, drawn)
+    return tile(tiles), {name: job.sequences * each for name, each in spent.items()}
 
 
 def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:

@@ -115,8 +115,8 @@ def _refuse_unseen(scene: Scene) -> None:
     size = float(np.linalg.norm(scene.force[t]))
     if np.linalg.norm(label.sum(axis=(0, 1), dtype=np.float64) - scene.force[t]) > 0.5 * size:
         raise UserError(
-            f"frame {t}: most of the force of {size:.3g} mN is on tissue that the camera does not show; change "
-            "the contact's place, or widen render.field_mm"
+            f"frame {t}: most of the force of {size:.3g} mN is on tissue that the camera does not show; "
+            "change the contact's place, or widen render.field_mm"
         )
 
 

@@ -24,6 +24,7 @@ from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
+from synth.render.camera.calibration import scaled
 from synth.render.camera.camera import Camera
 from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
@@ -258,26 +259,21 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
         return None
     pair = read_rig(render.calibration, render.size)
     if pair.baseline_mm < _LEAST_APART_MM:
-        raise UserError(
-            f"render.calibration: its cameras are {pair.baseline_mm:.3g} mm apart; T must be in mm"
-        )
+        raise UserError(f"render.calibration: cameras {pair.baseline_mm:.3g} mm apart; T must be in mm")
     scale = np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
-    K = camera.scaled(pair.right.K, scale)
-    lens = pair.right.distortion
-    if lens.size > 8 and lens[8:].any():
-        raise UserError(f"{render.calibration}: thin-prism distortion of the right camera is not supported")
-    lens = np.append(lens, np.zeros(4))[: 8 if lens.size >= 8 else 5]
-    place = partial(
-        camera.calibrated_right, K=K, distortion=lens, rotation=pair.rotation, translation=pair.translation
-    )
+    K = scaled(pair.right.K, scale)
+    lens = np.append(pair.right.distortion, np.zeros(4))
+    if lens[8:].any():
+        raise UserError("render.calibration: thin-prism distortion of the right camera is not supported")
+    posed = {"rotation": pair.rotation, "translation": pair.translation}
+    place = partial(camera.calibrated_right, K=K, distortion=lens[:8], **posed)
     Rectified(pair)  # refuses a right camera that is not to the right
     right = place(view)
     at = camera.project(right, np.zeros((1, 3)))[0]
     if right.translation[2] <= 0 or (at < 0).any() or (at >= right.size).any():
-        away = view.translation[2]
         raise UserError(
-            f"render.calibration: {away:.4g} mm away the right camera does not show the opening's centre, which "
-            f"is at pixel ({at[0]:.0f}, {at[1]:.0f}); change render.working_distance_mm (T must be in mm)"
+            f"render.calibration: the opening, {view.translation[2]:.4g} mm away, is at ({at[0]:.0f}, "
+            f"{at[1]:.0f}) px for the right camera, outside its picture; change render.working_distance_mm"
         )
     return place
 

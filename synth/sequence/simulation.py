@@ -70,7 +70,5 @@ def _refuse_untouched(job: Job, case: Scenario) -> None:
     for k, gesture in enumerate(case.gestures):
         if not trajectory(gesture, job.frames).load.max() > 1e-6:
             touch, leave = (f"{part * (job.frames - 1) / job.fps:.3g}" for part in gesture.timing[::3])
-            raise UserError(
-                f"instrument {k}: its contact from {touch} to {leave} s falls between two frames, {1 / job.fps:.3g} s "
-                "apart; make it longer, or raise frames"
-            )
+            when = f"from {touch} to {leave} s falls between two frames, {1 / job.fps:.3g} s apart"
+            raise UserError(f"instrument {k}: its contact {when}; make it longer, or raise frames")

@@ -39,8 +39,8 @@ def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
         size: width, height [px].
 
     Returns:
-        K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (5,) k1, k2, p1, p2, k3, or
-        (8,) with k4, k5, k6; of a stereo calibration those of the left camera.
+        K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (5,) k1, k2, p1, p2, k3,
+        or (8,) with k4, k5, k6; of a stereo calibration those of the left camera.
 
     Raises:
         UserError: it cannot be read, is not of a pinhole camera with Brown-Conrady distortion, perhaps
@@ -93,10 +93,13 @@ def _resized(path: Path, K: Floats, found: dict[str, Any], size: tuple[int, int]
             f"render.calibration: made from pictures of {width} x {height}, whose shape "
             f"differs from render.size {size[0]} x {size[1]}; change render.size"
         )
-    K = K.copy()
-    # Pixel centres, not corners, are whole numbers.
-    K[0, 0], K[0, 2] = K[0, 0] * across, (K[0, 2] + 0.5) * across - 0.5
-    K[1, 1], K[1, 2] = K[1, 1] * down, (K[1, 2] + 0.5) * down - 0.5
+    return scaled(K, np.array([across, down]))
+
+
+def scaled(K: Floats, scale: Floats) -> Floats:
+    """K (3, 3) of pictures that are wider and higher by factors (2,)."""
+    K = K * np.append(scale, 1.0)[:, None]
+    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers
     return K
 
 

@@ -1,9 +1,8 @@
 """The microscope camera: one model for rays, ground truth, flow and bench.
 
-OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3) or OpenCV's
-rational model of it (k4, k5, k6 as well), the centre of the top-left pixel at (0, 0). D. C. Brown,
-"Close-range camera calibration", 1971; D. Claus, A. W. Fitzgibbon, "A rational function lens distortion model
-for general cameras", 2005.
+OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3, and k4, k5, k6 of
+OpenCV's rational model), the centre of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera
+calibration", 1971.
 """
 
 from __future__ import annotations
@@ -124,14 +123,8 @@ def visible_radius(camera: Camera) -> float:
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with pictures of another size (width, height) px of the same field."""
     scale = np.array(size) / camera.size
-    return replace(camera, K=scaled(camera.K, scale), size=size, mm_per_px=camera.mm_per_px / float(scale[0]))
-
-
-def scaled(K: Floats, scale: Floats) -> Floats:
-    """K (3, 3) of pictures that are wider and higher by factors (2,)."""
-    K = K * np.append(scale, 1.0)[:, None]
-    K[:2, 2] += 0.5 * scale - 0.5  # pixel centres, not corners, are whole numbers
-    return K
+    K = calibration.scaled(camera.K, scale)
+    return replace(camera, K=K, size=size, mm_per_px=camera.mm_per_px / float(scale[0]))
 
 
 def right_camera(camera: Camera, baseline_mm: float) -> Camera:
@@ -176,7 +169,7 @@ def disparity(left: Camera, right: Camera, points: Floats) -> Floats:
 
 
 def depth_of(left: Camera, right: Camera, along: Floats, disparity_px: Floats) -> Floats:
-    """Depth (N,) mm in the left camera of points on its rays `along` (N, 3), z = 1, with those disparities."""
+    """Depth (N,) mm in the left camera of points on its rays `along` (N, 3), z = 1, by their disparities."""
     turn, shift = between(left, right)
     there = along @ turn.T
     x = (left.K[0, 0] * along[:, 0] + left.K[0, 2] - disparity_px - right.K[0, 2]) / right.K[0, 0]
@@ -235,9 +228,7 @@ def undistort(flat: Floats, distortion: Floats) -> Floats:
         step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], 1)
         guess = guess - step / determinant[:, None]
     if not np.abs(_distort(guess, distortion) - flat).max() < 1e-9:
-        raise UserError(
-            "render.distortion or the calibration's: folds the picture over itself; choose smaller coefficients"
-        )
+        raise UserError("render.distortion: folds the picture over itself (or the calibration's does)")
     return guess
 
 

@@ -1,4 +1,4 @@
-"""A dataset rendered with the pair of a `stereoCalibrate` file, against OpenCV's projections of its labels."""
+"""A dataset rendered with the pair of a `stereoCalibrate` file, against OpenCV's projections."""
 
 from pathlib import Path
 
