@@ -50,10 +50,8 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
         return
     for t in frames:
         if size[t] > 0.05 * size.max():
-            off = float(np.linalg.norm(shown[t] - applied[t])) / float(size[t])
-            yield Measure(
-                off, 0.01 if whole[t] else 0.5, f"frame {t}{'' if whole[t] else ', partly in view'}"
-            )
+            off = float(np.linalg.norm(shown[t] - applied[t]) / size[t])
+            yield Measure(off, 0.01 if whole[t] else 0.5, f"frame {t}")
 
 
 def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:

@@ -21,7 +21,7 @@ from synth.render.camera.camera import resized
 from synth.render.scene import SceneState
 from synth.sequence import pipeline, scenario
 from synth.sequence.scene import Scene, at_rest
-from synth.sequence.simulation import simulate
+from synth.sequence.simulation import refuse_untouched, simulate
 from synth.system.stopwatch import Stopwatch
 from synth.system.terminal import ProgressCallback
 
@@ -114,10 +114,12 @@ def _simulate(job: Job, index: int, count: int, watch: Stopwatch) -> Scene:
     """`count` frames of the sequence, with the instruments' motion in the job's own frames: rest, largest
     load, last, and others between. UserError with the numbers of those frames."""
     case = scenario.draw_scenario(job, index)
+    refuse_untouched(job, case)
     moves = [tool_gesture.trajectory(gesture, job.frames) for gesture in case.gestures]
     strongest = int(np.argmax(np.max([move.load for move in moves], axis=0)))
     further = np.linspace(0, job.frames - 1, count - 1).round().astype(int)
-    frames = np.unique([*further, strongest])
+    in_time = job.fem.time == "dynamic" or job.fem.relaxation  # then frames can't be left out
+    frames = np.arange(min(count, job.frames)) if in_time else np.unique([*further, strongest])
     motions = [ToolMotion(move.load[frames], move.away[frames], move.shift[frames]) for move in moves]
     short = job.model_copy(update={"frames": len(frames)})
     try:

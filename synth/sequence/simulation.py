@@ -55,7 +55,7 @@ def simulate(
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     if mechanics is None and not len(motions):
-        _refuse_untouched(job, case or draw_scenario(job, index))
+        refuse_untouched(job, case or draw_scenario(job, index))
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     with watch.stage("mesh"):
@@ -65,7 +65,7 @@ def simulate(
     return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, rest.content, motion)
 
 
-def _refuse_untouched(job: Job, case: Scenario) -> None:
+def refuse_untouched(job: Job, case: Scenario) -> None:
     """Raises UserError for an instrument whose contact falls between two frames."""
     for k, gesture in enumerate(case.gestures):
         if not trajectory(gesture, job.frames).load.max() > 1e-6:

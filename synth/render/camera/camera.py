@@ -1,7 +1,7 @@
 """The microscope camera: one model for rays, ground truth, flow and bench.
 
-OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3, and k4, k5, k6 of
-OpenCV's rational model), the centre of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera
+OpenCV axes (x right, y down, z away), `K` 3x3, Brown-Conrady distortion (k1, k2, p1, p2, k3, and k4, k5, k6
+of OpenCV's rational model), the centre of the top-left pixel at (0, 0). D. C. Brown, "Close-range camera
 calibration", 1971.
 """
 

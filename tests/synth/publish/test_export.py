@@ -238,12 +238,14 @@ def moving(out: Path, job: Job) -> list[Camera]:
     writer.put("force", np.zeros((job.frames, 3)))
     writer.put("tissue", np.ones((height, width), bool))
     writer.put("area", np.ones((height, width), np.float32))
+    pose = cameras[0].rotation.tolist(), cameras[0].translation.tolist()
     writer.seal(
         K=K.tolist(),
         distortion=bent.tolist(),
-        right={"K": shifted.tolist(), "baseline_mm": baseline},
-        rotation=cameras[0].rotation.tolist(),
-        translation=cameras[0].translation.tolist(),
+        right={"K": shifted.tolist(), "distortion": bent.tolist(), "baseline_mm": baseline}
+        | {"rotation": pose[0], "translation": (np.array(pose[1]) - [baseline, 0, 0]).tolist()},
+        rotation=pose[0],
+        translation=pose[1],
         young_kpa=1.0,
         scale_mm_per_px=1 / 3,
         scenario={"camera_motion": {"drift_mm": 1.0}},

@@ -24,6 +24,27 @@ def scene(job: synth.Job) -> synth.Scene:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        (["frames=4", "fem.instrument_list=[{timing: [0.4, 0.41, 0.42, 0.43]}]"], "0.03"),
+        (["fem.footprint_mm=[13,14]"], "13"),
+        (["fem.footprint_mm=[11.9,11.9]", "fem.gestures=[grasp]"], "12"),
+        (
+            ["render.field_mm=[8,8]", "fem.instrument_list=[{gesture: push, place: [7,0], footprint_mm: 2}]"],
+            "mN",
+        ),
+        (["sensor.exposure=[1e-4,1e-4]"], "frame 0"),
+        (["render.tilt_deg=86"], "85"),
+        (["anatomy.craniotomy.radius_mm=1", "fem.footprint_mm=0.5", "render.field_mm=[1,1]"], "field_mm"),
+    ],
+)
+def test_labels_without_a_meaning_are_refused(tmp_path: Path, changes: list[str], named: str) -> None:
+    small = ["anatomy.vertices=1500", "fem.tets=300", "render.size=[48,36]", "flow.backend=ideal", "frames=3"]
+    with pytest.raises(synth.UserError, match=named):
+        synth.write_scene(synth.simulate(synth.load_job("tiny", [*small, *changes])), tmp_path)
+
+
 def test_it_is_the_scene_in_a_dataset(
     scene: synth.Scene, job: synth.Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
