@@ -114,5 +114,6 @@ def baseline_mm(calibration: Path) -> float:
     except UserError:
         return 0.0  # reported by those that read the cameras
     shift = held.get("T")
-    pair = "R" in held and isinstance(shift, np.ndarray) and any(name.endswith("2") for name in held)
-    return float(np.linalg.norm(shift)) if pair else 0.0
+    if "R" not in held or not isinstance(shift, np.ndarray) or not any(name.endswith("2") for name in held):
+        return 0.0
+    return float(np.linalg.norm(shift))

@@ -265,8 +265,8 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
     lens = np.append(pair.right.distortion, np.zeros(4))
     if lens[8:].any():
         raise UserError("render.calibration: thin-prism distortion of the right camera is not supported")
-    posed = {"rotation": pair.rotation, "translation": pair.translation}
-    place = partial(camera.calibrated_right, K=K, distortion=lens[:8], **posed)
+    turn, shift = pair.rotation, pair.translation
+    place = partial(camera.calibrated_right, K=K, distortion=lens[:8], rotation=turn, translation=shift)
     Rectified(pair)  # refuses a right camera that is not to the right
     right = place(view)
     at = camera.project(right, np.zeros((1, 3)))[0]

@@ -12,8 +12,10 @@ from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
 
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "K1", "M1", "intrinsic_matrix", "mtx")
-_MATRIX += ("cameraMatrix1", "camera_matrix_1", "CM1")  # the left one of a pair
+_MATRIX = (
+    *("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "intrinsic_matrix", "mtx"),
+    *("K1", "M1", "cameraMatrix1", "camera_matrix_1", "CM1"),  # the left one of a pair
+)
 _LENS = (
     "distortion_coefficients",
     "distCoeffs",

@@ -165,7 +165,8 @@ def disparity(left: Camera, right: Camera, points: Floats) -> Floats:
     turn, shift = between(left, right)
     there = points @ turn.T + shift
     (x, z), (x_there, z_there) = (one[:, ::2].T for one in (points, there))
-    return (left.K[0, 0] * x / z + left.K[0, 2]) - (right.K[0, 0] * x_there / z_there + right.K[0, 2])
+    own, other = left.K[0, 0] * x / z + left.K[0, 2], right.K[0, 0] * x_there / z_there + right.K[0, 2]
+    return np.asarray(own - other)
 
 
 def depth_of(left: Camera, right: Camera, along: Floats, disparity_px: Floats) -> Floats:
@@ -173,7 +174,7 @@ def depth_of(left: Camera, right: Camera, along: Floats, disparity_px: Floats) -
     turn, shift = between(left, right)
     there = along @ turn.T
     x = (left.K[0, 0] * along[:, 0] + left.K[0, 2] - disparity_px - right.K[0, 2]) / right.K[0, 0]
-    return (x * shift[2] - shift[0]) / (there[:, 0] - x * there[:, 2])
+    return np.asarray((x * shift[2] - shift[0]) / (there[:, 0] - x * there[:, 2]))
 
 
 def blur_radius(camera: Camera, depth: npt.NDArray[np.floating]) -> Map:
