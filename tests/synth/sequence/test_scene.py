@@ -36,7 +36,6 @@ def scene(job: synth.Job) -> synth.Scene:
         ),
         (["sensor.exposure=[1e-4,1e-4]"], "frame 0"),
         (["render.tilt_deg=86"], "85"),
-        (["render.field_mm=[1,1]"], "field_mm"),
     ],
 )
 def test_labels_without_a_meaning_are_refused(tmp_path: Path, changes: list[str], named: str) -> None:
