@@ -249,10 +249,13 @@ def from_dataset(
         Option(help="Only the first sequence this model was not trained on; repeat for more models."),
     ] = None,
     footage: Annotated[Literal["png", "mp4"], Option(help="Lossless pictures or H.264.")] = "png",
+    instrument: Annotated[
+        int | None, Option(help="The sensor measures this instrument alone, from 1; else the total force.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored like real recordings."""
-    from bench.recording.from_sequence import export_recording
+    from bench.recording.from_sequence import export_recording, force_of
     from learn.checkpoint import read_card
     from learn.inference.shipped import find_model
     from synth.dataset.store import Dataset
@@ -265,7 +268,9 @@ def from_dataset(
         chosen = [s for s in chosen if s.attrs["content_hash"] not in trained][:1]
     if not chosen:
         raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")
-    names = [str(export_recording(s, out / f"{s.index:06d}", footage)) for s in chosen]
+    for one in chosen:
+        force_of(one, instrument)  # refused before anything is written
+    names = [str(export_recording(s, out / f"{s.index:06d}", footage, instrument)) for s in chosen]
     print(json_.dumps({"recordings": names}) if json else "\n".join(names))
 
 

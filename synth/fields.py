@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-TIME, ROW, COLUMN = "frame", "row", "column"
+TIME, ROW, COLUMN, INSTRUMENT = "frame", "row", "column", "instrument"
+MOST_INSTRUMENTS = 3  # at once
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,10 @@ class Field:
     dtype: str
     unit: str
     meaning: str
-    length: int = 0  # of the axis that is neither frame, row nor column
-    stored: Literal["always", "usually", "recovered", "stereo", "stereo recovered", "extra"] = "always"
+    length: int = 0  # of the axis that is neither frame, row, column nor instrument
+    stored: Literal["always", "usually", "several", "recovered", "stereo", "stereo recovered", "extra"] = (
+        "always"
+    )
     half: bool = False  # whether `store.flow: float16` stores it as float16
     packed: float = 0.1  # stored size over raw size, measured on rendered sequences, for forecasts
     low: float | None = None  # smallest plausible value, checked by `synth verify`
@@ -31,13 +34,14 @@ class Field:
 
     def shape(self, frames: int, size: tuple[int, int]) -> tuple[int, ...]:
         """Shape for `frames` frames of `size` = (height, width) [px]."""
-        lengths = {TIME: frames, ROW: size[0], COLUMN: size[1]}
+        lengths = {TIME: frames, ROW: size[0], COLUMN: size[1], INSTRUMENT: MOST_INSTRUMENTS}
         return tuple(lengths.get(dim, self.length) for dim in self.dims)
 
 
 STORED_WHEN = {
     "always": "always",
     "usually": "unless in `store.without`",
+    "several": "if the job has several instruments",
     "recovered": "with a flow estimator",
     "stereo": "with `render.stereo_mm`",
     "stereo recovered": "with `render.stereo_mm` and a flow estimator",
@@ -85,6 +89,9 @@ _TABLE = (
     Field("force", (TIME, "xyz"), "float64", "mN",
           "total load on the tissue, camera axes",
           length=3, packed=3.5, low=-1e6, high=1e6),
+    Field("force_of", (TIME, INSTRUMENT, "xyz"), "float64", "mN",
+          "load of each instrument on the tissue, camera axes, 0 beyond their number; force is their sum",
+          length=3, stored="several", packed=2.0, low=-1e6, high=1e6),
     Field("flow_recovered", (*_VIDEO, "xy"), "float32", "px",
           "flow recovered from the video by the estimator in the attribute flow_backend",
           length=2, stored="recovered", half=True, packed=0.33, low=-1e4, high=1e4),

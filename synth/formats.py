@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from synth.errors import UserError
 
-STORE, FOLDER, MODEL, SCORE = 2, 2, 2, 2
+STORE, FOLDER, MODEL, SCORE = 2, 3, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
 FIRST = 2  # written by 0.2, the first release: nothing older is read
 

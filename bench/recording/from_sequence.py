@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from bench.recording import writer
-from synth.arrays import Pixels
+from synth.arrays import Floats, Pixels
 from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
 from synth.errors import UserError, as_path
@@ -18,21 +18,38 @@ from synth.system import checked_file
 _PAIR = "stereo.yaml"
 
 
-def export_recording(sequence: Sequence, folder: str | Path, frames: Literal["png", "mp4"] = "png") -> Path:
+def export_recording(
+    sequence: Sequence,
+    folder: str | Path,
+    frames: Literal["png", "mp4"] = "png",
+    instrument: int | None = None,
+) -> Path:
     """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     A stereo sequence adds the right camera and the calibration. Ground truth that a real recording lacks is
     not written: no true flow, no traction, no glare mask.
 
-    `frames`: `png` is lossless, `mp4` is H.264. Raises UserError if the folder exists.
+    `frames`: `png` is lossless, `mp4` is H.264; `instrument`: number, from 1, of the one that the sensor is
+    on; None: all. Raises UserError if the folder exists, or there is no such instrument.
     """
-    folder = as_path("recording", folder)
+    folder, force = as_path("recording", folder), force_of(sequence, instrument)
     with checked_file.folder_of(folder) as part:
-        _write_files(sequence, part, frames)
+        _write_files(sequence, part, frames, force)
     return folder
 
 
-def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) -> None:
+def force_of(sequence: Sequence, instrument: int | None) -> Floats:
+    """Force (T, 3) mN, camera axes, of one instrument (from 1) or of all. UserError if there is none."""
+    if instrument is None:
+        return np.asarray(sequence["force"][:], np.float64)
+    each = (sequence.attrs.get("mechanics") or {}).get("instruments", [])
+    if instrument not in range(1, len(each) + 1):
+        has = f"has instruments 1 to {len(each)}" if each else "has no instrument"
+        raise UserError(f"instrument {instrument}: sequence {sequence.index} {has}")
+    return np.asarray(each[instrument - 1]["force_mn"], np.float64)
+
+
+def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"], force: Floats) -> None:
     (part / "masks").mkdir()
     time = np.asarray(sequence["time"][:], np.float64)
     _write_pictures(sequence, "rgb", part, "video", frames)
@@ -44,7 +61,7 @@ def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"]) 
         if tool.any():
             _write(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
     _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
-    writer.write_force(part, time, np.asarray(sequence["force"][:], np.float64) / 1000)
+    writer.write_force(part, time, force / 1000)
     writer.write_frames(part, time)
     about: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),

@@ -51,7 +51,7 @@ def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
     field = job.render.size[0] * MM_PER_PX
     # `taken` applies the codec.
     bare = changed(
-        job, {"render.tool": False, "render.field_mm": (field, field), "sensor.bitrate_mbps": None}
+        job, {"fem.instrument": "none", "render.field_mm": (field, field), "sensor.bitrate_mbps": None}
     )
     pictures, of = [], []
     for index in range(job.sequences):

@@ -23,6 +23,7 @@ from synth.job.schema import Job
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
+from synth.tune.search import changed
 
 Frame = tuple[Pixels, Mask]  # an image (H, W, 3) sRGB and its instrument mask (H, W)
 FRAMES = 6  # frames a scene; the last shows no instrument
@@ -53,7 +54,7 @@ def frames_of(scenes: range, seed: int) -> Iterator[Frame]:
 def _scene(job: Job, index: int) -> Iterator[Frame]:
     rng = np.random.default_rng([job.seed, index])
     hands = [str(kind) for kind in rng.choice(_GESTURES, size=1 + (rng.random() < 0.2))]
-    scene = at_rest(job, index, hands)
+    scene = at_rest(changed(job, {"fem.instrument_list": [{"gesture": kind} for kind in hands]}), index)
     vertices = scene.surface.vertices
     for k, seed in enumerate(scenario.frame_seeds(job, index)):
         poses = [_pose(vertices, job.anatomy.craniotomy.radius_mm, rng) for _ in hands]

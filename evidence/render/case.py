@@ -9,6 +9,7 @@ from synth.arrays import Floats
 from synth.job.schema import Job
 from synth.render.scene import Renderer, SceneState
 from synth.sequence.scene import at_rest
+from synth.tune.search import changed
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Case:
 
 def case(job: Job, index: int) -> Case:
     """Sequence `index` of a job with a plain pull as its load."""
-    scene = at_rest(job, index, ["pull"])
+    scene = at_rest(changed(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
     surface = replace(scene.surface, uv=scene.surface.uv.copy())  # `stability` modifies it
     scene = replace(scene, surface=surface)
     rng = np.random.default_rng([job.seed, index])

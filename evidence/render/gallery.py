@@ -1,6 +1,5 @@
 """Images of the gallery: families, instruments, lights, cameras and scenery side by side."""
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -13,8 +12,6 @@ from evidence.study import Study
 from synth.arrays import Pixels
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
-from synth.render import instrument
-from synth.render.instrument import Kind
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import at_rest
@@ -22,12 +19,13 @@ from synth.tune.search import changed
 
 Settings = dict[str, Any]  # values of a job's dotted keys
 
-_GESTURES: dict[Kind, str] = {
+_GESTURES: dict[str, str] = {
     "forceps": "pull",
     "bayonet": "grasp",
     "dissector": "push",
     "suction": "tap",
     "spatula": "retract",
+    "probe": "slide",
 }
 _LIGHTS: dict[str, Settings] = {
     "few highlights": {"light.glare": 0.0},
@@ -41,7 +39,7 @@ _CAMERAS: dict[str, Settings] = {
     "soft": {"sensor.blur_px": 1.2},
     "wide": {"render.field_mm": 46.0, "render.tilt_deg": 28.0, "render.distortion": (-0.25, 0, 0, 0, 0)},
 }
-_SCENERY: dict[str, Kind] = {
+_SCENERY: dict[str, str] = {
     "bone": "forceps",
     "drape": "dissector",
     "cottonoid": "suction",
@@ -58,7 +56,7 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
     size = (width, width * 3 // 4)
     families = [
         [_tile({"appearance.families": (family,)}, kind, size, seed + row, f"{family}, {kind}")
-         for kind in get_args(Kind)]
+         for kind in _GESTURES]
         for row, family in enumerate(get_args(Family))
     ]  # fmt: skip
     views = [
@@ -74,27 +72,21 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
         cv2.imwrite(str(out / f"{name}.webp"), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
-def _tile(settings: Settings, kind: Kind, size: tuple[int, int], seed: int, caption: str) -> Pixels:
+def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
     usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000}
-    job = changed(Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],)} | settings)
+    job = changed(
+        Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],), "fem.instrument": (kind,)} | settings
+    )
     rest = at_rest(job)
     case = rest.scenario
-    appearance = replace(
-        case.appearance, rim_seed=_seed_of(kind, case.gestures[0].kind), scenery=job.render.scenery
-    )
+    appearance = replace(case.appearance, scenery=job.render.scenery)
     scene = replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1]))
     state = SceneState(rest.surface.vertices, *poised(case.gestures[0], rest.surface))
     shot = scene.renderer.render(state, scenario.frame_seeds(job, 0)[0])
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
     cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([band, shot.rgb])
-
-
-def _seed_of(kind: Kind, gesture: str) -> int:
-    """The first rim seed for which a gesture uses that instrument."""
-    taken = (instrument.choose([gesture], np.random.default_rng([seed, 2])) for seed in itertools.count())
-    return next(seed for seed, kinds in enumerate(taken) if kinds == (kind,))
 
 
 STUDY = Study(measure)

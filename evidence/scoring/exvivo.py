@@ -32,6 +32,7 @@ from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 from synth.system import checked_file
 from synth.system.terminal import counting
+from synth.tune.search import changed
 
 _GESTURES = 3
 _LEVELS = 9
@@ -129,7 +130,7 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
         raise UserError(f"seconds: {plan.seconds:g}; calibration alone takes {_PRESS_S:g}, at least 5 more")
     (part / "masks").mkdir(parents=True)
     job = job_of(plan)
-    scene = at_rest(job, index, ["pull"])
+    scene = at_rest(changed(job, {"fem.instrument_list": [{"gesture": "pull"}]}), index)
     case, surface = scene.scenario, scene.surface
     rng = np.random.default_rng([plan.seed, index, 77])
     opening, young = job.anatomy.craniotomy.radius_mm, case.tissue.young_kpa

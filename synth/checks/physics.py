@@ -34,11 +34,14 @@ def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
 
 def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """Traction times area, summed over the pixels, equals the force (relative); half of it, if a part of the
-    contact is outside the view."""
+    contact is outside the view. The instruments' forces add up to it."""
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
     applied = sequence["force"][:]
     shown = np.zeros_like(applied)
     whole = np.ones(len(applied), bool)
+    if "force_of" in sequence and applied.any():
+        off = np.abs(sequence["force_of"][:].sum(axis=1) - applied).max()
+        yield Measure(float(off / np.abs(applied).max()), 1e-6, "sum of the instruments")
     for t in frames:
         traction = sequence["traction"][t]
         size = np.linalg.norm(traction, axis=-1)

@@ -27,6 +27,7 @@ _Edge = Annotated[int, Field(ge=1, le=LARGEST_PIXELS)]
 
 class _Gesture(BaseModel):
     kind: str | None = None
+    instrument: str | None = None
     load: _Number | None = None
 
 
@@ -80,6 +81,9 @@ def first_gesture(scenario: Mapping[str, Any]) -> Mapping[str, Any]:
     return next(iter(scenario.get("gestures", ())), {})
 
 
-def name_gestures(scenario: Mapping[str, Any]) -> str:
-    """Gestures of all instruments in a sequence's attribute `scenario`: "pull + push"; may be empty."""
-    return " + ".join(one["kind"] for one in scenario.get("gestures", ()) if one.get("kind"))
+def name_gestures(scenario: Mapping[str, Any], of: str = "kind") -> str:
+    """Gestures of all instruments in a sequence's attribute `scenario`: "pull + push"; may be empty.
+
+    `of`: "instrument" names their instruments instead.
+    """
+    return " + ".join(one[of] for one in scenario.get("gestures", ()) if one.get(of))

@@ -66,8 +66,15 @@ class Folder:
 
     def job(self) -> Job:
         """The dataset's job; its plug-ins need not be installed."""
+        described = self.described()
+        job = described["job"]
+        names = ("appearance", "render", "fem")
+        if described["format_version"] < 3 and all(isinstance(job.get(name), dict) for name in names):
+            job["appearance"].pop("cottonoid", None)
+            if not job["render"].pop("tool", True):
+                job["fem"]["instrument"] = "none"
         try:
-            return Job.model_validate(self.described()["job"], context=STORED)
+            return Job.model_validate(job, context=STORED)
         except ValidationError as error:
             raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
 

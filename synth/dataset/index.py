@@ -75,6 +75,8 @@ COLUMNS = (
     IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
     IndexColumn("gesture", _TEXT, "kind of gesture of each instrument",
                 source=lambda one: name_gestures(one.attrs.get("scenario") or {}) or None),
+    IndexColumn("instrument", _TEXT, "instrument of each gesture; none: not drawn",
+                source=lambda one: name_gestures(one.attrs.get("scenario") or {}, "instrument") or None),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
@@ -111,10 +113,12 @@ def read_index(root: Path) -> pa.Table:
     try:
         checked_file.check_file(path, _LARGEST_BYTES)
         about = pq.read_metadata(path)
-        if about.num_rows > _MOST_ROWS or about.schema.names != SCHEMA.names:
+        # A dataset of format 2 has no instruments in its index.
+        names = [name for name in SCHEMA.names if name != "instrument" or name in about.schema.names]
+        if about.num_rows > _MOST_ROWS or about.schema.names != names:
             raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
         file = pq.ParquetFile(path, memory_map=False, page_checksum_verification=True)
-        table = file.read(use_threads=False).cast(SCHEMA)
+        table = pa.Table.from_pylist(file.read(use_threads=False).to_pylist(), SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         raise UserError(f"{path}: is damaged ({first_line(error)}){_REMEDY}") from error

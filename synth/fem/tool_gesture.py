@@ -13,8 +13,10 @@ from synth.geometry.triangles import Shape, side_areas
 _PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
 FRICTION = 0.4  # drag of a sliding tip, as a part of its push
 _OVERLAP = 0.6  # least distance of contacts over their radii's sum: together they peak at 1.1 of one's peak
-_BLADE_MM, _SPREADING, _BODY_MM = 3.0, 0.3, 14.0  # clearance at a tip, its growth up the shaft, its largest
-_LENGTH_MM, _STEPS = 110.0, 23
+_RING = 0.6  # radius of a ring's largest pressure over its own
+_RING_SIZE = (32 / 5 * _RING * (1 - _RING)) ** -0.5  # radius over that of a round contact of its area
+_ASPECTS = {"forceps": 2.0, "bayonet": 2.0, "spatula": 0.5}  # a tine's line, a blade's edge
+_FACE = 0.7  # of a blade that retracts: length along the instrument over width
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,9 @@ class Gesture:
     """Gesture of one instrument in a sequence."""
 
     kind: str  # `pull`, `push`, `slide`, `grasp`, `retract` or `tap`
+    instrument: str  # `forceps`, `bayonet`, `dissector`, `suction`, `spatula`, `probe`; `none` is not drawn
     contacts: tuple[ToolContact, ...]  # A grasp has two, the others one
-    footprint_mm: float  # radius a of every contact
+    footprint_mm: float  # radius a of every contact; that of a circle of its area where it is not round
     load: float  # peak P = F/(E a^2) of a contact
     point_mm: tuple[float, float]  # world x, y of the middle of the contacts at rest
     direction: tuple[float, float, float]  # unit vector of the whole load, world axes
@@ -45,19 +48,36 @@ class Gesture:
     timing: tuple[float, float, float, float]  # touch, full load, start of its fall, release: sequence parts
 
     @property
+    def axes(self) -> Floats:
+        """Half axes (2, 2) mm of its contacts along and across the instrument, world x and y.
+
+        All forms have the area of a circle of radius a, so that P means the same largest pressure.
+        """
+        along = form(self.kind, self.instrument)
+        turn, size = np.radians(self.azimuth_deg), self.footprint_mm * np.sqrt([along, 1 / along])
+        size *= _RING_SIZE if self.instrument == "suction" else 1.0
+        return np.asarray(size[:, None] * [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+
+    @property
     def reach_mm(self) -> float:
         """Largest distance of loaded tissue from the opening's middle."""
-        start = np.array([c.point_mm for c in self.contacts])
-        ends = np.concatenate([start, start + np.asarray(self.path_mm)])
-        return float(np.hypot(*ends.T).max()) + self.footprint_mm
+        return max(float(np.hypot(x, y)) + radius for x, y, radius in self.focus)
 
     @property
     def focus(self) -> tuple[tuple[float, float, float], ...]:
-        """Places where the mesh should be finest: x, y and radius of the contacts, mm."""
+        """Places where the mesh should be finest: x, y and radius of circles in the contacts, mm."""
+        wide, long = sorted(self.axes, key=np.linalg.norm)
+        radius, end = float(np.linalg.norm(wide)), long * (1 - np.linalg.norm(wide) / np.linalg.norm(long))
         stops = (0.0, 0.5, 1.0) if any(self.path_mm) else (0.0,)
-        (dx, dy), radius = self.path_mm, self.footprint_mm
-        places = [(contact.point_mm, s) for contact in self.contacts for s in stops]
-        return tuple((x + s * dx, y + s * dy, radius) for (x, y), s in places)
+        sides = (-1, 0, 1) if end.any() else (0,)
+        path = [s * np.asarray(self.path_mm) + e * end for s in stops for e in sides]
+        places = [np.asarray(contact.point_mm) + step for contact in self.contacts for step in path]
+        return tuple((float(x), float(y), radius) for x, y in places)
+
+    @property
+    def sides(self) -> Floats:
+        """Vectors (2, 2) mm from the middle of the tips to each."""
+        return np.outer((-1, 1), _aside(self.spread_mm, self.azimuth_deg))
 
     @property
     def shaft(self) -> Floats:
@@ -76,6 +96,11 @@ class ToolMotion:
     """(T,) distance of the tips from the tissue, as a part of `hover_mm`."""
     shift: Floats
     """(T, 2) mm that the contacts have slid over the surface at rest."""
+
+
+def form(kind: str, instrument: str) -> float:
+    """Length of an instrument's contact along it over the width; 1 is round."""
+    return _FACE if (kind, instrument) == ("retract", "spatula") else _ASPECTS.get(instrument, 1.0)
 
 
 def grip(
@@ -97,15 +122,10 @@ def grip(
 
 
 def clearance(one: Gesture, other: Gesture) -> float:
-    """Distance of two gestures' contacts and shafts beyond the clearance they need, mm."""
+    """Distance of two gestures' contacts beyond the clearance they need, mm."""
     here, there = np.array(one.focus), np.array(other.focus)
     apart = np.linalg.norm(here[:, None, :2] - there[None, :, :2], axis=2)
-    contacts = (apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min()
-    s = np.linspace(0, _LENGTH_MM, _STEPS)
-    lines = [np.append(g.point_mm, 0.0) + s[:, None] * g.shaft for g in (one, other)]
-    gap = np.linalg.norm(lines[0][:, None] - lines[1][None], axis=2)
-    wide = np.minimum(_BLADE_MM + _SPREADING * np.maximum(s[:, None], s[None, :]), _BODY_MM)
-    return float(min(contacts, (gap - wide).min()))
+    return float((apart - _OVERLAP * (here[:, None, 2] + there[None, :, 2])).min())
 
 
 def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
@@ -136,31 +156,40 @@ def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floa
     out = np.zeros((len(motion.load), len(vertices), 3))
     for contact in gesture.contacts:
         start = np.asarray(contact.point_mm)
-        kernel = footprint(start, gesture.footprint_mm, vertices, area)
+        under = gesture.axes, vertices, area, gesture.instrument == "suction"
+        kernel = footprint(start, *under)
         for t, part in enumerate(motion.load):
             if part > 0:
                 if motion.shift[t].any():
-                    kernel = footprint(start + motion.shift[t], gesture.footprint_mm, vertices, area)
+                    kernel = footprint(start + motion.shift[t], *under)
                 out[t] += np.outer(part * kernel, contact.force_mn)
     return out
 
 
-def footprint(centre: Floats, radius_mm: float, vertices: Floats, area: Floats) -> Floats:
+def footprint(
+    centre: Floats, size: float | Floats, vertices: Floats, area: Floats, ring: bool = False
+) -> Floats:
     """Pressure (V,) 1/mm^2 of a unit force: the kernel (1 - (r/a)^2)^2 on the surface, sum(area * result) =
     1.
 
     Args:
         centre: (2,) world x, y, mm.
-        radius_mm: a.
+        size: a [mm], or the two half axes (2, 2) mm of an ellipse.
         vertices, area: (V, 3) mm at rest, and (V,) mm^2.
+        ring: the kernel is that of the distance from a ring in its outer part.
 
     Raises:
         UserError: fewer than 3 vertices lie under the contact.
     """
     flat = np.hypot(*(vertices[:, :2] - centre).T)
     middle = np.append(centre, vertices[flat.argmin(), 2])
-    reach = np.minimum(np.linalg.norm(vertices - middle, axis=1) / radius_mm, 1)
-    kernel = (1 - reach**2) ** 2
+    axes = np.eye(3)
+    axes[:2, :2] = size if np.ndim(size) else size * np.eye(2)
+    radius_mm = axes[2, 2] = float(np.sqrt(np.linalg.det(axes)))
+    reach = np.linalg.norm((vertices - middle) @ np.linalg.inv(axes), axis=1)
+    if ring:
+        reach = np.abs(reach - _RING) / (1 - _RING)
+    kernel = (1 - np.minimum(reach, 1) ** 2) ** 2
     total = float(kernel @ area)
     if np.count_nonzero(kernel) < 3 or total <= 0:
         raise UserError(
@@ -175,12 +204,12 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
 
     Raises UserError beyond the edge of the surface.
     """
-    aside = _aside(gesture.spread_mm, gesture.azimuth_deg)
+    aside = gesture.sides
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(motion.shift).max() + 3 * gesture.footprint_mm
     corner = surface.vertices[surface.faces, :2]
     near = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
-    places = (start + motion.shift)[:, None] + np.stack([-aside, aside])
+    places = (start + motion.shift)[:, None] + aside
     once, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
     found = [_under(place, surface.vertices, near) for place in once]
     shape = (*places.shape[:2], 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Annotated, Literal, get_args
 
@@ -12,6 +13,17 @@ from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range,
 from synth.plugins import STORED
 
 Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
+Instrument = Literal["forceps", "bayonet", "dissector", "suction", "spatula", "probe", "none"]
+
+INSTRUMENTS: dict[Kind, dict[Instrument, float]] = {
+    "pull": {"forceps": 0.5, "bayonet": 0.5, "suction": 0.0},
+    "grasp": {"forceps": 0.5, "bayonet": 0.5},
+    "push": {"dissector": 0.6, "suction": 0.4, "spatula": 0.0, "probe": 0.0},
+    "slide": {"dissector": 0.5, "suction": 0.5, "spatula": 0.0, "probe": 0.0},
+    "tap": {"dissector": 0.7, "suction": 0.3, "probe": 0.0},
+    "retract": {"spatula": 0.7, "dissector": 0.3, "suction": 0.0},
+}
+"""Instruments that each gesture takes, with their shares where a job names none; `none` suits every one."""
 
 CLEAR_MM = 1.0  # least distance of a contact from the rim
 
@@ -28,7 +40,16 @@ _DIRECTIONS: dict[Kind, tuple[str, Callable[[float, float, float], bool]]] = {
 }
 """Rule for the direction of each gesture's load, and its test; z points out of the brain."""
 
-_Part = Annotated[FiniteFloat, Field(gt=0, lt=1)]
+_Time = FiniteFloat | Annotated[str, Field(max_length=40)]
+
+
+def _read_times(timing: tuple[float | str, ...]) -> tuple[list[float], str]:
+    """The numbers of times such as 0.2 or "0.2 s", and their unit, empty for parts of the sequence."""
+    found = [re.fullmatch(r"\s*(\d*\.?\d+(?:e-\d+)?)\s*(s|ms|)\s*", str(one)) for one in timing]
+    read = [one.groups() for one in found if one]
+    if len(read) < len(timing) or len({unit for _, unit in read}) > 1:
+        raise ValueError("timing: give four parts of the sequence such as 0.2, or four times such as 0.2 s")
+    return [float(number) for number, _ in read], read[0][1]
 
 
 class InstrumentSection(Section):
@@ -36,6 +57,8 @@ class InstrumentSection(Section):
 
     gesture: Kind | None = None
     """Kind of gesture. Empty: drawn from `fem.gestures`."""
+    instrument: Instrument | None = None
+    """The instrument, one that the gesture takes; none: not drawn. Empty: drawn as by `fem.instrument`."""
     place: tuple[FiniteFloat, FiniteFloat] | None = None
     """Centre of its contact at rest [mm]: x and y in world axes, from the centre of the opening."""
     direction: Direction | None = None
@@ -47,17 +70,17 @@ class InstrumentSection(Section):
     """Peak force of a contact [mN], instead of `load`."""
     footprint_mm: Range[Positive] | None = None
     """Radius a of its contact [mm]."""
-    timing: tuple[_Part, _Part, _Part, _Part] | None = None
-    """Touch, full load, beginning of the unloading, release: rising fractions of the sequence. For a tap only
-    the first and the last are used."""
+    timing: tuple[_Time, _Time, _Time, _Time] | None = None
+    """Touch, full load, beginning of the unloading, release: rising fractions of the sequence, or times such
+    as 0.2 s or 200 ms from its first frame. For a tap only the first and the last are used."""
 
     @model_validator(mode="after")
     def _goes_together(self) -> InstrumentSection:
         if self.load is not None and self.force_mn is not None:
             raise ValueError("either load or force_mn, not both")
         if self.timing is not None:
-            touch, full, fall, release = self.timing
-            if not touch < full <= fall < release:
+            touch, full, fall, release = _read_times(self.timing)[0]
+            if not 0 < touch < full <= fall < release:
                 raise ValueError("timing: touch, full load, fall and release must follow one another")
         if self.direction is not None and self.gesture is None:
             raise ValueError("direction needs gesture: that of a push points inwards, of a pull outwards")
@@ -66,6 +89,19 @@ class InstrumentSection(Section):
             if not holds(*self.direction):
                 raise ValueError(f"direction: a {self.gesture} {rule}")
         return self
+
+    def timed(self, frames: int, fps: float) -> InstrumentSection:
+        """The same with times as parts of a sequence. ValueError, in the unit given, if it ends too late."""
+        if self.timing is None:
+            return self
+        numbers, unit = _read_times(self.timing)
+        end = (frames - 1) / fps * {"s": 1.0, "ms": 1000.0}[unit] if unit else 1.0
+        if numbers[3] >= end:
+            hint = "release earlier, or raise frames" if unit else f"was {numbers[3]:g} s meant?"
+            raise ValueError(
+                f"timing ends at {numbers[3]:g} {unit}, the sequence at {end:.4g} {unit}: {hint}"
+            )
+        return self.model_copy(update={"timing": tuple(one / end for one in numbers)})
 
 
 class MembraneSection(Section):
@@ -94,11 +130,8 @@ class PulseSection(Section):
     """Amplitude of the respiratory motion [mm]."""
 
 
-Skulls = Annotated[
-    tuple[Literal["bonded", "slip"], ...],
-    Field(min_length=1),
-    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
-]
+_OneOrMore = BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)
+Skulls = Annotated[tuple[Literal["bonded", "slip"], ...], Field(min_length=1), _OneOrMore]
 
 
 def _of_tissue(young_kpa: tuple[float, float]) -> tuple[float, float]:
@@ -135,12 +168,17 @@ class FemSection(Section):
     footprint_mm: Range[Positive] = (3.0, 6.0)
     """Radius a of the contact [mm]."""
     gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)
-    """Kinds of gesture that sequences are drawn from, in equal shares."""
+    """Kinds of gesture that sequences are drawn from, in equal shares. Not given: those that the named
+    instruments suit."""
+    instrument: Annotated[tuple[Instrument, ...], _OneOrMore] = ()
+    """Instruments, one or more: each gesture is made with one that it takes, in equal shares. None: it is not
+    drawn. Empty: those usual for each gesture."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
     """The first ones of `instruments`, of which there are at least as many, with given properties: a list of
-    {gesture, place, direction, load, force_mn, footprint_mm, timing}; keys left out are drawn at random."""
+    {gesture, instrument, place, direction, load, force_mn, footprint_mm, timing}; keys left out are drawn at
+    random."""
     max_tilt_deg: Annotated[FiniteFloat, Field(ge=0, le=80)] = 65.0
     """The load's direction is drawn uniformly within this angle of the surface normal."""
     time: Literal["quasi-static", "dynamic"] = "quasi-static"
@@ -164,6 +202,32 @@ class FemSection(Section):
         for name, loads in () if info.context is STORED else self.load_ranges:
             check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
         return self
+
+    @model_validator(mode="after")
+    def _gestures_take_their_instruments(self) -> FemSection:
+        if "gestures" not in self.model_fields_set:
+            object.__setattr__(self, "gestures", tuple(self.choices()))
+        lacking = [("instrument", kind) for kind in self.gestures if kind not in self.choices()]
+        for k, one in enumerate(self.instrument_list):
+            kinds = self.gestures if one.gesture is None else (one.gesture,)
+            at = f"instrument_list[{k}].instrument"
+            lacking += [] if self.choices(one) else [(at, kind) for kind in kinds]
+        if lacking:
+            takes = [f"a {kind} takes {' or '.join(INSTRUMENTS[kind])}" for _, kind in lacking]
+            raise ValueError(f"{lacking[0][0]}: {'; '.join(takes)}")
+        return self
+
+    def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Instrument, float]]:
+        """Gestures that an instrument may be drawn with, each with its instruments and their shares."""
+        named = self.instrument if one.instrument is None else (one.instrument,)
+        found: dict[Kind, dict[Instrument, float]] = {}
+        for kind in self.gestures if one.gesture is None else (one.gesture,):
+            shares = INSTRUMENTS[kind]
+            if named:
+                shares = {name: 1.0 for name in named if name in (*shares, "none")}
+            total = sum(shares.values())
+            found[kind] = {name: share / total for name, share in shares.items() if share}
+        return {kind: shares for kind, shares in found.items() if shares}
 
     def load_range(self, instrument: InstrumentSection) -> LoadRange:
         """The ranges for an instrument: its own where it has some."""

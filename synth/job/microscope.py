@@ -85,8 +85,6 @@ class RenderSection(Section):
     stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Baseline to a right camera [mm], for a stereo dataset: its pictures, and motion in three dimensions,
     true and recovered; 0: monocular."""
-    tool: bool = True
-    """Whether the instrument is drawn."""
     scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()
     """Objects around the opening, each in three of four sequences: a retractor's blade and cotton patties
     over its edge, the bone's cut edge, drapes in the corners. They hide tissue and don't count as tissue."""

@@ -108,8 +108,6 @@ class AppearanceSection(Section):
     """Appearance families that sequences are drawn from, in equal shares."""
     photo: Path | None = None
     """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
-    cottonoid: Share = 0.2
-    """Share of sequences with a cotton patty on the rim."""
     blood: Range[Share] | None = None
     """Blood on the rim, from none (0) to soaked (1). Empty: that of the family."""
 
@@ -201,26 +199,38 @@ class Job(Section):
         return self
 
     @model_validator(mode="after")
-    def _contacts_are_inside_the_opening(self, info: ValidationInfo) -> Job:
-        radius = self.anatomy.craniotomy.radius_mm
+    def _instruments_fit_opening_and_sequence(self, info: ValidationInfo) -> Job:
+        radius, timed = self.anatomy.craniotomy.radius_mm, []
         for name, loads in () if info.context is STORED else self.fem.load_ranges:
             if (least := loads.footprint_mm[0]) > radius:
                 key = f"fem.{name.replace(': ', '.')}footprint_mm"
                 raise ValueError(f"{key}: {least:g} mm is wider than an opening of {radius:g} mm radius")
         for k, one in enumerate(self.fem.instrument_list):
+            try:
+                timed.append(one.timed(self.frames, self.fps))
+            except ValueError as error:
+                raise ValueError(f"fem.instrument_list[{k}].{error}") from None
             least = self.fem.load_range(one).footprint_mm[0]
             if one.place is not None and math.hypot(*one.place) + least + CLEAR_MM > radius:
                 raise ValueError(
                     f"fem.instrument_list[{k}].place: {math.hypot(*one.place):.3g} mm from the centre, a "
                     f"contact of {least:g} mm radius reaches under the rim of an opening of {radius:g} mm"
                 )
+        fem = self.fem.model_copy(update={"instrument_list": tuple(timed)})
+        object.__setattr__(self, "fem", fem)
         return self
 
     @property
     def stored_fields(self) -> tuple[str, ...]:
         """Names of the fields in its sequences, in the order of the field table."""
         recovered, stereo = self.flow.backend != "ideal", self.render.stereo_mm > 0
-        conditions = {"recovered": recovered, "stereo": stereo, "stereo recovered": stereo and recovered}
+        several = max(self.fem.instruments[1], len(self.fem.instrument_list)) > 1
+        conditions = {
+            "several": several,
+            "recovered": recovered,
+            "stereo": stereo,
+            "stereo recovered": stereo and recovered,
+        }
         kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
         found = [one for one in FIELDS.values() if one.stored in kinds or one.name in self.store.extra]
         return tuple(one.name for one in found if one.name not in self.store.without)

@@ -64,8 +64,8 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     state = SceneState(scene.surface.vertices, tips, shafts)
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
-    label = f"{index}  {scene.scenario.family}  {' + '.join(one.kind for one in gestures)}"
-    return caption(picture, label, size[1] - 8)
+    acting = " + ".join(f"{one.instrument} {one.kind}" for one in gestures)
+    return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
 
 
 def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:

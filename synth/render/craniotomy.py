@@ -28,7 +28,11 @@ _AMBIENT = 0.05  # share of the lamps' light that comes from all directions
 
 
 def craniotomy(
-    surface: CortexSurface, appearance: Appearance, camera: Camera, job: Job, gestures: Sequence[str] = ()
+    surface: CortexSurface,
+    appearance: Appearance,
+    camera: Camera,
+    job: Job,
+    drawn: Sequence[tuple[str, float]] = (),
 ) -> SceneContent:
     """The content of one sequence.
 
@@ -36,8 +40,8 @@ def craniotomy(
         surface: the cortex at rest.
         appearance: its appearance.
         camera: the microscope at rest.
-        job: opening, photograph, and whether instruments are shown.
-        gestures: kind of each instrument's gesture, for which a suitable instrument is shown.
+        job: opening and photograph.
+        drawn: kind of each instrument, `none` for one that is not drawn, and the radius of its contacts [mm].
 
     Raises:
         UserError: the photograph cannot be read.
@@ -57,13 +61,11 @@ def craniotomy(
     if "retractor" in appearance.scenery:
         static.append(_retractor(surface, around, theatre))
     hand = np.random.default_rng([appearance.rim_seed, 2])
-    kinds = instrument.choose(gestures, hand)
-    shown = job.render.tool and kinds
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(kinds, theatre, hand) if shown else None,
+        instruments=instrument.build(drawn, theatre, hand),
         spot=appearance.light.even,
     )
 

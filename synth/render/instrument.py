@@ -1,4 +1,4 @@
-"""Instruments as meshes that follow tips and shafts: forceps of two kinds, dissector, suction, spatula.
+"""Instruments as meshes that follow tips and shafts: two forceps, dissector, suction, spatula, probe.
 
 Sizes in mm are those of common neurosurgical instruments, chosen by eye, not from drawings.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -18,23 +17,13 @@ from synth.geometry.triangles import Shape, grid_faces, joined, lengths
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
 
-Kind = Literal["forceps", "bayonet", "dissector", "suction", "spatula"]
-
 _AROUND = 40
+RING = _AROUND + 1  # vertices of each of a part's rings
 _LENGTH_MM = 110.0
 _COAT_MM = 11.0  # from the tip
 
 _CLIMB_MM, _REACH_MM = 0.30, 0.40  # height to which fluid climbs at a tip, and distance of its fall-off
 
-# Instruments that suit each gesture, and their shares.
-_HABITS: dict[str, tuple[tuple[Kind, ...], tuple[float, ...]]] = {
-    "pull": (("forceps", "bayonet"), (0.5, 0.5)),
-    "grasp": (("forceps", "bayonet"), (0.5, 0.5)),
-    "push": (("dissector", "suction"), (0.6, 0.4)),
-    "slide": (("dissector", "suction"), (0.5, 0.5)),
-    "tap": (("dissector", "suction"), (0.7, 0.3)),
-    "retract": (("spatula", "dissector"), (0.7, 0.3)),
-}
 _COATED = 0.4  # share of instruments whose end is coated black, against sticking and glare
 
 
@@ -50,8 +39,8 @@ class Part:
 class SteelInstruments:
     """All instruments of a scene as one mesh; see `content.Instruments`."""
 
-    kinds: tuple[Kind, ...]
-    parts: tuple[tuple[Part, ...], ...]  # the parts of each
+    halves: tuple[float, ...]  # half the width of each one's contact with tissue, mm
+    parts: tuple[tuple[Part, ...], ...]  # the parts of each, none where it is not drawn
     faces: Indices  # (F, 3) over all parts
     coat: Map  # (V,) 0 bare steel to 1 under a black coating
     theatre: Theatre  # that they mirror
@@ -70,15 +59,7 @@ class SteelInstruments:
             raise UserError(f"{len(tips)} tips for {len(self.parts)} instruments; give two for each")
         placed = []
         for k, parts in enumerate(self.parts):
-            ends, ways = tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2]
-            for part in parts:
-                # The flat sides of two tines face each other; a single blade's faces the tissue.
-                if part.side == 0:
-                    tip, shaft, across = ends.mean(axis=0), ways.mean(axis=0), np.array([0.0, 0.0, 1.0])
-                else:
-                    tip, shaft = (pair[0 if part.side == 1 else 1] for pair in (ends, ways))
-                    across = ends[1] - ends[0]
-                placed.append(tip + part.profile @ _axes(shaft, across))
+            placed += place(parts, tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2])
         return Shape(np.concatenate(placed), self.faces)
 
     def glow(self, posed: Shape) -> Floats:
@@ -86,24 +67,48 @@ class SteelInstruments:
 
     def film(self, tips: Floats, surface: Floats) -> Floats:
         height = np.zeros(len(surface))
-        for k, kind in enumerate(self.kinds):
+        for k, (half, parts) in enumerate(zip(self.halves, self.parts, strict=True)):
             ends = tips[2 * k : 2 * k + 2]
-            for end in ends if len(self.parts[k]) == 2 else ends.mean(axis=0, keepdims=True):
-                away = lengths(surface - end) - _SHAPES[kind][1]
+            for end in ends if len(parts) == 2 else ends.mean(axis=0, keepdims=True)[: len(parts)]:
+                away = lengths(surface - end) - half
                 height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
         return height
 
 
-def choose(gestures: Sequence[str], rng: np.random.Generator) -> tuple[Kind, ...]:
-    """An instrument that suits each gesture."""
-    suitable = (_HABITS[gesture] for gesture in gestures)
-    return tuple(kinds[int(rng.choice(len(kinds), p=shares))] for kinds, shares in suitable)
+def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
+    """Vertices (V, 3) mm of each part of an instrument with its tips and shafts (2, 3)."""
+    placed = []
+    for part in parts:
+        # The flat sides of two tines face each other; a single blade's faces the tissue.
+        if part.side == 0:
+            tip, shaft, across = ends.mean(axis=0), ways.mean(axis=0), np.array([0.0, 0.0, 1.0])
+        else:
+            tip, shaft = (pair[0 if part.side == 1 else 1] for pair in (ends, ways))
+            across = ends[1] - ends[0]
+        placed.append(tip + part.profile @ _axes(shaft, across))
+    return placed
 
 
-def build(kinds: Sequence[Kind], theatre: Theatre, rng: np.random.Generator) -> SteelInstruments:
-    """One or more instruments in a theatre, some of them with ends coated black."""
-    coated = rng.random(len(kinds)) < _COATED
-    parts = tuple(_SHAPES[kind][0]() for kind in kinds)
+def shape_of(kind: str, footprint_mm: float) -> tuple[tuple[Part, ...], float]:
+    """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip."""
+    if kind == "none":
+        return (), 0.0
+    make, share, least, most = SHAPES[kind]
+    half = float(np.clip(share * footprint_mm, least, most))
+    return make(half), half
+
+
+def build(
+    drawn: Sequence[tuple[str, float]], theatre: Theatre, rng: np.random.Generator
+) -> SteelInstruments | None:
+    """Instruments in a theatre, some of them with ends coated black; None if there is none.
+
+    `drawn`: kind of each and the radius a of its contacts, mm.
+    """
+    coated = rng.random(len(drawn)) < _COATED
+    parts, halves = zip(*(shape_of(*one) for one in drawn), strict=True) if drawn else ((), ())
+    if not any(parts):
+        return None
     bars, coat = [], []
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
@@ -112,7 +117,7 @@ def build(kinds: Sequence[Kind], theatre: Theatre, rng: np.random.Generator) -> 
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
     return SteelInstruments(
-        tuple(kinds), parts, joined(*bars).faces, np.concatenate(coat).astype(np.float32), theatre
+        halves, parts, joined(*bars).faces, np.concatenate(coat).astype(np.float32), theatre
     )
 
 
@@ -148,14 +153,14 @@ def _round_off(s: Floats, over: float) -> Floats:
     return np.asarray(np.sqrt(np.clip(1 - (1 - np.minimum(s / over + 0.01, 1)) ** 2, 0, 1)))
 
 
-def _forceps(aside_mm: float = 0.0) -> tuple[Part, ...]:
+def _forceps(half: float, aside_mm: float = 0.0) -> tuple[Part, ...]:
     """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1).
 
-    `aside_mm`: shift of the handle, which a bayonet's two bends move out of view.
+    `half`: of a tip's width; `aside_mm`: shift of the handle, which a bayonet's two bends move out of view.
     """
     s = _along(96)
     close = _round_off(s, 0.45)
-    wide = (0.42 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
+    wide = (half - 0.03 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
     thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
     bend = np.clip((s - 24.0) / 14.0, 0, 1)
@@ -163,43 +168,53 @@ def _forceps(aside_mm: float = 0.0) -> tuple[Part, ...]:
     return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
 
 
-def _dissector() -> tuple[Part, ...]:
+def _dissector(half: float) -> tuple[Part, ...]:
     """A small rounded blade on a thin round shaft, slightly bent, that ends in a thicker handle."""
     s = _along(96)
     close = _round_off(s, 1.4)
     neck = np.exp(-((s / 5.0) ** 2))
     handle = 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
     thick = (0.28 + 0.55 * (1 - neck) + handle) * np.minimum(close * 1.4, 1)
-    wide = (0.83 + 0.75 * neck + handle) * close
+    wide = (0.83 + (half - 0.75) * neck + handle) * close
     bow = 1.6 * np.exp(-s / 6.0) - 1.6
     return (Part(_sweep(s, thick, wide, bow, 0.9), 0),)
 
 
-def _suction() -> tuple[Part, ...]:
+def _suction(half: float) -> tuple[Part, ...]:
     """A tube, open at its end, bent and wider towards the hand."""
     outside = 0.12 + _along(84)
     inside = np.array([8.0, 3.0, 1.0, 0.3, 0.05])
     s = np.concatenate([inside, outside])
-    radius = np.concatenate([np.full(5, 1.05), 1.25 + 0.9 / (1 + np.exp(-(outside - 55.0) / 4.0))])
-    radius[5] = 1.15  # a blunted edge
+    radius = half + np.concatenate([np.full(5, -0.15), 0.05 + 0.9 / (1 + np.exp(-(outside - 55.0) / 4.0))])
+    radius[5] = half - 0.05  # a blunted edge
     bow = 2.5 * (1 - np.exp(-((s / 45.0) ** 2)))
     return (Part(_sweep(s, radius, radius, bow, 1.0), 0),)
 
 
-def _spatula() -> tuple[Part, ...]:
+def _spatula(half: float) -> tuple[Part, ...]:
     """A flat ribbon with a round end, bent where it leaves the wound."""
     s = _along(96)
-    wide = (3.4 + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, 3.4)
+    wide = (half + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, half)
     thick = np.full_like(s, 0.32) * _round_off(s, 0.3)
     bow = 4.0 * (1 - np.exp(-((s / 30.0) ** 2)))
     return (Part(_sweep(s, thick, wide, bow, 0.35), 0),)
 
 
-_SHAPES: dict[Kind, tuple[Callable[[], tuple[Part, ...]], float]] = {
-    "forceps": (_forceps, 0.45),
-    "bayonet": (partial(_forceps, 13.0), 0.45),
-    "dissector": (_dissector, 1.5),
-    "suction": (_suction, 1.2),
-    "spatula": (_spatula, 3.0),
+def _probe(half: float) -> tuple[Part, ...]:
+    """A ball on a thin shaft; at 50 degrees its lowest point is the tip."""
+    s = _along(96)
+    radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), np.where(s > half, 0.45 * half, 0))
+    radius += 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
+    low, up = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
+    return (Part(_sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)
+
+
+SHAPES: dict[str, tuple[Callable[[float], tuple[Part, ...]], float, float, float]] = {
+    "forceps": (_forceps, 0.0, 0.45, 0.45),
+    "bayonet": (partial(_forceps, aside_mm=13.0), 0.0, 0.45, 0.45),
+    "dissector": (_dissector, 0.0, 1.5, 1.5),
+    "suction": (_suction, 0.48, 1.0, 2.0),
+    "spatula": (_spatula, 0.8, 1.5, 4.5),
+    "probe": (_probe, 0.5, 0.6, 3.0),
 }
-"""Parts of each kind, and half the width [mm] of its contact with tissue."""
+"""Parts of each drawn kind by half the width of its tip: a share of the contact's radius, from and to mm."""

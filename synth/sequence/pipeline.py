@@ -11,7 +11,7 @@ import numpy as np
 from synth.arrays import Mask, Pixels
 from synth.dataset.store import Writer
 from synth.errors import UserError
-from synth.fields import FIELDS
+from synth.fields import FIELDS, MOST_INSTRUMENTS
 from synth.flow import mask_detection, track
 from synth.flow.estimator import create
 from synth.flow.stereo import rig
@@ -92,6 +92,9 @@ def write_scene(
     writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
     writer.put("time", scene.time)
     writer.put("force", scene.force)  # labels are in camera axes
+    if writer.wants("force_of"):
+        each = scene.motion.by_instrument @ scene.view.rotation.T
+        writer.put("force_of", np.pad(each, ((0, 0), (0, max(MOST_INSTRUMENTS - each.shape[1], 0)), (0, 0))))
     writer.put("tissue", scene.tissue)
     writer.put("area", scene.area)
     if renderer.right is not None:
@@ -260,6 +263,7 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
         "instruments": [
             {
                 "kind": gesture.kind,
+                "instrument": gesture.instrument,
                 "force_mn": (motion.by_instrument[:, k] @ scene.view.rotation.T).tolist(),
                 "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
                 "shaft": motion.shaft[:, 2 * k].tolist(),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from synth.job import schema
 from synth.job.mechanics import CLEAR_MM, InstrumentSection
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
+from synth.render import instrument
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
@@ -39,6 +41,9 @@ _STRETCH = 1.01, 1.03
 mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
+_END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
+_RINGS = 4  # every fourth ring of an instrument is compared with those of others
+_FRAMES = Job().frames  # of a sequence, where no job states them
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
@@ -80,9 +85,10 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     view = draw_view(job.render, generator(_VIEW))
     motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
     opening_mm = job.anatomy.craniotomy.radius_mm
-    visible_mm = visible_radius(place(view, job.render))
+    lens = place(view, job.render)
     rngs = generator(_GESTURE), generator(_FURTHER)
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, visible_mm)
+    shown = visible_radius(lens), lens.centre
+    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
     appearance = draw_appearance(job, family, generator(_APPEARANCE))
     return Scenario(index, family, relief, tissue, gestures, appearance, view, motion, pulse)
 
@@ -132,6 +138,8 @@ def draw_gestures(
     rng: Random,
     others: Random,
     visible_mm: float = np.inf,
+    lens: Floats = np.array([0.0, 0.0, 300.0]),
+    frames: int = _FRAMES,
 ) -> tuple[Gesture, ...]:
     """Draws the gestures of all instruments, each again until it fits next to the others.
 
@@ -145,6 +153,8 @@ def draw_gestures(
         rng: random numbers of this sequence's first gesture.
         others: of its further ones.
         visible_mm: radius around the opening's middle that the camera shows, see `draw_gesture`.
+        lens: (3,) mm, in world axes; no instrument is end-on before it.
+        frames: of the sequence.
 
     Raises:
         UserError: not all instruments fit into the opening, or not in their places.
@@ -153,14 +163,18 @@ def draw_gestures(
     count = max(int(others.integers(fewest, most + 1)), len(given))
     wanted = [*given, *[InstrumentSection()] * (count - len(given))]
     order = sorted(range(count), key=lambda k: wanted[k].place is None)
-    for _ in range(_ROUNDS if given else 1):  # all anew: the shaft of one may be in the way of the next
+    for _ in range(_ROUNDS):  # all anew: the shaft of one may be in the way of the next
         found: dict[int, Gesture] = {}
         for k in order:
             for _ in range(_TRIES):
-                trial = draw_gesture(fem, opening_mm, young_kpa, others if k else rng, wanted[k], visible_mm)
-                clear = max(opening_mm - CLEAR_MM, trial.footprint_mm) if given else opening_mm
+                own = others if k else rng
+                trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
+                longest = np.linalg.norm(trial.axes, axis=1).max()
+                clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
-                if fits and all(tool_gesture.clearance(trial, other) >= 0 for other in found.values()):
+                sight = lens / np.linalg.norm(lens)
+                hides = trial.shaft @ sight > np.cos(np.radians(_END_ON_DEG)) and trial.instrument != "none"
+                if fits and not hides and all(_apart(trial, other) for other in found.values()):
                     found[k] = trial
                     break
             else:
@@ -183,28 +197,39 @@ def draw_gesture(
     rng: Random,
     given: InstrumentSection = InstrumentSection(),
     visible_mm: float = np.inf,
+    frames: int = _FRAMES,
 ) -> Gesture:
     """Draws one gesture: contact uniformly in the opening, direction uniformly in its cone, unless `given`.
 
     Its contacts stay within the opening and within `visible_mm` of its middle, which the camera shows of a
     wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
-    drawn, wanted = str(rng.choice(fem.gestures)), fem.load_range(given)
-    kind = given.gesture or drawn
+    drawn, wanted, own = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
+    kinds = list(fem.choices(given))
+    kind = drawn if drawn in kinds else kinds[int(own.integers(len(kinds)))]
+    tools = fem.choices(given)[kind]
+    tool = str(own.choice(list(tools), p=list(tools.values())))
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
-    spread = footprint * _uniform(rng, (1.2, 1.8) if kind == "grasp" else (0.1, 0.9))
+    spread = footprint * _uniform(rng, (1.2, 1.8) if kind == "grasp" else (0.1, 0.4))
     path = _uniform(rng, (3, 8)) if kind == "slide" else 0.0
     azimuth = _uniform(rng, (0, 360))
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
-    point = _draw_point(opening_mm, visible_mm, footprint + 0.5 * half, rng, given)
+    long = tool_gesture.form(kind, tool)
+    reach = footprint * np.sqrt(max(long, 1 / long)) + 0.5 * half
+    point = _draw_point(opening_mm, visible_mm, reach, rng, given)
     along, direction = _draw_direction(fem, kind, rng, given)
+    if kind == "retract":  # the hand is on the side that tissue is drawn to, in a quarter of them opposite
+        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (own.random() < 0.25)
+        azimuth = float((turn + _uniform(own, (-30, 30))) % 360)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
-    timing = _draw_timing(kind, rng)
+    drawn_timing = _draw_timing(kind, rng, frames)
+    touch, full, fall, release = map(float, given.timing or drawn_timing)
     return Gesture(
         kind=kind,
+        instrument=tool,
         contacts=tuple(
             ToolContact((float(p[0]), float(p[1])), _vector(f))
             for p, f in zip(places, load * unit_mn * directions, strict=True)
@@ -219,9 +244,32 @@ def draw_gesture(
         elevation_deg=_uniform(rng, (35, 65)),
         spread_mm=spread,
         hover_mm=_uniform(rng, (6, 12)),
-        taps=int(rng.integers(2, 4)) if kind == "tap" else 1,
-        timing=given.timing or timing,
+        taps=min(int(rng.integers(2, 4)), max((frames - 1) // 3, 1)) if kind == "tap" else 1,
+        timing=(touch, full, fall, release),
     )
+
+
+def _apart(one: Gesture, other: Gesture) -> bool:
+    """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
+    if tool_gesture.clearance(one, other) < 0:
+        return False
+    (here, wide), (there, broad) = _rings(one), _rings(other)
+    gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
+    return float(gap.min(initial=np.inf)) >= _APART_MM
+
+
+@lru_cache(maxsize=64)
+def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
+    """Middles (N, 3) mm and radii (N,) mm of the instrument's rings before, at the start and at the end."""
+    parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
+    found = [np.zeros((0, 3))]
+    for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
+        place = gesture.point_mm + slid * np.asarray(gesture.path_mm)
+        tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + away * gesture.shaft
+        found += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
+    rings = np.concatenate(found).reshape(-1, instrument.RING, 3)[::_RINGS]
+    middles = rings.mean(axis=1)
+    return middles, np.linalg.norm(rings - middles[:, None], axis=2).max(axis=1)
 
 
 def _draw_point(
@@ -255,13 +303,18 @@ def _draw_direction(
     return along, np.append(np.sqrt(1 - rise**2) * along, up)
 
 
-def _draw_timing(kind: str, rng: Random) -> tuple[float, float, float, float]:
+def _draw_timing(kind: str, rng: Random, frames: int) -> tuple[float, float, float, float]:
     """Times of touch, full load, start of its fall, and release, as parts of the sequence."""
     touch = _uniform(rng, (0.08, 0.15))
     full = touch + _uniform(rng, (0.1, 0.2) if kind == "tap" else _RAMP)
     release = _uniform(rng, (0.85, 0.92))
     hold = _uniform(rng, (0.5, 0.7) if kind in ("retract", "slide") else (0.15, 0.5))
-    return touch, full, full + hold * (release - full), release
+    fall = full + hold * (release - full)
+    if frames > 3:  # the first frame after that at rest has no contact, the next may have the whole load
+        touch = max(touch, 1.01 / (frames - 1))
+        full = max(full, touch + 0.05)
+        fall = max(fall, full, min(2 / (frames - 1), release - 0.05))
+    return touch, full, fall, release
 
 
 def draw_view(render: RenderSection, rng: Random) -> CameraView:
@@ -296,11 +349,11 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     drawn["bump"] *= 1 + 3 * square
     drawn["roughness"] += 0.12 * square
     drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
+    rng.uniform()  # unused; the draws below stay those of earlier versions
     appearance = Appearance(
         family=family,
         **drawn,
         fluid_index=1.33 + 0.47 * square,
-        cottonoid=bool(rng.uniform() < job.appearance.cottonoid),
         scenery=(),
         rim_seed=int(rng.integers(2**31)),
         light=lighting,

@@ -202,14 +202,13 @@ class Scene(RestScene):
 
 def draw_craniotomy(rest: RestScene) -> SceneContent:
     """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
-    kinds = [gesture.kind for gesture in rest.scenario.gestures]
-    return craniotomy(rest.surface, rest.scenario.appearance, rest.view, rest.job, kinds)
+    drawn = [(gesture.instrument, gesture.footprint_mm) for gesture in rest.scenario.gestures]
+    return craniotomy(rest.surface, rest.scenario.appearance, rest.view, rest.job, drawn)
 
 
 def at_rest(
     job: Job,
     index: int = 0,
-    gestures: Sequence[str] | None = None,
     *,
     case: Scenario | None = None,
     content: Callable[[RestScene], SceneContent] | None = None,
@@ -221,7 +220,6 @@ def at_rest(
     Args:
         job: the job.
         index: number of the sequence.
-        gestures: kinds of gesture whose instruments are shown instead of the drawn ones.
         case: a scenario to use instead of the drawn one.
         content: what is drawn around the surface and of it; `draw_craniotomy` if None.
 
@@ -229,8 +227,6 @@ def at_rest(
         UserError: the job's surface or calibration cannot be used.
     """
     case = case or scenario.draw_scenario(job, index)
-    if gestures is not None and case.gestures:
-        case = replace(case, gestures=tuple(replace(case.gestures[0], kind=kind) for kind in gestures))
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:
         case = replace(case, view=camera.calibrated(case.view, view))

@@ -18,7 +18,6 @@ from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render.anatomy import noise, scenery, tube
 from synth.render.anatomy.chart import places
 from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, through
-from synth.render.anatomy.scenery import Patty
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.anatomy.texture import normals, thickness
 from synth.render.appearance.family import Appearance
@@ -92,7 +91,7 @@ class Rim:
     uv: Map  # (V, 2)
     extent_mm: float  # side of the square that uv spans
     edge: Floats  # (A,) mm: radius of the opening's edge at even angles
-    cotton: tuple[Patty, ...]  # drawn in the texture; one in its unused middle is the felt over the edge
+    cotton: bool  # whether the texture's unused middle has the felt of patties over the edge
     stitches: Floats  # (n,) rad: angles of threads that hold the dura
     dura: Floats  # (A,) mm beyond the edge: end of the folded dura, start of the gutter
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
@@ -121,7 +120,6 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     folds = 0.2 * noise.band(rng, 256, extent, 6.5, 0.5) + 0.05 * noise.band(rng, 256, extent, 1.8, 0.5)
     z = _under(surface, flat).reshape(away.shape) + up
     z += np.clip(away - 0.1, 0, 3.0) / 3.0 * sampled(folds)
-    patty = scenery.drawn_patty(rng, edge) if appearance.cottonoid else None
     stitches = scenery.stitches(edge, rng)
     if appearance.family == "calf":  # the dura of a specimen is not sewn back
         stitches = stitches[:0]
@@ -141,16 +139,13 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     z += beyond * (Wound.floor - CutEdge.fold[1] + risen + lumpy)
     if len(cloth):
         z += step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
-    if patty:  # cotton bridges folds
-        z += step((0.3 - patty.placed(xy[..., 0], xy[..., 1])[2]) / 0.6) * scenery.PATTY_UP_MM
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     painted = edge[:, None] + np.concatenate([CutEdge.painted, away[0, len(CutEdge.painted) :]])[None]
     faces = grid_faces(around, away.shape[1], "rows").reshape(-1, 3)
     parts = [(vertices, faces, _places(angle, painted).reshape(-1, 2))]
-    cotton: tuple[Patty, ...] = () if patty is None else (patty,)
-    if "cottonoid" in appearance.scenery:
+    cotton = "cottonoid" in appearance.scenery
+    if cotton:
         # Their felt is painted in the middle of the maps, which the opening leaves free.
-        cotton += (Patty((0.0, 0.0), 0.0, scenery.PATTY_MM),)
         parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
     uv = (np.concatenate([place for *_, place in parts]) / extent + 0.5).astype(np.float32)
     mesh = joined(*(Shape(vertices, faces) for vertices, faces, _ in parts))
@@ -265,8 +260,8 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         cloth = away - _round(rim.cloth, angle)
         colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
     colour, bumps = scenery.threaded(rim.stitches, angle, away, float(rim.edge.mean()), colour, bumps)
-    for patty in rim.cotton:
-        colour, bumps = scenery.with_patty(patty, x, y, cotton, appearance.blood, colour, bumps)
+    if rim.cotton:
+        colour, bumps = scenery.with_felt(x, y, cotton, appearance.blood, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 

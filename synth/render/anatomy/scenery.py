@@ -20,8 +20,6 @@ from synth.render.anatomy.tree import Tree
 
 PATTY_MM = (5.0, 2.3)
 """Half length and half width of the patties over the opening's edge."""
-PATTY_UP_MM = 0.55 + 0.3
-"""Height of a patty on the rim: cotton, and the folds under it."""
 _PATTY_GRID = (34, 18)
 _COTTON_MM = 0.45
 _BLADE_RINGS, _BLADE_AROUND = 60, 24
@@ -43,23 +41,6 @@ class Suture:
     albedo: Rgb = (0.025, 0.025, 0.035)
     half_mm: float = 0.075
     raised_mm: float = 0.08
-
-
-@dataclass(frozen=True)
-class Patty:
-    """A strip of cotton on the rim."""
-
-    middle: tuple[float, float]  # world x, y [mm]
-    turn: float  # direction of its long side [rad]
-    half: tuple[float, float]  # half its length and width [mm]
-
-    def placed(self, x: Floats | Map, y: Floats | Map) -> tuple[Floats, Floats, Map]:
-        """Points x, y in its own axes: along, across, and distance from its outline, negative inside [mm]."""
-        c, s = np.cos(self.turn), np.sin(self.turn)
-        dx, dy = x - self.middle[0], y - self.middle[1]
-        along, across = c * dx + s * dy, c * dy - s * dx
-        far = np.maximum(np.abs(along) - self.half[0], np.abs(across) - self.half[1])
-        return along, across, np.asarray(far, np.float32)
 
 
 def stitches(edge: Floats, rng: np.random.Generator) -> Floats:
@@ -128,26 +109,15 @@ def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
     return Tree(np.stack(nodes), np.asarray(parent, np.int64), np.asarray(radius))
 
 
-def drawn_patty(rng: np.random.Generator, edge: Floats) -> Patty:
-    """A patty on the rim, along the opening's edge (A,) mm."""
-    around = float(rng.uniform(0, 2 * np.pi))
-    half = (float(rng.uniform(4.0, 8.0)), float(rng.uniform(2.0, 3.2)))
-    radius = edge_at(edge, around) + half[1] + float(rng.uniform(0.5, 2.0))
-    turn = around + np.pi / 2 + float(rng.uniform(-0.35, 0.35))
-    return Patty((radius * float(np.cos(around)), radius * float(np.sin(around))), turn, half)
-
-
-def with_patty(
-    patty: Patty, x: Map, y: Map, drawn: Sequence[Map], blood: float, colour: Map, bumps: Map
-) -> tuple[Map, Map]:
-    """Colour (r, n, 3) and bumps mm at x, y mm with a patty, by noise `drawn` (r, n), soaked at its edges."""
+def with_felt(x: Map, y: Map, drawn: Sequence[Map], blood: float, colour: Map, bumps: Map) -> tuple[Map, Map]:
+    """Colour (r, n, 3) and bumps mm at x, y mm with the felt of the patties in the middle, by noise `drawn`
+    (r, n), soaked at its edges."""
     ragged, weave, stains = drawn
-    along, across, far = patty.placed(x, y)
-    far = far + 0.12 * ragged
+    far = np.maximum(np.abs(x) - PATTY_MM[0], np.abs(y) - PATTY_MM[1]) + 0.12 * ragged
     cover = step(0.5 - far / 0.25)[..., None]
     soaked = blood * np.clip(1.2 + far / 1.2 + 0.5 * stains, 0, 1.5)
     felt = through(speckled(Cotton.felt, 0.06 * weave), soaked, Cotton.blood)
-    thread = (np.exp(-((across / 0.25) ** 4)) * (along > -patty.half[0] + 1))[..., None]
+    thread = (np.exp(-((y / 0.25) ** 4)) * (x > -PATTY_MM[0] + 1))[..., None]
     felt = felt * (1 - 0.8 * thread) + np.array(Cotton.thread, np.float32) * 0.8 * thread
     near = np.exp(-np.maximum(far, 0) / 0.5)[..., None]
     shaded = colour * (1 - 0.4 * near * (1 - cover))

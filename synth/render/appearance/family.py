@@ -34,7 +34,6 @@ class Appearance:
     blood: float  # on the rim, from none (0) to soaked (1)
     dura_albedo: Colour
     surroundings_albedo: Colour  # outside the dura: muscle, or the bone of a specimen
-    cottonoid: bool  # whether a cotton patty lies on the rim
     scenery: tuple[str, ...]  # shown parts of the job's `render.scenery`
     rim_seed: int
     light: Lighting

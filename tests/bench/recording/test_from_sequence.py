@@ -41,6 +41,18 @@ def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path
     assert np.array_equal(mask, sequence["tool"][2])
 
 
+def test_the_force_of_one_instrument(tmp_path: Path) -> None:
+    job = Job(frames=4, render={"size": SIZE[::-1]}, flow={"backend": "ideal"})
+    fake_work.consistent(job, 0, tmp_path, lambda *_: None)
+    sequence = open_sequence(tmp_path / "000000.zarr")
+    recording = open_recording(export_recording(sequence, tmp_path / "one", instrument=1))
+    assert recording.force is not None
+    assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
+    done = run(app, "from-dataset", tmp_path, "-o", tmp_path / "two", "--instrument", "2", code=2)
+    assert "instrument 2" in done.output
+    assert not (tmp_path / "two").exists()
+
+
 def test_the_first_sequence_that_no_model_was_trained_on(tmp_path: Path) -> None:
     for index in range(3):
         phantom.write(tmp_path / "data", index, anatomy_seed=7, frames=3)

@@ -1,6 +1,8 @@
 """Instruments given by the job, several at once: labels that add up, forces in place of loads."""
 
-from typing import Any
+import re
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -8,10 +10,12 @@ from dome import OPENING_MM, block, patch
 from pydantic import ValidationError
 
 import synth
+from synth.errors import UserError
 from synth.fem import solver, tool_gesture
 from synth.fem.material import Tissue
 from synth.fem.surface_embedding import vertex_area
-from synth.job import schema
+from synth.job import mechanics, reader, schema
+from synth.render.camera import camera
 from synth.sequence import scenario
 
 PUSH = {
@@ -49,7 +53,13 @@ def test_given_values_are_used_and_the_others_drawn() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"place": [11, 0]}, {"gesture": "slide", "direction": [0, 0, -1]}, {"load": 0.1, "force_mn": 1}],
+    [
+        {"place": [11, 0]},
+        {"gesture": "slide", "direction": [0, 0, -1]},
+        {"load": 0.1, "force_mn": 1},
+        {"timing": [0.2, "0.6 s", "1 s", "1.6 s"]},
+        {"timing": [0.2, 0.6, 1.2, 1.6]},
+    ],
 )
 def test_contradictions_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match="instrument_list"):
@@ -68,10 +78,10 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     moved = surface.vertices + motion.displacement
     for k, gesture in enumerate(gestures):
         centre = np.asarray(gesture.contacts[0].point_mm)
-        mine = np.linalg.norm(surface.vertices[:, :2] - centre, axis=1) < 1.1 * gesture.footprint_mm
+        long, other = (np.linalg.norm(one.axes, axis=1).max() for one in (gesture, gestures[1 - k]))
+        mine = np.linalg.norm(surface.vertices[:, :2] - centre, axis=1) < 1.1 * long
         theirs = (
-            np.linalg.norm(surface.vertices[:, :2] - gestures[1 - k].contacts[0].point_mm, axis=1)
-            < gestures[1 - k].footprint_mm
+            np.linalg.norm(surface.vertices[:, :2] - gestures[1 - k].contacts[0].point_mm, axis=1) < other
         )
         if not (mine & theirs).any():
             part = np.einsum("v,tvd->td", area[mine], motion.traction[:, mine])
@@ -95,3 +105,86 @@ def test_a_force_replaces_the_load() -> None:
         assert 3.0 <= force <= 5.0
         assert force == pytest.approx(gesture.load * tissue.young_kpa * gesture.footprint_mm**2)
     assert schema.FemSection(force_mn=0.2).chosen_law[0] == "linear"
+
+
+def test_the_page_has_the_table_of_instruments() -> None:
+    page = (Path(__file__).parents[3] / "docs/howto/instruments.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
+    shown = {
+        gesture: [*re.findall(r"`(\w+)` \d+%", usual), *re.findall(r"`(\w+)`", others)]
+        for gesture, usual, others in rows
+    }
+    assert shown == {kind: list(takes) for kind, takes in mechanics.INSTRUMENTS.items()}
+    shares = [int(share) for _, usual, _ in rows for share in re.findall(r"(\d+)%", usual)]
+    assert shares == [
+        round(100 * share) for takes in mechanics.INSTRUMENTS.values() for share in takes.values() if share
+    ]
+
+
+def test_gestures_and_instruments_are_drawn_together() -> None:
+    for kind, takes in mechanics.INSTRUMENTS.items():
+        for tool in get_args(mechanics.Instrument):
+            one = {"gesture": kind, "instrument": tool}
+            if tool in takes or tool == "none":
+                (gesture,) = scenario.draw_scenario(job(one), 0).gestures
+                assert (gesture.kind, gesture.instrument) == (kind, tool)
+            else:
+                with pytest.raises(ValidationError, match=f"a {kind} takes {' or '.join(takes)}"):
+                    job(one)
+    blades = job(instrument="spatula")
+    assert blades.fem.gestures == ("push", "slide", "retract")
+    drawn = [scenario.draw_scenario(blades, k).gestures[0] for k in range(20)]
+    assert {one.kind for one in drawn} == {"push", "slide", "retract"}
+    assert {one.instrument for one in drawn} == {"spatula"}
+    with pytest.raises(ValidationError, match="a pull takes forceps"):
+        job(instrument="spatula", gestures=["pull", "push"])
+
+
+@pytest.mark.parametrize("tool", ["forceps", "spatula", "suction", "probe"])
+def test_footprints_hold_their_force_and_have_their_form(tool: str) -> None:
+    kind = "pull" if tool == "forceps" else "push"
+    drawn = scenario.draw_scenario(job({"gesture": kind, "instrument": tool, "place": [0, 0]}), 0).gestures[0]
+    surface = patch(241)
+    area = vertex_area(*surface)
+    flat = np.column_stack([surface.vertices[:, :2], 0 * area])
+    pressure = tool_gesture.footprint(np.zeros(2), drawn.axes, flat, area, tool == "suction")
+    assert pressure @ area == pytest.approx(1.0, abs=1e-12)
+    # The same P has the same largest pressure, whatever the form.
+    assert pressure.max() == pytest.approx(3 / np.pi / drawn.footprint_mm**2, rel=0.02)
+    spread = np.linalg.eigh(np.einsum("v,vi,vj->ij", pressure * area, flat[:, :2], flat[:, :2]))
+    ratio = np.sqrt(spread.eigenvalues[1] / spread.eigenvalues[0])
+    assert ratio == pytest.approx({"forceps": 2.0, "spatula": 2.0}.get(tool, 1.0), rel=0.02)
+    along = abs(spread.eigenvectors[:, 1] @ drawn.shaft[:2]) / np.linalg.norm(drawn.shaft[:2])
+    assert {"forceps": along > 0.99, "spatula": along < 0.1}.get(tool, True)
+    middle = pressure[np.linalg.norm(flat, axis=1) < 0.1 * drawn.footprint_mm].max()
+    assert middle < 1e-9 if tool == "suction" else middle > 0.9 * pressure.max()
+
+
+def test_instruments_are_apart_and_none_points_at_the_lens() -> None:
+    many = synth.Job.model_validate({"sequences": 4, "fem": {"instruments": 3}, "render": {"tilt_deg": 40}})
+    for case in (scenario.draw_scenario(many, k) for k in range(4)):
+        lens = camera.place(case.view, many.render).centre
+        bars = [scenario._rings(gesture) for gesture in case.gestures]
+        for k, gesture in enumerate(case.gestures):
+            sight = lens - np.append(gesture.point_mm, 0)
+            assert gesture.shaft @ sight < np.cos(np.radians(25)) * np.linalg.norm(sight)
+            for other, wide in bars[:k]:
+                gap = np.linalg.norm(bars[k][0][:, None] - other, axis=2) - bars[k][1][:, None] - wide
+                assert gap.min() >= 3
+
+
+def test_times_are_parts_of_the_sequence_and_must_lie_in_it() -> None:
+    for given in (["100 ms", "200ms", "400 ms", "600 ms"], ["0.1 s", "0.2s", "0.4 s", " .6 s"]):
+        (gesture,) = scenario.draw_scenario(job({"timing": given}), 0).gestures
+        assert gesture.timing == pytest.approx(np.array([0.1, 0.2, 0.4, 0.6]) / (23 / 25))
+    with pytest.raises(UserError, match=r"1200 ms.*920 ms"):
+        reader.parse_job("fem: {instrument_list: [{timing: [1 ms, 2 ms, 3 ms, 1200 ms]}]}", "", Path())
+
+
+@pytest.mark.parametrize("frames", range(3, 25))
+def test_frames_before_the_contact_and_in_it(frames: int) -> None:
+    for index in range(24):
+        case = scenario.draw_scenario(synth.Job(frames=frames, sequences=24), index)
+        load = tool_gesture.trajectory(case.gestures[0], frames).load
+        assert load[: 1 + (frames > 3)].max() == 0
+        assert load.max() > 0.5

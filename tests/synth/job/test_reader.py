@@ -57,7 +57,9 @@ def test_overrides_take_precedence_and_are_named_if_wrong() -> None:
 
 
 def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
-    job = Job(seed=3, fem={"load": 0.05}, appearance={"families": ["pale", "calf"]}, render={"tool": False})
+    timed = {"timing": ["0.1 s", "0.2 s", "0.3 s", "0.4 s"]}
+    fem = {"load": 0.05, "instrument": "spatula", "instrument_list": [timed]}
+    job = Job(seed=3, fem=fem, appearance={"families": ["pale", "calf"]})
     assert reader.parse_job(writer.commented(job), "job.yaml", Path()) == job
     assert reader.parse_job(writer.dump_job(job), "job.yaml", Path()) == job
 

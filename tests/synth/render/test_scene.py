@@ -28,7 +28,7 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 
 
 def made(
-    variant: str, spp: int = 4, extra: tuple[str, ...] = (), **render: object
+    variant: str, spp: int = 4, extra: tuple[str, ...] = (), tool: bool = True, **render: object
 ) -> tuple[Renderer, np.ndarray]:
     settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
     job = Job(
@@ -40,7 +40,7 @@ def made(
     appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
     appearance = replace(appearance, scenery=job.render.scenery)
     lens = camera.place(view, job.render)
-    content = craniotomy(surface, appearance, lens, job, ["pull"])
+    content = craniotomy(surface, appearance, lens, job, [("forceps" if tool else "none", 4.0)])
     return Renderer(content, lens, appearance.sensor, job.render, extra), surface.vertices
 
 

@@ -1,7 +1,5 @@
 """Shapes: the chart of the surface, trees of vessels, instruments."""
 
-from typing import get_args
-
 import numpy as np
 import pytest
 import trimesh
@@ -94,9 +92,10 @@ SHAFTS = np.array([[0.3, 0.2, 0.9], [0.3, 0.2, 0.9]])
 DARK = Theatre(np.zeros((2, 2, 3), np.float32), 30.0, (), np.zeros(3), np.array([0, 0, 300.0]), seed=0)
 
 
-@pytest.mark.parametrize("kind", get_args(instrument.Kind))
-def test_an_instrument_ends_at_its_tips(kind: instrument.Kind) -> None:
-    made = instrument.build([kind], DARK, np.random.default_rng(0))
+@pytest.mark.parametrize("kind", instrument.SHAPES)
+def test_an_instrument_ends_at_its_tips(kind: str) -> None:
+    made = instrument.build([(kind, 2.5)], DARK, np.random.default_rng(0))
+    assert made is not None
     points, _ = made.pose(TIPS, SHAFTS)
     assert np.isfinite(points).all()
     assert made.faces.max() == len(points) - 1
