@@ -120,7 +120,7 @@ def schema(
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
     job: Annotated[
-        str, Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK).")
+        str, Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK, VTP).")
     ],
     overrides: Overrides = None,
     out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
@@ -133,7 +133,6 @@ def preview(
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
     from synth.dataset.size_forecast import amount, estimate
-    from synth.geometry.brain_surface import KINDS
     from synth.job import reader
     from synth.publish import contact_sheet, openings
     from synth.system.checked_file import write_picture
@@ -141,7 +140,7 @@ def preview(
 
     if out.suffix.lower() != ".png" or not out.parent.is_dir():
         raise UserError(f"{out}: cannot be written as PNG")
-    if Path(job).suffix.lower().removeprefix(".") in KINDS:
+    if Path(job).is_file() and Path(job).suffix.lower() not in ("", ".yaml", ".yml", ".json"):
         fill_holes = reader.load_job("demo", overrides or []).anatomy.fill_holes
         chosen = openings.find_openings(Path(job), radius, count, fill_holes)
         write_picture(out, openings.draw_openings(Path(job), chosen, radius, fill_holes))

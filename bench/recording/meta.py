@@ -144,8 +144,8 @@ class Stereo(Section):
     """The right camera's `right.mp4` or `right/`."""
 
     calibration: Path
-    """Stereo calibration as OpenCV writes it (K1, D1, K2, D2, R, T), in the recording's folder; for pictures
-    of the recording's size."""
+    """Stereo calibration of OpenCV (K1, D1, K2, D2, R, T), Kalibr or others, in the recording's folder; for
+    pictures of the recording's size, or rescaled to it if it states its own."""
     mm_per_unit: Positive = 1.0
     """Millimetres per unit of T, e.g. the side of a chessboard's square."""
 

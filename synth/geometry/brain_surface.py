@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 import io
+import re
+import struct
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, first_line
 from synth.geometry.triangles import Shape, side_areas
-from synth.geometry.vtk import read_vtk
+from synth.geometry.vtk import read_vtk, read_vtp
 from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
-KINDS = ("obj", "stl", "ply", "off", "vtk")  # suffixes of the files that can be read
+_KINDS = ("obj", "stl", "ply", "off", "vtk", "vtp")  # suffixes of the files that can be read
 
+_BRAIN_MM = 20.0, 400.0  # greatest extent: of a small phantom, of more than a head
+_UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
+_CLICKED_MM = 0.03  # a point read in a viewer is that close to the surface, or closer than its mirrors
+_STEEPEST = 0.5  # cosine of the angle between an opening's direction and the normal of the surface in it
+_STATED = re.compile(
+    rb"SPACE(?:=|\s+1\s+1\s+string\s+)([RL][AP][SI])\b"
+)  # in a header or comment of 3D Slicer's
 _OPEN = 0.25  # missing share of a surface's area above which it counts as open: a hemisphere lacks a half
 
 
@@ -28,7 +39,9 @@ class Brain:
     """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
 
     shape: Shape
-    to_world: Floats  # (4, 4) rigid, mm: a point p of the file is to_world @ (p, 1) in world axes
+    to_world: (
+        Floats  # (4, 4) rigid, mm: a point p of the file (RAS if it states its space) is to_world @ (p, 1)
+    )
     attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
 
 
@@ -38,7 +51,7 @@ def load_brain(
     attachments: Sequence[AttachmentSection] = (),
     fill_holes: bool = False,
 ) -> Brain:
-    """Reads a surface (OBJ, STL, PLY, OFF or legacy VTK, mm), merges its vertices, and places it.
+    """Reads a surface (OBJ, STL, PLY, OFF, VTK or VTP, mm), merges its vertices, and places it.
 
     `craniotomy` and `attachments` are in the file's axes; `fill_holes` as in `read_brain`. UserError: the
     file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
@@ -51,11 +64,7 @@ def load_brain(
     placed = (vertices - origin) @ turn.T
     heights = _heights(placed, faces)
     heights = heights[np.abs(heights) <= craniotomy.radius_mm]
-    if len(heights) == 0:
-        raise UserError(
-            f"anatomy.craniotomy: {path.name} has no surface within {craniotomy.radius_mm:g} mm of the "
-            f"point, looking along the direction; `synth preview {path.name}` finds places that work"
-        )
+    _check_place(path, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
     held = tuple(
@@ -73,18 +82,30 @@ def load_brain(
 
 
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
-    """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3).
+    """A surface in the file's axes, merged: vertices (V, 3) mm and faces (F, 3). A stated space becomes RAS.
 
     `fill_holes`: every hole is closed by a fan of triangles, so that each edge has two faces. UserError: the
-    file can't be read, encloses no volume, or a hole can't be filled.
+    file can't be read, isn't in mm, encloses no volume, or a hole can't be filled.
     """
     vertices, faces = _read(path)
     if not np.isfinite(vertices).all():
         raise UserError(f"anatomy.mesh: {path.name} has coordinates that are not finite")
+    if not len(faces):
+        raise UserError(f"anatomy.mesh: {path.name} contains no triangles or polygons")
+    span = np.ptp(vertices, axis=0)
+    if not _BRAIN_MM[0] <= span.max() <= _BRAIN_MM[1]:
+        unit, factor = min(_UNITS_MM.items(), key=lambda one: abs(np.log(one[1] * span.max() / 150)))
+        likely = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
+        hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if likely else "convert it to mm"
+        raise UserError(f"anatomy.mesh: {path.name} is {span.max():.3g} mm long, a brain 100 to 200; {hint}")
+    faces = _oriented(vertices, faces)
     if fill_holes:
         faces = _filled(vertices, faces, path.name)
-    span = np.ptp(vertices, axis=0) if len(vertices) else np.zeros(3)
-    if len(faces) < 4 or span.min() < 1e-3 * span.max() or _volume(vertices, faces) < 1e-3 * span.prod():
+    if (
+        len(faces) < 4
+        or span.min() < 1e-3 * span.max()
+        or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod()
+    ):
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
     if (open_share := _open_share(vertices, faces)) > _OPEN:
@@ -95,6 +116,43 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
             stacklevel=1,  # so that it is printed only once
         )
     return vertices, faces
+
+
+def _check_place(path: Path, corners: Floats, point: Floats, out: Floats, radius_mm: float) -> None:
+    """Raises UserError for an opening off the surface, in other axes, or that doesn't face outwards.
+
+    `corners`: (F, 3, 3) of the faces; `radius_mm`: 0 if nothing is met along the direction.
+    """
+    from trimesh.triangles import closest_point
+
+    def nearest(at: Floats) -> tuple[float, Floats]:
+        found = np.asarray(closest_point(corners, np.broadcast_to(at, (len(corners), 3))))
+        away = np.linalg.norm(found - at, axis=1)
+        return float(away.min()), found[away.argmin()]
+
+    def text(vector: Floats) -> str:
+        return "[" + ", ".join(f"{x:.2f}" for x in vector) + "]"
+
+    (gap, foot), turned = nearest(point), []
+    for what, sign in (("x and y", [-1, -1, 1]), ("x", [-1, 1, 1]), ("y", [1, -1, 1]), ("z", [1, 1, -1])):
+        turned.append((nearest(point * sign)[0], f"; with {what} negated, {text(point * sign)}, it is "))
+    left, hint = min(turned)
+    if gap > radius_mm or gap > _CLICKED_MM + 3 * left:
+        hint = f"{hint}{left:.2g} mm off (other axes?)" if left < max(1.0, gap) / 3 else ""
+        raise UserError(
+            f"anatomy.craniotomy.point: {text(point)} is {gap:.2g} mm off the surface of {path.name}{hint}. "
+            f"The nearest point is {text(foot)}; `synth preview {path.name}` finds places"
+        )
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    middle = corners.mean(axis=1)
+    near = normals[np.linalg.norm(middle - foot, axis=1) <= radius_mm].sum(axis=0)
+    near *= np.sign(((middle - middle.mean(axis=0)) * normals).sum())  # all may face inwards
+    if near.any() and out @ near < _STEEPEST * np.linalg.norm(near):
+        where = "into the tissue" if out @ near < 0 else "along the surface"
+        raise UserError(
+            f"anatomy.craniotomy.direction: {text(out)} points {where} of {path.name} at "
+            f"{text(point)}; outwards is {text(near / np.linalg.norm(near))} (are both in the same axes?)"
+        )
 
 
 def axes(out: Floats) -> Floats:
@@ -116,25 +174,72 @@ def _heights(vertices: Floats, faces: Ints) -> Floats:
 
 def _read(path: Path) -> tuple[Floats, Ints]:
     kind = path.suffix.lower().removeprefix(".")
-    if kind not in KINDS:
-        raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(KINDS)}")
+    if kind not in _KINDS:
+        hint = "3D Slicer converts most others, mris_convert those of FreeSurfer and GIFTI"
+        raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(_KINDS)}; {hint}")
     try:
         data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
     except UserError as error:
         raise UserError(f"anatomy.mesh: {error}") from None
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
+    stated = _STATED.search(data[:4096])
+    space = stated[1].decode() if stated else ""
     try:
         if kind == "vtk":
-            return _merged(*read_vtk(data))
-        # From bytes, trimesh can't open further files that are named in this one.
-        mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False)
+            vertices, faces = read_vtk(data)
+        elif kind == "vtp":
+            vertices, faces, space = read_vtp(data)
+        else:
+            # From bytes, trimesh can't open further files that are named in this one.
+            held = io.BytesIO(_whole(data) if kind == "stl" else data)
+            mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
+            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # readers of formats raise anything
         why = first_line(error)
         raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({why})") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise UserError(f"anatomy.mesh: {path.name} contains no surface")
-    return _merged(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    if space not in ("", "RAS"):
+        vertices = vertices * [1 if c in "RAS" else -1 for c in space]
+        warnings.warn(
+            f"anatomy.mesh: {path.name} states the space {space}: points and directions are in RAS, as 3D "
+            "Slicer shows them",
+            Caution,
+            stacklevel=1,
+        )
+    return _merged(vertices, faces)
+
+
+def _whole(data: bytes) -> bytes:
+    """An STL with the number of faces that its size gives. ValueError if its header counts others."""
+    if len(data) < 84 or (data[:5].lower() == b"solid" and b"facet" in data[:1000].lower()):
+        return data
+    count, held = struct.unpack_from("<I", data, 80)[0], (len(data) - 84) // 50
+    if count not in (0, held):
+        raise ValueError(f"its header counts {count} faces, its size {held}")
+    return data[:80] + struct.pack("<I", held) + data[84 : 84 + 50 * held]
+
+
+def _oriented(vertices: Floats, faces: Ints) -> Ints:
+    """The faces; if neighbours are oriented differently or bodies cancel, turned until all face outwards."""
+    import trimesh
+
+    mesh, count = trimesh.Trimesh(vertices, faces, process=False), len(faces)
+    one, other = mesh.face_adjacency.T
+    start, end = mesh.face_adjacency_edges[:, :, None].swapaxes(0, 1)
+    runs = [((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (one, other)]
+    alike = runs[0] != runs[1]  # neighbours pass along their edge in opposite directions
+    # Faces as they are and, from `count`, turned: each is linked to what its neighbours then are.
+    links = (
+        np.concatenate([one, one + count]),
+        np.concatenate([other + count * ~alike, other + count * alike]),
+    )
+    graph = coo_array((np.ones(2 * len(one)), links), shape=(2 * count, 2 * count))
+    label = connected_components(graph, directed=False)[1].reshape(2, count)
+    turned, body = label[0] > label[1], label.min(axis=0)
+    volumes = np.bincount(body, np.where(turned, -1, 1) * _volumes(vertices, faces))
+    if turned.any() or abs(volumes.sum()) < 0.1 * np.abs(volumes).sum():
+        faces = np.where((turned ^ (volumes[body] < 0))[:, None], faces[:, ::-1], faces)
+    return faces
 
 
 def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
@@ -170,7 +275,7 @@ def _open_share(vertices: Floats, faces: Ints) -> float:
     return float(np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum())
 
 
-def _volume(vertices: Floats, faces: Ints) -> float:
-    """Volume by the divergence theorem about the centroid; approximate if there are holes."""
+def _volumes(vertices: Floats, faces: Ints) -> Floats:
+    """Signed volumes between faces and centroid (F,) mm^3; their sum is the volume if there are no holes."""
     corner = (vertices - vertices.mean(axis=0))[faces]
-    return float(abs(np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6))
+    return np.asarray(np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6)

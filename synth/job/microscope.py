@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from synth.errors import UserError
 from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Section, Share, Weights
-from synth.system import checked_file
+from synth.system import camera_file
 
 
 class LightSection(Section):
@@ -77,9 +75,9 @@ class RenderSection(Section):
     distortion: Distortion = (-0.05, 0.01, 0.0, 0.0, 0.0)
     """Brown-Conrady k1, k2, p1, p2, k3."""
     calibration: Path | None = None
-    """Camera calibration written by OpenCV (YAML, XML, JSON), relative to the job file; it replaces field_mm
-    and distortion, and sets the principal point. One of a pair (K1, D1, K2, D2, R, T in mm of
-    `stereoCalibrate`) gives a stereo dataset with that right camera, and replaces stereo_mm."""
+    """Camera calibration of OpenCV, ROS or Kalibr (YAML, XML, JSON, INI), relative to the job file; it
+    replaces field_mm and distortion, and sets the principal point. One of a pair (K1, D1, K2, D2, R, T in mm
+    of `stereoCalibrate`) gives a stereo dataset with that right camera, and replaces stereo_mm."""
     drift_mm: Range[NonNegative] = (0.0, 0.0)
     """Slow drift of the microscope over some seconds [mm]; it is part of the flow."""
     stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
@@ -93,7 +91,7 @@ class RenderSection(Section):
     def _calibration_replaces_keys(self) -> RenderSection:
         if self.calibration is None:
             return self
-        found = round(baseline_mm(self.calibration), 9)
+        found = round(camera_file.find_baseline_mm(self.calibration), 9)
         fixed: dict[str, float | None] = {"field_mm": None, "distortion": None}
         if found:
             fixed["stereo_mm"] = found
@@ -103,15 +101,3 @@ class RenderSection(Section):
         if found:
             object.__setattr__(self, "stereo_mm", found)
         return self
-
-
-def baseline_mm(calibration: Path) -> float:
-    """Distance of the two cameras of a stereo calibration; 0 for another file, or one that can't be read."""
-    try:
-        held = checked_file.read_storage(calibration)
-    except UserError:
-        return 0.0  # reported by those that read the cameras
-    shift = held.get("T")
-    if "R" not in held or not isinstance(shift, np.ndarray) or not any(name.endswith("2") for name in held):
-        return 0.0
-    return float(np.linalg.norm(shift))

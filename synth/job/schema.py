@@ -34,7 +34,8 @@ class CraniotomySection(Section):
     """Where the skull is open."""
 
     point: Vector | None = None
-    """A point on (or near) the brain surface, in the mesh's own axes [mm]. Needed with `anatomy.mesh`."""
+    """A point on the brain surface, in the mesh's own axes [mm]: RAS, as 3D Slicer shows, if the file
+    states its space (SPACE=LPS). Needed with `anatomy.mesh`."""
     direction: Direction | None = None
     """Outward direction of the opening, in the mesh's own axes; normalised. Needed with `anatomy.mesh`."""
     radius_mm: Positive = 12.0
@@ -61,7 +62,7 @@ class AnatomySection(Section):
     """The brain: a procedural block, or a user's surface."""
 
     mesh: Path | None = None
-    """Surface of a brain (OBJ, STL, PLY or VTK, mm); relative to the job file. Empty: a procedural block."""
+    """Surface of a brain (OBJ, STL, PLY, OFF, VTK, VTP; mm), relative to the job file. Empty: a block."""
     fill_holes: bool = False
     """Whether holes of the mesh are closed, each by a fan of triangles; an error if that is not possible."""
     dome_mm: Positive = 70.0

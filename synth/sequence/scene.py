@@ -19,7 +19,6 @@ from synth.flow.stereo.rig import Rectified
 from synth.flow.track import Track
 from synth.geometry.brain_surface import Brain, load_brain
 from synth.geometry.triangles import Shape
-from synth.job.microscope import baseline_mm
 from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
@@ -32,6 +31,7 @@ from synth.render.scene import RenderedFrame, Renderer
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
+from synth.system import camera_file
 
 _LEAST_APART_MM = 0.5  # cameras of a pair
 
@@ -251,7 +251,7 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
     `view`: the left camera at rest; its picture may have another size than those of the calibration.
     Raises UserError for a pair that is none, or whose right camera does not show the opening's centre.
     """
-    if render.calibration is None or not baseline_mm(render.calibration):
+    if render.calibration is None or not camera_file.find_baseline_mm(render.calibration):
         return None
     pair = read_rig(render.calibration, render.size)
     if pair.baseline_mm < _LEAST_APART_MM:

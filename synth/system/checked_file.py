@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import stat
 import tempfile
@@ -23,12 +22,10 @@ from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError, as_user_error, first_line
 
-LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML, LARGEST_STORAGE = 64 << 20, 512 << 20, 200_000, 1 << 20
+LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML = 64 << 20, 512 << 20, 200_000
 """Size limits of files by kind [bytes]."""
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
-_NESTED = re.compile(r"[\[{]|<\w|[-?] +(?=[-?] )|\w: +(?=\w+: )")
-_MOST_NESTED = 1000  # values within values of an OpenCV file
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
@@ -115,25 +112,6 @@ def refuse_large(width: int, height: int) -> None:
     """Raises ValueError for a picture without pixels, or with more than 40 million."""
     if width < 1 or height < 1 or width * height > LARGEST_PIXELS:
         raise ValueError(f"{width} x {height} pixels, at most {LARGEST_PIXELS // 10**6} million are allowed")
-
-
-def read_storage(path: Path, largest: int = LARGEST_STORAGE) -> dict[str, Any]:
-    """Matrices (float64 arrays) and numbers at the top level of an OpenCV FileStorage: YAML, XML or JSON."""
-    import cv2
-
-    text = read_text(path, largest)
-    with as_user_error(f"{path}: is not an OpenCV calibration"):
-        # OpenCV's parser calls itself for every level and ends the process when the stack is full.
-        if len(_NESTED.findall(text)) > _MOST_NESTED:
-            raise ValueError(f"more than {_MOST_NESTED} nested values")
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root = storage.root()  # it and its nodes live as long as the storage
-        nodes = {key: root.getNode(key) for key in root.keys()}  # noqa: SIM118 - a FileNode is not a dict
-        return {
-            key: node.mat() if node.isMap() else node.real()
-            for key, node in nodes.items()
-            if node.isMap() or node.isInt() or node.isReal()
-        }
 
 
 def read_yaml(path: Path) -> Any:

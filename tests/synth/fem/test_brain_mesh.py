@@ -1,5 +1,9 @@
 """A user's surface: holes and duplicates, placement, meshing, and refused files."""
 
+import base64
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -63,3 +67,118 @@ def test_holes_are_filled_on_request_and_surfaces_still_open_refused(tmp_path: P
     fin = np.concatenate([ball.triangles, [[*ball.triangles[0, :2], (0.0, 0.0, 90.0)]]])
     with pytest.raises(UserError, match=r"anatomy\.fill_holes"):
         brain_surface.read_brain(written(tmp_path / "fin.stl", fin), fill_holes=True)
+
+
+BALL = trimesh.creation.icosphere(subdivisions=3)
+WAVES = 1 + 0.03 * np.sin(9 * BALL.vertices[:, 0] + 1) * np.sin(8 * BALL.vertices[:, 1] + 2)
+POINTS, FACES = BALL.vertices * WAVES[:, None] * [65, 85, 60], np.array(BALL.faces)
+VOLUME = trimesh.Trimesh(POINTS, FACES, process=False).volume
+HALF = BALL.triangles_center[:, 0] < 0
+SLICER = b"3D Slicer output. SPACE=LPS"
+
+
+def stl(head: bytes = SLICER, count: int = len(FACES), tail: bytes = b"", scale: float = 1.0) -> bytes:
+    rows = np.zeros(len(FACES), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    rows["corners"] = scale * POINTS[FACES]
+    return head.ljust(80) + struct.pack("<I", count) + rows.tobytes() + tail
+
+
+def vtk() -> bytes:
+    """Half of the faces as polygons, the others as strips: each one a triangle."""
+    rows = [b"%d %d %d" % tuple(face) for face in FACES]
+    lines = [b"# vtk DataFile Version 3.0", SLICER, b"ASCII", b"DATASET POLYDATA"]
+    lines += [b"POINTS %d float" % len(POINTS), *(b"%f %f %f" % tuple(one) for one in POINTS)]
+    lines += [
+        b"POLYGONS %d %d" % (HALF.sum(), 4 * HALF.sum()),
+        *(b"3 " + rows[k] for k in np.flatnonzero(HALF)),
+    ]
+    strips = [b"3 " + rows[k] for k in np.flatnonzero(~HALF)]
+    return b"\n".join([*lines, b"TRIANGLE_STRIPS %d %d" % (len(strips), 4 * len(strips)), *strips, b""])
+
+
+def vtp(appended: bool) -> bytes:
+    """As ParaView and 3D Slicer write it: compressed, in base64, or raw at the end of the file."""
+    blobs = b""
+
+    def array(name: str, kind: str, values: np.ndarray, tag: str = "DataArray") -> bytes:
+        nonlocal blobs
+        data = values.astype(kind.lower().replace("string", "uint8")).tobytes()
+        packed = zlib.compress(data)
+        head = np.array([1, len(data), 0, len(packed)], "<u4").tobytes()
+        at, blobs = len(blobs), blobs + head + packed
+        coded = b"" if appended else base64.b64encode(head) + base64.b64encode(packed)
+        form = f'format="appended" offset="{at}"' if appended else 'format="binary"'
+        return f'<{tag} type="{kind}" Name="{name}" {form}>'.encode() + coded + f"</{tag}>".encode()
+
+    cells = array("connectivity", "Int64", FACES) + array("offsets", "Int32", 3 + 3 * np.arange(len(FACES)))
+    space = array("SPACE", "String", np.frombuffer(b"LPS\0", np.uint8), "Array")
+    body = b"<FieldData>" + space + b"</FieldData><Piece><Points>" + array("Points", "Float64", POINTS)
+    body += b"</Points><Polys>" + cells + b"</Polys></Piece>"
+    end = b'<AppendedData encoding="raw">\n_' + blobs + b"\n</AppendedData>" if appended else b""
+    about = b'<VTKFile type="PolyData" byte_order="LittleEndian" compressor="vtkZLibDataCompressor">'
+    return about + b"<PolyData>" + body + b"</PolyData>" + end + b"</VTKFile>"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "data"),
+    [
+        ("stl", stl(tail=b"\n")),
+        ("stl", stl(count=0)),
+        ("vtk", vtk()),
+        ("vtp", vtp(appended=False)),
+        ("vtp", vtp(appended=True)),
+    ],
+)
+def test_the_stated_space_becomes_ras_and_no_face_is_lost(suffix: str, data: bytes, tmp_path: Path) -> None:
+    (tmp_path / f"brain.{suffix}").write_bytes(data)
+    with pytest.warns(match="LPS"):
+        vertices, faces = brain_surface.read_brain(tmp_path / f"brain.{suffix}")
+    assert len(faces) == len(FACES)
+    true = trimesh.Trimesh(POINTS * [-1, -1, 1], FACES)
+    assert trimesh.Trimesh(vertices, faces).volume == pytest.approx(true.volume, rel=1e-5)
+    np.testing.assert_allclose(vertices.mean(axis=0), true.vertices.mean(axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("sign", "turn", "named"),
+    [
+        ([1, 1, 1], 1, "accepted"),
+        ([-1, -1, 1], 1, "negated"),
+        ([-1, 1, 1], 1, "negated"),
+        ([1, 1, 1], -1, "direction"),
+        ([1.3, 1.3, 1.3], 1, "nearest"),
+    ],
+)
+def test_an_opening_in_other_axes_is_refused(
+    sign: list[float], turn: int, named: str, tmp_path: Path
+) -> None:
+    (tmp_path / "brain.stl").write_bytes(stl(b"no space"))
+    found = []
+    for k in np.flatnonzero(BALL.vertices[:, 2] > 0.5)[::12]:
+        point, out = POINTS[k] * sign, BALL.vertices[k] * sign * turn
+        try:
+            opening = schema.CraniotomySection(point=tuple(point), direction=tuple(out))
+            brain_surface.load_brain(tmp_path / "brain.stl", opening)
+            found.append("accepted")
+        except UserError as error:
+            found.append(str(error))
+    assert sum(named not in one for one in found) <= 2, found  # where it is symmetric by chance
+
+
+def test_faces_are_turned_until_neighbours_agree(tmp_path: Path) -> None:
+    for turned in (HALF, np.arange(len(FACES)) % 10 < 3):
+        faces = np.where(turned[:, None], FACES[:, ::-1], FACES)
+        with warnings.catch_warnings(action="error"):
+            found = brain_surface.read_brain(written(tmp_path / "brain.ply", POINTS[faces]))
+        assert trimesh.Trimesh(*found, process=False).volume == pytest.approx(VOLUME, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("data", "named"),
+    [(stl(scale=0.1), "by 10$"), (stl(scale=0.001), "by 1000$"), (stl()[:-50], str(len(FACES)))],
+)
+@pytest.mark.filterwarnings("ignore:.*LPS")
+def test_a_true_reason_names_the_unit_or_the_count(data: bytes, named: str, tmp_path: Path) -> None:
+    (tmp_path / "brain.stl").write_bytes(data)
+    with pytest.raises(UserError, match=named):
+        brain_surface.read_brain(tmp_path / "brain.stl")

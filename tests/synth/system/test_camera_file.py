@@ -1,0 +1,96 @@
+"""Calibrations of other programs: read, or refused by the name of what is not supported."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from synth.errors import UserError
+from synth.flow.stereo.calibration import read_rig
+from synth.system.camera_file import read_lens
+
+K = [[800.0, 0.0, 320.5], [0.0, 801.0, 238.5], [0.0, 0.0, 1.0]]
+D = [-0.2, 0.05, 0.001, -0.002, 0.01]
+FLAT = [x for row in K for x in row]
+TURN = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
+ROS = f"""image_width: 640
+image_height: 480
+camera_matrix: {{rows: 3, cols: 3, data: {FLAT}}}
+distortion_model: plumb_bob
+distortion_coefficients: {{rows: 1, cols: 5, data: {D}}}
+"""
+KALIBR = f"""cam0:
+  camera_model: pinhole
+  intrinsics: [800.0, 801.0, 320.5, 238.5]
+  distortion_model: radtan
+  distortion_coeffs: {D[:4]}
+  resolution: [640, 480]
+cam1:
+  T_cn_cnm1: [[1, 0, 0, -0.0044], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  intrinsics: [900.0, 901.0, 320.5, 238.5]
+  distortion_coeffs: {D[:4]}
+  resolution: [640, 480]
+"""
+SIDE = "Res_x=640\nRes_y=480\nfc_x=800\nfc_y=801\ncc_x=320.5\ncc_y=238.5\n"
+SIDE += "".join(f"kc_{k}={x}\n" for k, x in enumerate(D))
+INI = f"[StereoLeft]\n{SIDE}[StereoRight]\n{SIDE}T_0=-4.4\nT_1=0\nT_2=0\n"
+INI += "".join(f"R_{k}={x}\n" for k, x in enumerate(np.eye(3).ravel()))
+
+
+def pair(**changed: object) -> str:
+    return json.dumps({"K1": K, "D1": D, "K2": K, "D2": D, "R": TURN, "T": [-4.4, 0, 0], **changed})
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.yaml", ROS),
+        ("a.yaml", KALIBR),
+        ("a.json", pair()),
+        ("a.yaml", f"height: 480\nwidth: 640\nd: {D}\nk: {FLAT}\nroi: {{width: 0, height: 0}}\n---\n"),
+        ("a.json", json.dumps({"mtx": str(np.array(K)), "dist": [D]})),
+        ("a.json", json.dumps({"fx": 800, "fy": 801, "cx": 320.5, "cy": 238.5, "k1": -0.2, "k2": 0.05})),
+    ],
+)
+def test_one_camera_of_every_program_is_read(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    found, lens = read_lens(tmp_path / name, (640, 480))
+    np.testing.assert_allclose(found, K)
+    np.testing.assert_allclose(lens[:2], D[:2])
+
+
+@pytest.mark.parametrize(("name", "text", "right"), [("a.yaml", KALIBR, 900), ("a.ini", INI, 800)])
+def test_a_pair_is_read_and_scaled_to_the_pictures(
+    name: str, text: str, right: float, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(text)
+    rig = read_rig(tmp_path / name, (320, 240))
+    assert (rig.left.K[0, 0], rig.right.K[0, 0], rig.left.K[0, 2]) == (400, right / 2, 160)
+    np.testing.assert_allclose(rig.translation, [-4.4, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        (ROS.replace("plumb_bob", "equidistant"), "equidistant"),
+        (KALIBR.replace("pinhole", "omni"), "omni"),
+        (pair(fisheye_model=1), "fisheye_model"),
+        (pair(thin_prism_coefficients=[0.1, 0.1]), "thin_prism"),
+        (pair(K1=np.transpose(K).tolist()), "319.5, 237.5"),
+        (pair(K1=(2 * np.array(K)).tolist()), "0, 0, 1"),
+        (pair(K1=[[1800, 0, 960], [0, 1800, 540], [0, 0, 1]]), "960, 540"),
+        (pair(D2=[-0.2, 0.05, 0.08, 0.001, 0.002]), "0.08"),
+        (pair(T=[-0.0044, 0, 0]), "mm_per_unit.*1000"),
+        (pair(image_size=[1920, 1080]), "1920 x 1080"),
+        ("<html></html>", "named values"),
+        ('{"a": ' + "[" * 500_000, "recursion"),
+        ("<a>" * 200_000, "a.yaml"),
+        ("%YAML:1.0\na: " + "- " * 10_000, "a.yaml"),
+    ],
+)
+def test_what_is_not_supported_is_named(text: str, named: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(UserError, match=named) as caught:
+        read_rig(tmp_path / "a.yaml", (640, 480))
+    assert "\n" not in str(caught.value)
