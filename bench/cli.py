@@ -196,7 +196,7 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, folder of pictures or .npy."),
+        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, or pictures' folder."),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
@@ -204,8 +204,15 @@ def import_(
     use: Annotated[
         list[str] | None,
         Option(
-            help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, tip, fps; "
-            "in a ROS bag also right, depth, calibration, right_calibration."
+            help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, tip, fps, "
+            "right, calibration; in a ROS bag also depth, right_calibration."
+        ),
+    ] = None,
+    stereo_layout: Annotated[
+        str | None,
+        Option(
+            help="Two cameras in one video: side-by-side, top-bottom, half-width, half-height (squeezed) or "
+            "alternating; add ,right-first if so."
         ),
     ] = None,
     newtons: Annotated[
@@ -218,7 +225,7 @@ def import_(
     from synth.system.terminal import counting
     from synth.video.pixel_scale import read_scale
 
-    found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"))
+    found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"), stereo_layout)
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
         about["scale_mm_per_px"] = read_scale(scale)

@@ -1,86 +1,168 @@
-"""Files without a container: folders of pictures, .npy arrays, CSV tables as ROS tools write them."""
+"""Videos, folders of pictures, TIFF stacks, .npy arrays, and CSV tables next to them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 
+import cv2
 import numpy as np
+from PIL import Image
 
-from bench.importers.registry import Intake, picture_files
+from bench.importers.registry import STILLS, Intake, SecondView
 from bench.recording import csv_table
-from synth.arrays import Floats, Pixels
+from synth.arrays import Array, Floats
 from synth.errors import UserError
+from synth.system import checked_file
+from synth.video import file_numbers
 from synth.video import read as video
 
-_SECONDS = ("t_s", "time", "timestamp", "t", "time_s", "%time", "__time")
-_FORCES = (
-    ("fx_n", "fy_n", "fz_n"),
-    ("fx", "fy", "fz"),
-    ("wrench.force.x", "wrench.force.y", "wrench.force.z"),
-    ("field.wrench.force.x", "field.wrench.force.y", "field.wrench.force.z"),
-    ("force.x", "force.y", "force.z"),
-)
-_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-_Pictures = Callable[[], Iterator[Pixels]]
-_NANOSECONDS = 1e15  # larger numbers are no seconds of any clock: `rostopic echo -p` writes nanoseconds
+# Names of columns without "%", "_" or "/" in front, with "." for "/".
+_TIME = r"(?:t|time|time_?stamp|stamp|elapsed)(?:[ _]*[\[(]?(s|secs?|seconds|ms|us|µs|ns)[\])]?)?"
+_STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
+_FORCE = r"(?:.*\.)?(?:f{0}|force[._]{0})(?:_n|[ _]*[\[(]n[\])])?"
+_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_SINCE_1970_S = 0.9e9, 5e9  # of the years 1998 to 2128
+_AT_ONCE = 16  # pages of a stack
+_Pictures = Callable[[], Iterator[Array]]
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a folder of pictures, in the order of their numbers, or an .npy of (T, H, W[, C]).
+    """Opens a video, a folder of pictures or stacks of them, a stack, or an .npy of (T, H, W[, C]).
 
-    Times come from `--use frame_time=TABLE.csv`, or from `--use fps=RATE`. Forces come from
+    Times come from `--use frame_time=TABLE.csv`, from `--use fps=RATE` and the numbers in the names, or from
+    the video. `--use frames=GLOB` and `right=GLOB` choose among a folder's pictures. Forces come from
     `--use force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n.
 
     Raises:
         UserError: no times, a table without the columns, or not as many times as pictures.
     """
-    pictures, count = _array(source) if source.is_file() else _folder(source)
-    times = _times(source, use, count)
-    return Intake(times, pictures, *(_read_forces(Path(use["force"])) if "force" in use else ()))
-
-
-def _read_forces(path: Path) -> tuple[Floats, Floats]:
-    """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
-    header = csv_table.read_header(path)
-    names = next((names for names in _FORCES if set(names) <= set(header)), None)
-    if names is None:
-        raise UserError(f"{path}: no columns of force; the header has {', '.join(header)}")
-    return _seconds(path, header), np.column_stack(list(csv_table.read_csv(path, names).values()))
-
-
-def _seconds(path: Path, header: list[str]) -> Floats:
-    """Times of a table's rows, (N,) s."""
-    if set(_STAMP) <= set(header):
-        stamp = csv_table.read_csv(path, _STAMP)
-        return np.asarray(stamp[_STAMP[0]] + 1e-9 * stamp[_STAMP[1]], np.float64)
-    name = next((name for name in _SECONDS if name in header), None)
-    if name is None:
-        raise UserError(f"{path}: no column of times; the header has {', '.join(header)}")
-    time = csv_table.read_csv(path, (name,))[name]
-    return np.asarray(1e-9 * time if np.nanmax(time) > _NANOSECONDS else time, np.float64)
-
-
-def _times(source: Path, use: dict[str, str], count: int) -> Floats:
+    notes: list[str] = []
+    pictures, numbers, times = _open(source, use.get("frames"), notes)
     if "frame_time" in use:
-        path = Path(use["frame_time"])
-        times = _seconds(path, csv_table.read_header(path))
-        if len(times) != count:
-            raise UserError(f"{path}: {len(times)} times for {count} pictures of {source}")
-        return times
-    rate = float(use.get("fps", "nan"))
-    if not (np.isfinite(rate) and rate > 0):
+        times = _frame_seconds(Path(use["frame_time"]), numbers, notes)
+    elif "fps" in use:
+        rate = float(use["fps"]) if use["fps"].replace(".", "", 1).isdigit() else 0.0
+        if rate == 0:
+            raise UserError(f"--use fps={use['fps']}: give pictures per second")
+        times = (np.array(numbers) - numbers[0]) / rate
+        if numbers[-1] - numbers[0] != len(numbers) - 1:
+            notes.append(
+                f"{source}: {len(numbers)} numbers from {numbers[0]} to {numbers[-1]}: times follow them"
+            )
+    if times is None or not np.isfinite(times).all():
         raise UserError(f"{source}: pictures without times; add --use frame_time=TABLE.csv or --use fps=RATE")
-    return np.arange(count) / rate
+    second = None
+    if "right" in use:
+        other = Path(use["right"])
+        right, own, _ = _open(*((other, None) if other.exists() else (source, use["right"])), notes)
+        at = {number: k for k, number in enumerate(numbers)}
+        second = SecondView("right", np.array([at.get(number, -1) for number in own]), right)
+    force = _read_forces(Path(use["force"]), notes) if "force" in use else ()
+    return Intake(times, pictures, *force, notes=tuple(notes), second=second)
 
 
-def _folder(folder: Path) -> tuple[_Pictures, int]:
-    paths = tuple(picture_files(folder))
-    return lambda: (picture.rgb for picture in video.read_pictures(dict(enumerate(paths)))), len(paths)
+def _open(source: Path, names: str | None, notes: list[str]) -> tuple[_Pictures, list[int], Floats | None]:
+    """Pictures, their numbers, and their times [s] if the source has them, NaN where it lacks one."""
+    if names and not source.is_dir():
+        raise UserError(f"--use ...={names}: no such file")
+    if source.suffix.lower() in video.SUFFIXES:
+        times = np.array([one.time_s for one in video.read_video(source)], np.float64)
+        return lambda: (one.rgb for one in video.read_video(source)), list(range(len(times))), times
+    if source.suffix.lower() == ".npy":
+        frames = np.load(source, mmap_mode="r", allow_pickle=False)
+        if frames.ndim not in (3, 4):
+            raise UserError(f"{source}: an array of shape {frames.shape}, expected (T, H, W) or (T, H, W, C)")
+        return lambda: (np.asarray(picture) for picture in frames), list(range(len(frames))), None
+    files = {0: source}
+    if source.is_dir():
+        stills = [p for p in file_numbers.find_stills(source, STILLS) if fnmatch(p.name, names or "*")]
+        if not stills:
+            raise UserError(f"{source}: holds no picture {names}")
+        files = file_numbers.number_files(stills)
+        last = [int(part) for one in files.values() for part in re.findall("[0-9]+", one.stem)[-1:]]
+        if 0 in files and last and last != list(files):
+            notes.append(f"{source}: the names' numbers are not those of frames: in order, evenly spaced")
+    pages = {path: _count_pages(path) for path in files.values()}
+    total, is_stack = sum(pages.values()), max(pages.values()) > 1
+    if is_stack:
+        notes.append(f"{source}: {total} pages of {len(pages)} TIFF files")
+    return lambda: _read_stills(pages), list(range(total)) if is_stack else list(files), None
 
 
-def _array(path: Path) -> tuple[_Pictures, int]:
-    frames = np.load(path, mmap_mode="r", allow_pickle=False)
-    if frames.ndim not in (3, 4):
-        raise UserError(f"{path}: an array of shape {frames.shape}, expected (T, H, W) or (T, H, W, C)")
-    return lambda: (np.asarray(picture) for picture in frames), len(frames)
+def _count_pages(path: Path) -> int:
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return 1
+    checked_file.read_picture(path)  # refuses one that is no picture, or too large
+    with Image.open(path) as stack:
+        return getattr(stack, "n_frames", 1)
+
+
+def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
+    """Pictures (H, W, 3) of files with so many pages, RGB."""
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
+    for path, count in pages.items():
+        for k in range(0, count, _AT_ONCE):
+            wanted = min(_AT_ONCE, count - k)
+            found = [checked_file.read_picture(path, flags)]
+            if count > 1:
+                found = cv2.imreadmulti(str(path), start=k, count=wanted, flags=flags)[1]
+            if len(found) < wanted:
+                raise UserError(f"{path}: page {k + len(found)} of {count} is damaged")
+            yield from (picture[..., ::-1] for picture in found)
+
+
+def _read_forces(path: Path, notes: list[str]) -> tuple[Floats, Floats]:
+    """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
+    names = [_columns(path, _FORCE.format(axis)) for axis in "xyz"]
+    if any(len(one) != 1 for one in names):
+        why = "several columns of force" if all(names) else "no columns of force"
+        raise UserError(f"{path}: {why}; the header has {', '.join(csv_table.read_header(path))}")
+    time = _seconds(path, notes)
+    force = np.column_stack(list(csv_table.read_csv(path, [name for (name,) in names]).values()))
+    filled = np.isfinite(time) & np.isfinite(force).any(axis=1)
+    if not filled.all():
+        notes.append(f"{path}: {np.sum(~filled)} blank rows are left out")
+    return time[filled], force[filled]
+
+
+def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:
+    """Times (T,) s of the pictures with these numbers: by the table's column `frame`, else in its order."""
+    time = _seconds(path, notes)
+    if _columns(path, "frame"):
+        by_number = dict(zip(csv_table.read_csv(path, ("frame",))["frame"].tolist(), time, strict=True))
+        if by_number.keys() >= set(numbers):
+            return np.array([by_number[number] for number in numbers])
+    time = time[np.isfinite(time)]
+    if len(time) != len(numbers):
+        raise UserError(f"{path}: {len(time)} times for {len(numbers)} pictures")
+    return time
+
+
+def _seconds(path: Path, notes: list[str]) -> Floats:
+    """Times of a table's rows, (N,) s: the header's stamps if there are any, else the column of times."""
+    stamps, times = _columns(path, _STAMP), _columns(path, _TIME)
+    if len(stamps) > 1 or not stamps + times:
+        why = "several stamps" if stamps else "no column of times"
+        raise UserError(f"{path}: {why}; the header has {', '.join(csv_table.read_header(path))}")
+    found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(path, _NANOSECONDS))])
+    name = stamps[0] if stamps and np.nanmax(found[stamps[0]]) > 0 else times[0]
+    if stamps and times:
+        notes.append(f"{path}: times are those of {name}, not {times[0] if name in stamps else stamps[0]}")
+    values = found[name]
+    if name in stamps and rest:
+        return np.asarray(values + 1e-9 * found[rest[0]], np.float64)
+    match = re.fullmatch(_TIME, _plain(name))
+    units = [_UNITS.get(match[1], 1.0)] if match and match[1] else [1.0, 1e-3, 1e-6, 1e-9]
+    largest, (least, most) = np.nanmax(values), _SINCE_1970_S
+    return np.asarray(values * next((u for u in units if least < largest * u < most), units[0]), np.float64)
+
+
+def _columns(path: Path, pattern: str) -> list[str]:
+    return [name for name in csv_table.read_header(path) if re.fullmatch(pattern, _plain(name))]
+
+
+def _plain(name: str) -> str:
+    return name.lstrip("%_/").replace("/", ".")

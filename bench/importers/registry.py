@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
@@ -21,12 +22,15 @@ from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
-from synth.video.file_numbers import natural_order
+from synth.video import read as video
+from synth.video import stereo_layout
+from synth.video.file_numbers import find_stills
 
 ROLES = ("frames", "frame_time", "force", "force_time", "tip")
 """Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
+PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right")  # names of files, or *.* among a folder's
 BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")  # topics
-_STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _PLAIN = "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
@@ -35,7 +39,7 @@ _MAKERS = {
     ".bag": "bench.importers.rosbag",
     ".mcap": "bench.importers.rosbag",
     ".db3": "bench.importers.rosbag",
-    ".npy": _PLAIN,
+    **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
 }
 _LARGEST_BYTES = 1 << 42
 _LEAST_PX = 8
@@ -73,35 +77,48 @@ class Intake:
     second: SecondView | None = None
 
 
-def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
+def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str | None = None) -> Intake:
     """Opens a source.
 
-    `use`: role → name in the source, where the choice is ambiguous. Raises UserError for an unknown format, a
-    library that is not installed, no usable contents, or an ambiguous choice.
+    `use`: role → name in the source, where the choice is ambiguous. `layout`: of two cameras in its pictures,
+    as of `stereo_layout.LAYOUTS`, with `,right-first` if so.
+
+    Raises UserError for an unknown format, a library that is not installed, no usable contents, or an
+    ambiguous choice.
     """
+    use = dict(use or {})
     if not source.is_dir():
         checked_file.check_file(source, _LARGEST_BYTES)
     maker = _MAKERS.get(source.suffix.lower())
     if source.is_dir():
         bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
-        pictures_only = not recording and picture_files(source)
+        pictures_only = not recording and find_stills(source, STILLS)
         maker = "bench.importers.rosbag" if bag else _PLAIN if pictures_only else None
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
-    roles = BAG_ROLES if maker.endswith("rosbag") else (*ROLES, "fps")
-    if unknown := sorted(set(use or {}) - set(roles)):
+    is_bag = maker.endswith("rosbag")
+    roles = BAG_ROLES if is_bag else (*(PLAIN_ROLES if maker == _PLAIN else ROLES), "calibration")
+    if unknown := sorted(set(use) - set(roles)):
         raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
+    calibration = None if is_bag else use.pop("calibration", None)
     with _damage_as_user_error(source):
-        found: Intake = import_module(maker).read_source(source, dict(use or {}))
-    _refuse_odd(source, found)
+        found: Intake = import_module(maker).read_source(source, use)
+        _refuse_odd(source, found)
+        right = found.second.pictures() if found.second and found.second.kind == "right" else ()
+        bits, notes = 16, list(found.notes)
+        if (first := next(found.pictures())).dtype.kind == "u" and first.itemsize == 2:
+            bits = video.count_bits(chain(found.pictures(), right))
+            notes.append(f"the pictures use {bits} of 16 bits, which are reduced to 8")
 
     def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[Array]:
         with _damage_as_user_error(source):
             size = None
-            for k, picture in enumerate(map(_as_rgb, view.pictures()) if rgb else view.pictures()):
+            for k, picture in enumerate(
+                (_as_rgb(one, bits) for one in view.pictures()) if rgb else view.pictures()
+            ):
                 if picture.shape != (size := size or picture.shape):
                     raise UserError(f"{source}: frame {k} has another size than the frames before it")
                 yield picture
@@ -109,7 +126,40 @@ def read_source(source: Path, use: Mapping[str, str] | None = None) -> Intake:
     second = found.second
     if second is not None:
         second = replace(second, pictures=partial(decoded, second, second.kind == "right"))
-    return replace(found, pictures=partial(decoded, found), second=second)
+    found = replace(found, pictures=partial(decoded, found), second=second)
+    if layout is not None:
+        found = _split(found, layout)
+    elif second is None and (seems := stereo_layout.find_layout([*islice(found.pictures(), 9)])):
+        notes.append(f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}")
+    if calibration is not None:
+        if found.second is None:
+            raise UserError("--use calibration=...: requires right=... or --stereo-layout")
+        found = replace(
+            found, second=replace(found.second, pair=checked_file.read_storage(Path(calibration)))
+        )
+    if found.second is not None and not is_bag and found.second.pair is None:
+        notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
+    return replace(found, notes=tuple(notes))
+
+
+def _split(found: Intake, layout: str) -> Intake:
+    """Two cameras' pictures that are in one, or follow each other. UserError for no such layout."""
+    name, _, order = layout.partition(",")
+    if found.second is not None or name not in stereo_layout.LAYOUTS or order not in ("", "right-first"):
+        known = ", ".join(stereo_layout.LAYOUTS)
+        why = f"one of {known}, or with ,right-first" if found.second is None else "it has a right camera"
+        raise UserError(f"--stereo-layout {layout}: {why}")
+    in_turn, left = name == "alternating", int(bool(order))
+    count = len(found.times_s) // 2 if in_turn else len(found.times_s)
+
+    def view(which: int) -> Iterator[Array]:
+        if in_turn:
+            return islice(found.pictures(), which, 2 * count, 2)
+        return (stereo_layout.split(picture, name)[which] for picture in found.pictures())
+
+    times = found.times_s[left : 2 * count : 2] if in_turn else found.times_s
+    second = SecondView("right", np.arange(count), partial(view, 1 - left))
+    return replace(found, times_s=times, pictures=partial(view, left), second=second)
 
 
 @contextmanager
@@ -170,11 +220,6 @@ def write_recording(
     return out
 
 
-def picture_files(folder: Path) -> list[Path]:
-    """The pictures in a folder, in the order of the numbers in their names."""
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in _STILLS), key=natural_order)
-
-
 def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
     """The name for a role: the requested one, else the only one, else None.
 
@@ -190,10 +235,9 @@ def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | 
     return names[0] if names else None
 
 
-def _as_rgb(picture: Array) -> Pixels:
-    """Converts grey or colour to (H, W, 3) uint8 sRGB; 16 bits are cut to 8. UserError for other types."""
-    if picture.dtype == np.uint16:
-        picture = (picture >> 8).astype(np.uint8)
+def _as_rgb(picture: Array, bits: int) -> Pixels:
+    """Grey or colour, of 8 bits or so many of 16, as (H, W, 3) uint8 sRGB. UserError for other types."""
+    picture = video.as_8_bits(picture, bits)
     if picture.ndim == 2 or picture.shape[2] == 1:
         picture = np.repeat(picture.reshape(*picture.shape[:2], 1), 3, axis=2)
     if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):

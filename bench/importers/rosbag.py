@@ -15,20 +15,31 @@ import numpy as np
 from bench.importers import camera_info
 from bench.importers.camera_info import Lens, join_pair
 from bench.importers.registry import Intake, SecondView, one_of
-from synth.arrays import Array, Floats, Ints, Pixels
+from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file
 
 _LARGEST_BYTES = 1 << 42
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FORCES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3Stamped")
+_UNSTAMPED = ("geometry_msgs/msg/Wrench",)
 _TIPS = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PointStamped",
     "geometry_msgs/msg/TransformStamped",
 )
 _LENSES = ("sensor_msgs/msg/CameraInfo",)
-_CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
+_BAYER = ("rggb", "bggr", "gbrg", "grbg")
+_CHANNELS = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, **{f"bayer_{order}": 1 for order in _BAYER}}
+_SAME = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16", "16UC3": "bgr16"}
+_YUV = {
+    "yuv422": "UYVY",
+    "uyvy": "UYVY",
+    "yuv422_yuy2": "YUYV",
+    "yuyv": "YUYV",
+    "nv12": "NV12",
+    "nv21": "NV21",
+}
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _HEADER = 12  # bytes before the PNG in a compressed depth picture
 
@@ -62,16 +73,20 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
     with opened() as bag:
         second = use.get("right") or use.get("depth")
+        stamped = "force" not in use and any(c.msgtype in _FORCES for c in bag.connections)
+        forces = _FORCES if stamped else (*_FORCES, *_UNSTAMPED)
         topics = {
             role: _topic(bag, role, kinds, use, second)
-            for role, kinds in (("frames", _PICTURES), ("force", _FORCES), ("tip", _TIPS))
+            for role, kinds in (("frames", _PICTURES), ("force", forces), ("tip", _TIPS))
         }
+        notes: list[str] = []
         if topics["frames"] is None:
             raise UserError(f"{source}: holds no topic of pictures")
-        stamps = _table(bag, topics["frames"], lambda message: (), 0)[:, 0]
-        force = _table(bag, topics["force"], _vector, 3)
-        tip = _table(bag, topics["tip"], _place, 3) * [1.0, 1000.0, 1000.0, 1000.0]
-        found = Intake(stamps, partial(pictures, topics["frames"]), force[:, 0], force[:, 1:], tip)
+        stamps = _table(bag, topics["frames"], lambda message: (), 0, notes)[:, 0]
+        force = _table(bag, topics["force"], _vector, 3, notes)
+        tip = _table(bag, topics["tip"], _place, 3, notes) * [1.0, 1000.0, 1000.0, 1000.0]
+        first = partial(pictures, topics["frames"])
+        found = Intake(stamps, first, force[:, 0], force[:, 1:], tip, tuple(notes))
         if second is not None:
             return _add_second(bag, found, topics["frames"], use, pictures)
         if lone := {"calibration", "right_calibration"} & use.keys():
@@ -88,12 +103,13 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     if {"right", "depth"} <= use.keys():
         raise UserError("--use right=... and depth=...: give one of them")
     topic = _topic(bag, kind, _PICTURES, use) or ""
-    frame = partners(_table(bag, topic, lambda message: (), 0)[:, 0], found.times_s)
+    notes = list(found.notes)
+    frame = partners(_table(bag, topic, lambda message: (), 0, notes)[:, 0], found.times_s)
     if (frame < 0).all():
         raise UserError(f"{topic}: no picture is at the time of a frame of {frames}")
     first, last = int(frame[frame >= 0].min()), int(frame.max())
     times = found.times_s[first : last + 1]
-    notes = [f"{topic}: pictures for {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
+    notes += [f"{topic}: pictures for {(frame >= 0).sum()} of {len(found.times_s)} frames of {frames}"]
     if len(times) < len(found.times_s):
         notes.append(f"frames before {first} and after {last} have none and are left out")
     left = _lens(bag, frames, use.get("calibration"), next(pictures(frames)))
@@ -183,19 +199,25 @@ def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
         yield 1e-9 * logged, bag.deserialize(raw, connection.msgtype)
 
 
-def _table(bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int) -> Floats:
+def _table(
+    bag: Any, topic: str | None, read: Callable[[Any], tuple[float, ...]], width: int, notes: list[str]
+) -> Floats:
     """Times [s] and values of a topic's messages, (N, 1 + width), all on one clock."""
-    rows = [
-        (logged, message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec, *read(message))
-        for logged, message in _messages(bag, topic)
-    ]
+    rows = []
+    for logged, message in _messages(bag, topic):
+        stamp = message.header.stamp if hasattr(message, "header") else None
+        rows.append((logged, stamp.sec + 1e-9 * stamp.nanosec if stamp else 0.0, *read(message)))
     table = np.array(rows, np.float64).reshape(-1, 2 + width)
     clock = 1 if (table[:, 1] > 0).any() else 0
+    if rows and not clock:
+        notes.append(f"{topic}: has no stamps: its times are those at which the bag received it")
     return np.column_stack([table[:, clock], table[:, 2:]])
 
 
 def _vector(message: Any) -> tuple[float, float, float]:
-    vector = message.wrench.force if hasattr(message, "wrench") else message.vector
+    if hasattr(message, "wrench"):
+        message = message.wrench
+    vector = message.force if hasattr(message, "force") else message.vector
     return vector.x, vector.y, vector.z
 
 
@@ -209,17 +231,37 @@ def _place(message: Any) -> tuple[float, float, float]:
     return place.x, place.y, place.z
 
 
-def _picture(source: Path, message: Any) -> Pixels:
+def _picture(source: Path, message: Any) -> Array:
+    """RGB[A] or grey, of 8 or 16 bits."""
     if hasattr(message, "format"):
-        return checked_file.decode_picture(bytes(message.data)).astype(np.uint8)[..., ::-1]
-    channels = _CHANNELS.get(message.encoding)
-    if channels is None:
-        raise UserError(f"{source}: picture encoding {message.encoding}; supported: {', '.join(_CHANNELS)}")
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    picture = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    if message.encoding.startswith(("bgr", "8UC3")):
-        picture = picture[..., [2, 1, 0]]  # without opacity
-    return picture
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
+        found = checked_file.decode_picture(bytes(message.data), flags)[..., ::-1]
+        colour = message.format.split(";")[0].strip().rstrip("0168")
+        is_mosaic = colour.startswith("bayer_") and (found == found[..., :1]).all()
+        return _demosaic(np.ascontiguousarray(found[..., 0]), colour) if is_mosaic else found
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(-1, message.step)
+    if (order := _YUV.get(message.encoding)) is not None:
+        packed = rows[:, : message.width * (1 if order.startswith("NV") else 2)]
+        packed = packed if order.startswith("NV") else packed.reshape(message.height, message.width, 2)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(packed), getattr(cv2, f"COLOR_YUV2RGB_{order}")))
+    encoding = _SAME.get(message.encoding, message.encoding)
+    colour = encoding.rstrip("0168")
+    channels, bits = _CHANNELS.get(colour), encoding[len(colour) :]
+    if channels is None or bits not in ("8", "16"):
+        known = ", ".join([*_CHANNELS, *_YUV])
+        raise UserError(f"{source}: picture encoding {message.encoding}; supported: {known}, 8 or 16 bits")
+    kind = np.dtype((">" if message.is_bigendian else "<") + f"u{int(bits) // 8}")
+    used = np.ascontiguousarray(rows[:, : message.width * channels * kind.itemsize]).view(kind)
+    picture = used.astype(kind.newbyteorder("=")).reshape(message.height, message.width, channels)
+    if colour.startswith("bayer_"):
+        return _demosaic(picture[..., 0], colour)
+    return picture[..., [2, 1, 0]] if colour.startswith("bgr") else picture  # without opacity
+
+
+def _demosaic(mosaic: Array, colour: str) -> Array:
+    """RGB (H, W, 3) of a Bayer mosaic (H, W), by ROS's name of its order."""
+    order = getattr(cv2, f"COLOR_Bayer{colour.removeprefix('bayer_').upper()}2RGB")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(mosaic), order))
 
 
 def _depth(source: Path, message: Any) -> Array:

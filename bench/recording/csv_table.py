@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 from array import array
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ _LARGEST_BYTES = 512 << 20
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Floats]:
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
+    Dates of ISO 8601 are seconds since 1970, in UTC unless they state a zone.
+
     Args:
-        path: the CSV; comma, or semicolon and then also decimal commas; UTF-8 with or without BOM.
+        path: the CSV; comma or tab, or semicolon and then also decimal commas; UTF-8, or UTF-16 with BOM.
         required: columns that must be present exactly once.
         optional: columns returned if present.
 
@@ -42,7 +46,7 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
                 if over or len(row) <= max(columns):
                     why = "decimal commas? use points" if over else "cut off?"
                     raise ValueError(f"{len(row)} cells, {len(header)} expected ({why})")
-                values.extend(float(row[k].strip().replace(",", ".") or "nan") for k in columns)
+                values.extend(_number(row[k].strip().replace(",", ".") or "nan") for k in columns)
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path}:{rows.line_num}: {str(error)[:100]}") from None
     if not values:
@@ -55,11 +59,23 @@ def read_header(path: Path) -> list[str]:
     return _split(path)[0]
 
 
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        if "-" not in cell[1:]:
+            raise
+        date = datetime.fromisoformat(cell)
+        return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+
+
 def _split(path: Path) -> tuple[list[str], Any]:
     """Column names, and the csv.reader of the rows."""
-    lines = checked_file.read_text(path, _LARGEST_BYTES, "utf-8-sig").splitlines()
+    with checked_file.open_file(path, _LARGEST_BYTES) as file:
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    lines = checked_file.read_text(path, _LARGEST_BYTES, "utf-16" if wide else "utf-8-sig").splitlines()
     first = lines[0] if lines else ""
-    rows = csv.reader(lines, delimiter=";" if first.count(";") > first.count(",") else ",", strict=True)
+    rows = csv.reader(lines, delimiter=max(",;\t", key=first.count), strict=True)
     try:
         return [name.strip().lower() for name in next(rows, [])], rows
     except csv.Error as error:

@@ -186,7 +186,7 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
 def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     """The right camera's video or pictures, and depth pictures. UserError if meta.yaml does not match."""
     right = _find_video(folder, "right", "right")
-    depths = [path for path in folder.glob("depth/*") if path.suffix in (".png", ".npy")]
+    depths = file_numbers.find_stills(folder / "depth", (".png", ".npy"))
     for found, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
         if bool(found) != (section is not None):
             raise UserError(
@@ -201,7 +201,7 @@ def _find_video(folder: Path, name: str, pictures: str) -> Video:
     found: list[Video] = [
         path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
     ]
-    if stills := file_numbers.number_files(list(folder.glob(f"{pictures}/*.png"))):
+    if stills := file_numbers.number_files(file_numbers.find_stills(folder / pictures)):
         found.append(stills)
     if len(found) > 1:
         raise UserError(f"{folder}: has several of {name}.mp4 and {pictures}/; keep one of them")
@@ -279,6 +279,10 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     forces = ("fx_n", "fy_n", "fz_n")
     columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
     columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
+    blank = np.isnan([columns[name] for name in forces]).all(axis=0)
+    if 0 < blank.sum() < len(blank):  # rows of other instruments, as in joined tables
+        notes.append(f"{path.name}: {blank.sum()} rows without a force left out")
+        columns = {name: column[~blank] for name, column in columns.items()}
     for fault, check in (("without a time", np.isfinite), ("whose time repeats or runs backwards", _rising)):
         good = check(columns["t_s"])
         if not good.all():

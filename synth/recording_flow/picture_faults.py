@@ -10,6 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from synth.arrays import Map, Mask, Pixels
 from synth.recording_flow.finding import Finding
+from synth.video import stereo_layout
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,7 @@ class VideoFaults:
     def __init__(self, rgb: Pixels, small: Pixels, tissue: Mask) -> None:
         """Starts with the rest frame (H, W, 3), also downsampled (h, w, 3), and its tissue mask (h, w)."""
         self._tissue, self._rest_rgb, self._last = tissue, small, rgb[::_STRIDE, ::_STRIDE]
+        self._first = [rgb]  # pictures, from the rest frame on
         self.changes = False  # whether a tracked picture differs from the rest frame
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
         self._fine = _detail(grey, 0, 1)[tissue].std()
@@ -110,6 +112,7 @@ class VideoFaults:
 
     def add_decoded(self, index: int, time_s: float, rgb: Pixels) -> None:
         """Adds a picture (H, W, 3) of the video; every picture in order."""
+        self._first += [rgb] * (len(self._first) < stereo_layout.PICTURES)
         one = rgb[::_STRIDE, ::_STRIDE]
         if one.shape == self._last.shape:
             change = cv2.absdiff(one, self._last).mean(axis=2)
@@ -165,6 +168,9 @@ class VideoFaults:
         cuts = [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])]
         at = dict(zip(self._numbers, self._times, strict=True))
         found = [Finding("warning", "pictures", message) for message in self._rest]
+        if layout := stereo_layout.find_layout(self._first):
+            message = f"two cameras in one video: split it by bench import --stereo-layout {layout}"
+            found.append(Finding("error", "pictures", message))
         for times, fault in (
             (self._combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),

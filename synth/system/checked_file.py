@@ -102,7 +102,7 @@ def decode_picture(data: bytes, flags: int = 1) -> NDArray[np.generic]:
                 refuse_large(*picture.size)
         found = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except Exception as error:  # readers of formats raise anything: SyntaxError, struct.error, ...
-        raise ValueError(f"unknown format: {first_line(error)}") from error
+        raise ValueError(f"unknown format: {first_line(error).split(' <_io')[0]}") from error
     if found is None:
         raise ValueError("it is damaged")
     return np.asarray(found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from synth.errors import UserError
 
+_SEVERAL = "{}: holds {}: keep one series of names, or import one by --use frames='{}'"
 _SPARSE, _SPARE = 10, 1000  # n numbers that span more than 10 n + 1000 are not frame numbers but e.g. times
 
 
@@ -20,14 +22,30 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if k % 2 else (-1, part) for k, part in enumerate(parts)]
 
 
+def find_stills(folder: Path, suffixes: Collection[str] = (".png",)) -> list[Path]:
+    """A folder's files with one of the suffixes in any case, without hidden ones such as macOS's `._*`."""
+    return [p for p in folder.glob("*") if p.suffix.lower() in suffixes and not p.name.startswith(".")]
+
+
 def number_files(paths: Collection[Path]) -> dict[int, Path]:
-    """Files by the last number in their names that increases from file to file, else by their position."""
+    """Files by the last number in their names that increases from file to file, else by their position.
+
+    Raises UserError for several series of names, as of two cameras or two formats.
+    """
     ordered = sorted(paths, key=natural_order)
+    series = Counter(re.sub("[0-9]+", "*", path.name) for path in ordered).most_common(3)
+    if len(series) > 1 and any("*" in name for name, _ in series):
+        some = ", ".join(f"{count} {name}" for name, count in series)
+        raise UserError(_SEVERAL.format(ordered[0].parent, some, series[0][0]))
     found = [[int(part) for part in re.findall("[0-9]+", path.stem)[::-1]] for path in ordered]
-    for numbers in zip(*found, strict=False):  # only as many as every name has
+    columns = [*zip(*found, strict=False)]  # only as many as every name has
+    for numbers in columns:
         rising = all(a < b for a, b in pairwise(numbers))
         if rising and numbers[-1] - numbers[0] <= _SPARSE * len(numbers) + _SPARE:
             return dict(zip(numbers, ordered, strict=True))
+    if columns and set(Counter(columns[0]).values()) == {len(set(columns[-1]))} != {1}:
+        first = re.sub("([0-9]+)(.*)", r"\1*", ordered[0].stem) + ordered[0].suffix
+        raise UserError(_SEVERAL.format(ordered[0].parent, "each number several times", first))
     return dict(enumerate(ordered))
 
 

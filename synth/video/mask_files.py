@@ -10,7 +10,7 @@ from pathlib import Path
 
 from synth.arrays import Mask
 from synth.errors import UserError
-from synth.video.file_numbers import match_numbers, number_files
+from synth.video.file_numbers import find_stills, match_numbers, number_files
 from synth.video.read import read_mask
 
 MASKS = {
@@ -33,7 +33,7 @@ class MaskFiles:
     @classmethod
     def find(cls, numbered: Path, folder: Path) -> MaskFiles:
         """PNG files with a number in their names in `numbered`, and mask.png in `folder`, if present."""
-        files = [path for path in numbered.glob("*.png") if re.search("[0-9]", path.stem)]
+        files = [path for path in find_stills(numbered) if re.search("[0-9]", path.stem)]
         default = folder / "mask.png"
         return cls(number_files(files), default if os.path.lexists(default) else None)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -15,15 +16,18 @@ import numpy as np
 from av.container import InputContainer
 from numpy.typing import NDArray
 
-from synth.arrays import Mask, Pixels
+from synth.arrays import Array, Mask, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
-from synth.video.file_numbers import number_files
+from synth.video.file_numbers import find_stills, number_files
 
 A = TypeVar("A", bound=np.generic)
 
-SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+SUFFIXES = (
+    *(".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
+    *(".wmv", ".asf", ".flv", ".ogv", ".3gp"),
+)
 
 FPS = 25.0  # assumed if a video's times are unknown
 
@@ -50,10 +54,10 @@ class Picture:
 
 
 def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
-    """Decodes frame by frame; times are the container's presentation times, else those of `fps`.
+    """Decodes frame by frame; times are the container's presentation times from its start, else of `fps`.
 
-    A rotation stated in the file is applied, and pixels stated not to be square are resampled in width. Of a
-    truncated file the frames before the cut are returned.
+    The orientation stated in the file is applied, and pixels stated not to be square are resampled in width.
+    Of a truncated file the frames before the cut are returned.
 
     Raises:
         UserError: not a video, no video stream, or pictures larger than 40 megapixels.
@@ -65,18 +69,20 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
         # Two cores at most: a bench machine scores several recordings at a time.
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = 2
-        index = 0
+        start_s, index = (
+            0.0 if container.format.name == "avi" else (container.start_time or 0) / av.time_base,
+            0,
+        )
         try:
-            for frame in container.decode(stream):
+            for frame, ticks in _decode(container, stream):
                 width = _square_width(frame.width, stream.sample_aspect_ratio)
                 refuse_large(max(width, frame.width), frame.height)
                 rgb = frame.to_ndarray(format="rgb24")
                 if width != frame.width:
                     rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_AREA))
-                rgb = np.rot90(rgb, frame.rotation // 90)
                 unstated = None if fps is None else index / fps
-                time_s = unstated if frame.pts is None else float(frame.time)
-                yield Picture(index, time_s, np.ascontiguousarray(rgb))
+                time_s = unstated if ticks is None else float(ticks * frame.time_base) - start_s
+                yield Picture(index, time_s, np.ascontiguousarray(_upright(rgb, frame)))
                 index += 1
         except (av.error.FFmpegError, ValueError) as error:
             if index == 0:
@@ -85,10 +91,32 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
             raise UserError(f"{path}: holds no frames")
 
 
+def _decode(container: InputContainer, stream: av.VideoStream) -> Iterator[tuple[av.VideoFrame, int | None]]:
+    """Frames in order of presentation, with their times in ticks."""
+    # AVI has one time per packet, in the order of decoding, from which FFmpeg guesses those of presentation.
+    packets = deque[int]()
+    for packet in container.demux(stream):
+        if container.format.name == "avi" and packet.size and packet.dts is not None:
+            packets.append(packet.dts)
+        for frame in packet.decode():
+            yield frame, packets.popleft() if packets else frame.pts
+
+
+def _upright(rgb: Pixels, frame: av.VideoFrame) -> Pixels:
+    """The picture (H, W, 3) as by the frame's display matrix, which turns and mirrors."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return rgb
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        rgb, a, d = rgb.swapaxes(0, 1), c, b
+    return rgb[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
 def is_video(path: Path) -> bool:
     """Whether the path is a video by its suffix, or a folder of PNGs without sequences."""
     if path.is_dir():
-        return any(path.glob("*.png")) and not any(path.glob("*.zarr"))
+        return bool(find_stills(path)) and not any(path.glob("*.zarr"))
     return path.suffix.lower() in SUFFIXES
 
 
@@ -96,7 +124,7 @@ def read_frames(path: Path, fps: float) -> Iterator[Picture]:
     """As `read_video`; the pictures of a folder by the numbers in their names, at `fps`."""
     if not path.is_dir():
         return read_video(path, fps)
-    stills = number_files([*path.glob("*.png")])
+    stills = number_files(find_stills(path))
     first = min(stills)
     return (replace(one, time_s=(one.index - first) / fps) for one in read_pictures(stills))
 
@@ -140,10 +168,17 @@ def _open_video(path: Path) -> InputContainer:
 
 
 def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
-    """Still images by their numbers, in the given order, without times. UserError if their sizes differ."""
+    """Still images by their numbers, in the given order, without times. UserError if their sizes differ.
+
+    16-bit ones are reduced to 8 by the range that all of them use.
+    """
     size: tuple[int, ...] | None = None
+    bits: int | None = None
     for index, path in paths.items():
-        rgb = read_picture(path)
+        stored = _read_colours(path)
+        if bits is None and stored.dtype == np.uint16:
+            bits = count_bits(map(_read_colours, paths.values()))
+        rgb = np.ascontiguousarray(as_8_bits(stored, bits or 16)[..., ::-1])
         if size is not None and rgb.shape != size:
             raise UserError(
                 f"{path}: is {rgb.shape[1]} x {rgb.shape[0]}, but the frames before are {size[1]} x {size[0]}"
@@ -153,8 +188,24 @@ def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
 
 
 def read_picture(path: Path) -> Pixels:
-    """A still image as (H, W, 3) uint8 sRGB, 16-bit ones reduced to 8. UserError if it is unreadable."""
-    return np.ascontiguousarray(checked_file.read_picture(path)[..., ::-1]).astype(np.uint8)
+    """One still image as (H, W, 3) uint8 sRGB. Raises as `read_pictures`."""
+    return next(read_pictures({0: path})).rgb
+
+
+def _read_colours(path: Path) -> Array:
+    return checked_file.read_picture(path, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
+
+
+def count_bits(pictures: Iterable[Array]) -> int:
+    """Bits that 16-bit pictures use, at least 8: cameras of 10 to 14 bits leave the upper ones empty."""
+    return max(8, max(int(picture.max()) for picture in pictures).bit_length())
+
+
+def as_8_bits(picture: Array, bits: int) -> Array:
+    """A picture of 16 bits, of which so many are used, reduced to uint8; others as they are."""
+    if picture.dtype.kind != "u" or picture.dtype.itemsize != 2:
+        return picture
+    return np.minimum(picture >> (bits - 8), 255).astype(np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Mask:

@@ -1,0 +1,167 @@
+"""Two cameras in one video, clocks of files, and formats of pictures, as cameras and labs write them."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from fake_recording import texture
+
+from bench.importers import registry, rosbag
+from bench.recording import csv_table
+from synth.errors import UserError
+from synth.video import read as video
+from synth.video.stereo_layout import find_layout
+
+WIDE = cv2.resize(texture(120, 200, 3), (800, 480), interpolation=cv2.INTER_CUBIC)
+LEFT, RIGHT = WIDE[:, :640], WIDE[:, 12:652]
+
+
+def write(
+    path: Path, pictures: list[np.ndarray], codec: str = "ffv1", pixels: str = "bgr0", **options: str
+) -> Path:
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream(codec, rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], pixels
+        for rgb in pictures:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
+        out.mux(stream.encode(None))
+    return path
+
+
+def join(layout: str) -> list[np.ndarray]:
+    if layout == "alternating":
+        return 4 * [LEFT, RIGHT]
+    axis = int(layout in ("side-by-side", "half-width"))
+    both = np.concatenate([LEFT, RIGHT], axis)
+    if layout.startswith("half"):
+        both = both[:, ::2] if axis else both[::2]
+    return 4 * [both]
+
+
+@pytest.mark.parametrize("layout", ["side-by-side", "top-bottom", "half-width", "half-height", "alternating"])
+def test_two_cameras_in_one_video_are_recognised_and_split(layout: str, tmp_path: Path) -> None:
+    source = write(tmp_path / "v.mkv", join(layout))
+    noted = registry.read_source(source).notes
+    assert any(layout in note for note in noted)
+    for order, expected in (("", (LEFT, RIGHT)), (",right-first", (RIGHT, LEFT))):
+        found = registry.read_source(source, layout=layout + order)
+        assert found.second is not None
+        assert len(found.times_s) == 4 == len(found.second.frame)
+        for got, rgb in zip((found.pictures, found.second.pictures), expected, strict=True):
+            off = np.abs(next(got()).astype(int) - rgb).mean()
+            assert off < (6 if layout.startswith("half") else 1)
+
+
+def test_one_camera_is_not_taken_for_two() -> None:
+    """Also mirrored, black, half black and periodic pictures."""
+    board = np.repeat(255 * (np.add.outer(np.arange(480) // 40, np.arange(640) // 40) % 2)[..., None], 3, 2)
+    mirrored = np.hstack([LEFT, LEFT[:, ::-1]]), np.vstack([LEFT, LEFT[::-1]])
+    for picture in (LEFT, *mirrored, 0 * LEFT, LEFT * (np.arange(640) < 320)[:, None], board):
+        assert find_layout(9 * [picture.astype(np.uint8)]) == ""
+
+
+FRAMES = [np.roll(LEFT[:240, :320], 6 * k, 1) for k in range(8)]
+
+
+@pytest.mark.parametrize("codec", ["a.avi libx264", "a.avi mpeg4", "a.ts libx264", "a.mpg mpeg2video"])
+def test_times_start_at_0_and_rise_in_order(codec: str, tmp_path: Path) -> None:
+    name, codec = codec.split()
+    source = write(tmp_path / name, FRAMES, codec, "yuv420p", bf="2")
+    got = list(video.read_video(source))
+    assert [one.time_s for one in got] == pytest.approx(np.arange(8) / 25, abs=1e-6)
+    shown = [np.argmin([np.abs(one.rgb - frame.astype(int)).mean() for frame in FRAMES]) for one in got]
+    assert shown == [*range(8)]
+
+
+@pytest.mark.parametrize("s", [1, -1])
+@pytest.mark.parametrize("t", [1, -1])
+@pytest.mark.parametrize("turned", [False, True])
+def test_all_orientations_of_a_display_matrix(s: int, t: int, turned: bool, tmp_path: Path) -> None:
+    a, b, c, d = (0, s, t, 0) if turned else (s, 0, 0, t)
+    source = write(tmp_path / "a.mp4", [LEFT], "libx264", "yuv444p")
+    data = bytearray(source.read_bytes())
+    at = data.index(b"tkhd") + 44
+    data[at : at + 36] = struct.pack(">9i", *(v << 16 for v in (a, b, 0, c, d, 0, 0, 0, 1 << 14)))
+    source.write_bytes(data)
+    got = next(video.read_video(source)).rgb.astype(int)
+    y, x = np.mgrid[: LEFT.shape[0], : LEFT.shape[1]]
+    across, down = a * x + c * y, b * x + d * y
+    assert np.abs(got[down - down.min(), across - across.min()] - LEFT).mean() < 6
+
+
+def put(path: Path, *pictures: np.ndarray) -> None:
+    cv2.imwritemulti(str(path), list(pictures)) if len(pictures) > 1 else cv2.imwrite(str(path), pictures[0])
+
+
+def test_stacks_bits_numbers_and_hidden_files(tmp_path: Path) -> None:
+    put(tmp_path / "s.tif", *(frame.astype(np.uint16) * 16 for frame in FRAMES))
+    (tmp_path / "._s.tif").write_bytes(b"\0\5\x16\7" + bytes(100))
+    found = registry.read_source(tmp_path, {"fps": "10"})
+    assert [
+        (one[..., ::-1] == frame).all() for one, frame in zip(found.pictures(), FRAMES, strict=True)
+    ] == 8 * [True]
+    pngs = tmp_path / "p"
+    pngs.mkdir()
+    for k in (0, 1, 5):
+        put(pngs / f"{k}_l.png", FRAMES[k])
+    assert registry.read_source(pngs, {"fps": "10"}).times_s == pytest.approx([0, 0.1, 0.5])
+    for k in (0, 1):
+        put(pngs / f"{k}_r.png", FRAMES[k])
+    with pytest.raises(UserError, match=r"_l\.png"):
+        registry.read_source(pngs, {"fps": "10"})
+    pair = registry.read_source(pngs, {"fps": "10", "frames": "*_l.png", "right": "*_r.png"})
+    assert pair.second is not None
+    assert pair.second.frame.tolist() == [0, 1]
+
+
+def test_tables_of_forces(tmp_path: Path) -> None:
+    """The stamp counts, not the arrival; blank rows are left out; units, dates and encodings are read."""
+    np.save(tmp_path / "v.npy", np.zeros((3, 48, 64), np.uint8))
+    for text, expected in (
+        (
+            "%time,field.header.stamp,a.force.x,a.force.y,a.force.z\n9e9,17e17,1,2,3\n9e9,17000000001e8,1,2,3",
+            [0, 0.1],
+        ),
+        ("time (ms);Fx (N);Fy (N);Fz (N)\n0;1;2;3\n50;;;\n100,0;1;2;3", [0, 0.1]),
+        ("timestamp,fx,fy,fz\n2023-11-14T22:13:20Z,1,2,3\n2023-11-14 22:13:20.1,1,2,3", [0, 0.1]),
+        ("t,fx,fy,fz\n1700000000000000,1,2,3\n1700000000100000,1,2,3", [0, 0.1]),
+    ):
+        (tmp_path / "f.csv").write_text(text, "utf-16")
+        found = registry.read_source(tmp_path / "v.npy", {"fps": "10", "force": str(tmp_path / "f.csv")})
+        assert found.force_s - found.force_s[0] == pytest.approx(expected, abs=1e-6)
+        assert found.force.tolist() == 2 * [[1, 2, 3]]
+    (tmp_path / "f.csv").write_text("t,fx\nnoon,1\n")
+    with pytest.raises(UserError, match=":2:"):
+        csv_table.read_csv(tmp_path / "f.csv", ("t",))
+
+
+def mosaic(rgb: np.ndarray) -> np.ndarray:
+    """(H, W) as of a sensor with red in the first pixel and blue in the second one of the second row."""
+    out = rgb[..., 1].copy()
+    out[::2, ::2], out[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
+    return out
+
+
+class Message:
+    def __init__(self, encoding: str, data: np.ndarray) -> None:
+        self.encoding, self.height, self.width, self.is_bigendian = encoding, 240, 320, 0
+        self.step, self.data = data[:240].nbytes // 240 if data.ndim == 3 else data.strides[0], data.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "make"),
+    [
+        ("bayer_rggb8", mosaic),
+        ("yuv422", lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_UYVY)),
+        ("yuv422_yuy2", lambda rgb: cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_YUYV)),
+        ("rgb16", lambda rgb: rgb.astype(np.uint16)),
+    ],
+)
+def test_pictures_of_bags(encoding: str, make: Callable[[np.ndarray], np.ndarray]) -> None:
+    rgb = np.ascontiguousarray(FRAMES[0])
+    got = rosbag._picture(Path("bag"), Message(encoding, np.ascontiguousarray(make(rgb))))
+    assert np.abs(got.astype(int) - rgb).mean() < 8
