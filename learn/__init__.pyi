@@ -1,3 +1,4 @@
+from .inference.apply import predict as predict
 from .inference.force_estimator import predict_force as predict_force
 from .inference.predict import ForceMap as ForceMap
 from .inference.predict import Predictor as Predictor

@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -64,6 +63,17 @@ class ModelCard:
     weights_hash: str = ""  # of the file of weights; empty before the first epoch is stored
     intervals: Intervals | None = None  # prediction intervals; None if not fitted
     no_intervals: str = ""  # why they could not be fitted; else empty
+    motion: list[str] = field(default_factory=list)
+    """Estimators and versions of the recovered motion it was fitted on, `tvl1 1`; empty: none, or unknown."""
+
+    def doubt(self, recovered_by: str) -> list[str]:
+        """A note if the network was not trained on motion recovered like that; "" is unknown."""
+        if not (recovered_by and self.motion) or recovered_by in self.motion:
+            return []
+        return [
+            f"the network was trained on motion by {' and '.join(self.motion)} (estimator and version), and "
+            f"this is by {recovered_by}: forces may be off; use that estimator, or train again"
+        ]
 
     @property
     def used(self) -> set[str]:
@@ -120,17 +130,6 @@ def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
     _write(file, buffer.getvalue())
 
 
-def load_tensors(file: Path) -> dict[str, Any]:
-    """What `save_tensors` wrote. Raises UserError if it is damaged or holds other objects."""
-    checked_file.check_file(file, _LARGEST_WEIGHTS)
-    with as_user_error(f"{file}: corrupt checkpoint"):
-        _check_archive(file)
-        tree = torch.load(file, map_location="cpu", weights_only=True)
-        if not isinstance(tree, dict):
-            raise TypeError("holds no state")
-        return tree
-
-
 def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     """The trained network, in evaluation mode on the CPU, and its card.
 
@@ -139,7 +138,7 @@ def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
     card = read_card(folder)
     file = _find_weights(folder, card)
     with as_user_error(f"{file}: corrupt weights"):
-        state = safetensors.load_file(file)
+        state = safetensors.load(checked_file.read_bytes(file, _LARGEST_WEIGHTS))
     with torch.device("meta"):  # without memory
         expected = {name: value.shape for name, value in D2FNet(card.settings.arch).state_dict().items()}
     if expected != {name: value.shape for name, value in state.items()}:
@@ -171,16 +170,6 @@ def _find_weights(folder: Path, card: ModelCard) -> Path:
     if not (folder / _WEIGHTS).is_file():
         raise UserError(f"{folder / _WEIGHTS}: no such file")
     raise UserError(f"{folder / _WEIGHTS}: not the weights that config.json was written for, or damaged")
-
-
-def _check_archive(file: Path) -> None:
-    """Raises an error for a wrong checksum, which PyTorch ignores, or if the archive is compressed."""
-    with zipfile.ZipFile(file) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > file.stat().st_size:
-            raise ValueError("compressed")
-        damaged = archive.testzip()
-    if damaged is not None:
-        raise ValueError(f"a checksum of {damaged} does not match")
 
 
 def _write(file: Path, data: bytes) -> None:

@@ -175,6 +175,8 @@ def eval_command(
             raise UserError(f"{against}: differs from {model} in its grid; choose another --against")
     cards = [one.card for one in (predictor, other) if one is not None]
     chosen = choose_unseen(clips, dataset, cards, _console.print)
+    for note in {note for card in cards for clip in chosen for note in card.doubt(clip.recovered_by)}:
+        _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
         second = None if other is None else evaluate(other, chosen, source, progress)
@@ -251,24 +253,22 @@ def predict_command(
 
     Exit code 2 if no frame has a force.
     """
-    from learn.inference.motion import VideoOptions, has_right_camera
-    from learn.inference.predict import load_model
+    from learn.inference.apply import open_source
+    from learn.inference.motion import VideoOptions
     from learn.inference.prediction_file import predict_files
-    from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
     from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
     set_threads(threads)
-    if source is None:
-        model, source = choose_model(has_right_camera(model)), model
+    named, source = (None, model) if source is None else (model, source)
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
-    predictor = load_model(model, quick=True)
     found = []
-    for one in predict_files(predictor, source, out, options, input, young, membrane, overlay):
+    opened = open_source(source, named, options, input)
+    for one in predict_files(*opened, source, out, young, membrane, overlay):
         found.append(one)
         if not json:
             what = "no frame has a force" if one.peak_mn is None else f"peak force {one.peak_mn:.3g} mN"

@@ -1,6 +1,7 @@
 from .dataset.store import Dataset as Dataset
 from .dataset.store import Sequence as Sequence
 from .dataset.store import open_sequence as open_sequence
+from .dataset.torch_dataset import TorchDataset as TorchDataset
 from .engine.run import Summary as Summary
 from .engine.run import open_dataset as open_dataset
 from .engine.run import render_job as render_job

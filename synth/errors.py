@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from numbers import Real
-from pathlib import Path
 
 
 class UserError(Exception):
@@ -28,13 +27,6 @@ class NotFinite(UserError):
 
 class Caution(UserWarning):
     """A warning for the user, who can continue; command lines print it to stderr."""
-
-
-def as_path(what: str, value: object) -> Path:
-    """`value` as a path; UserError that names `what` for any other type."""
-    if not isinstance(value, (str, Path)):
-        raise UserError(f"{what}: expected a path, got {type(value).__name__}")
-    return Path(value)
 
 
 def as_positive(what: str, value: object, largest: float = math.inf) -> float:

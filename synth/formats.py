@@ -10,6 +10,9 @@ from synth.errors import UserError
 
 STORE, FOLDER, MODEL, SCORE = 2, 3, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
+MOTION = 1
+"""Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
+networks learn the errors of the motion that they were trained on."""
 FIRST = 2  # written by 0.2, the first release: nothing older is read
 
 

@@ -7,7 +7,7 @@ force over E is a function of displacement.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,7 +58,17 @@ class Baseline:
         return ForceEstimate(assumed_young(scene.young_kpa) * self._rule(*fields))
 
 
-def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A `Rule` that ignores confidence."""
+
+    matrix: Floats  # (3, C N N) mN/(kPa mm)
+
+    def __call__(self, moved: Field, mask: Field, confidence: Field) -> Floats:
+        return np.asarray(self.matrix @ _rows(moved[None], mask[None])[0], np.float64)
+
+
+def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Linear]:
     """Rules fitted on the network's own fit sequences `clips`, on `GRID`, for a fair comparison.
 
     `source`: the displacement: `recovered` or `ideal`, in stereo `motion` or `motion-ideal`.
@@ -73,18 +83,12 @@ def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Rule]:
     names = sorted({clip.group for clip in clips})
     fold = np.concatenate([np.full(clip.frames, names.index(clip.group) % 4) for clip in clips])
     strengths = np.geomspace(1e-4, 1e2, 13)
-    # A partial of a named function, which can be pickled.
-    return {RIDGE: partial(_regress, basis, ridge(features, force, fold, strengths))}
+    return {RIDGE: Linear(ridge(features, force, fold, strengths).coef_ @ basis.components_)}
 
 
 def _rows(moved: Field, mask: Field) -> Floats:
     """(T, C, N, N) mm, (T, N, N) → masked displacement, (T, C N N)."""
     return (moved * mask[:, None]).reshape(len(moved), -1).astype(np.float64)
-
-
-def _regress(basis: TruncatedSVD, regressor: Ridge, moved: Field, mask: Field, confidence: Field) -> Floats:
-    found = regressor.predict(basis.transform(_rows(moved[None], mask[None])))
-    return np.asarray(found[0], np.float64)
 
 
 def ridge(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import pickle
+import io
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 import sklearn
 
 from bench.methods import baselines, plugins
-from bench.methods.baselines import Baseline, Rule
+from bench.methods.baselines import Baseline, Linear
 from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from learn.checkpoint import read_card
@@ -54,20 +56,32 @@ def simpler_methods(train: Path | None, model: Path | None, stereo: bool = False
     if stereo and all("motion_recovered" in s for s in chosen):
         source = "motion"
 
-    def fit() -> dict[str, Rule]:
+    def fit() -> dict[str, Linear]:
         return baselines.fitted_rules([read_clip(s, baselines.GRID, (source,)) for s in chosen], source)
 
     rules = cached_rules([s.attrs["content_hash"] for s in chosen], source, fit)
     return methods | {name: Baseline(rule, has_depth(source)) for name, rule in rules.items()}
 
 
-def cached_rules(hashes: Sequence[str], source: str, fit: Callable[[], dict[str, Rule]]) -> dict[str, Rule]:
+def cached_rules(
+    hashes: Sequence[str], source: str, fit: Callable[[], dict[str, Linear]]
+) -> dict[str, Linear]:
     """The result of `fit`, from this user's cache if it was fitted before.
 
     `hashes`: content hashes of the sequences in the order of fitting; `source`: the displacement.
     """
     code = provenance.source("synth", "learn", "bench/methods")
     key = "\n".join([code, sklearn.__version__, source, *hashes]).encode()
-    # Files that were cut off by a full disk, or written by another version of Python, are fitted again.
-    faults = EOFError, pickle.UnpicklingError, AttributeError, ImportError
-    return cache.cached("baselines/pickle", key, fit, pickle.dumps, pickle.loads, faults, most=8)
+    # Files that were cut off by a full disk are fitted again.
+    faults = EOFError, ValueError, zipfile.BadZipFile
+    return cache.cached("baselines/npz", key, fit, _dump, _load, faults, most=8)
+
+
+def _dump(rules: dict[str, Linear]) -> bytes:
+    np.savez(held := io.BytesIO(), allow_pickle=False, **{name: one.matrix for name, one in rules.items()})
+    return held.getvalue()
+
+
+def _load(data: bytes) -> dict[str, Linear]:
+    with np.load(io.BytesIO(data), allow_pickle=False) as held:
+        return {name: Linear(held[name]) for name in held.files}

@@ -20,8 +20,12 @@ from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 class Model:
     """A model of `learn train`. Without a known E its forces are those of tissue of 1 kPa."""
 
-    def __init__(self, model: Path | Predictor) -> None:
-        """`model`: the model itself, or its folder, loaded as an optimised graph. UserError if unreadable."""
+    def __init__(self, model: Path | Predictor, recovered_by: str = "") -> None:
+        """`model`: the model itself, or its folder, loaded as an optimised graph. UserError if unreadable.
+
+        `recovered_by`: `name_motion` of the recording's motion.
+        """
+        self._recovered_by = recovered_by
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._estimator: tuple[MethodContext, ForceEstimator] | None = None
 
@@ -51,7 +55,8 @@ class Model:
     @property
     def warnings(self) -> list[str]:
         """Reasons to doubt these estimates."""
-        return [note for note in self._all_notes if note.startswith(OUT_OF_DISTRIBUTION)]
+        doubt = self.predictor.card.doubt(self._recovered_by)
+        return doubt + [note for note in self._all_notes if note.startswith(OUT_OF_DISTRIBUTION)]
 
     @property
     def _all_notes(self) -> list[str]:

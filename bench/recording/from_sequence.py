@@ -5,19 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from bench.recording import writer
-from synth.arrays import Floats, Pixels
+from synth.arguments import checked
+from synth.arrays import Floats
 from synth.checks import optics, stereo
 from synth.dataset.store import Sequence
-from synth.errors import UserError, as_path
+from synth.errors import UserError
 from synth.system import checked_file
 
 _PAIR = "stereo.yaml"
 
 
+@checked
 def export_recording(
     sequence: Sequence,
     folder: str | Path,
@@ -32,10 +33,10 @@ def export_recording(
     `frames`: `png` is lossless, `mp4` is H.264; `instrument`: number, from 1, of the one that the sensor is
     on; None: all. Raises UserError if the folder exists, or there is no such instrument.
     """
-    folder, force = as_path("recording", folder), force_of(sequence, instrument)
-    with checked_file.folder_of(folder) as part:
+    force = force_of(sequence, instrument)
+    with checked_file.folder_of(Path(folder)) as part:
         _write_files(sequence, part, frames, force)
-    return folder
+    return Path(folder)
 
 
 def force_of(sequence: Sequence, instrument: int | None) -> Floats:
@@ -59,8 +60,9 @@ def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"], 
     for t in range(sequence.frames):
         tool = np.asarray(sequence["tool"][t], bool)[even]
         if tool.any():
-            _write(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
-    _write(part / "tissue.png", np.asarray(sequence["tissue"][:], bool)[even].astype(np.uint8) * 255)
+            checked_file.write_picture(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
+    tissue = np.asarray(sequence["tissue"][:], bool)[even]
+    checked_file.write_picture(part / "tissue.png", tissue.astype(np.uint8) * 255)
     writer.write_force(part, time, force / 1000)
     writer.write_frames(part, time)
     about: dict[str, object] = {
@@ -90,9 +92,4 @@ def _write_pictures(
     folder = part / {"video": "frames"}.get(name, name)
     folder.mkdir()
     for t, rgb in enumerate(pictures):
-        _write(folder / f"{t:06d}.png", rgb[..., ::-1])
-
-
-def _write(path: Path, picture: Pixels) -> None:
-    if not cv2.imwrite(str(path), np.ascontiguousarray(picture)):
-        raise UserError(f"{path}: could not be written")
+        checked_file.write_picture(folder / f"{t:06d}.png", rgb)

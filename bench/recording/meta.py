@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +14,7 @@ from synth.errors import UserError
 from synth.job.types import MembraneState, Positive, Section
 from synth.job.writer import section_lines
 from synth.system import checked_file
-from synth.system.config_file import ConfigFile
+from synth.system.config_file import ConfigFile, Mistake
 
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Point = tuple[FiniteFloat, FiniteFloat]
@@ -232,4 +233,18 @@ def read_meta(path: Path) -> Meta:
     if not os.path.lexists(path):
         raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px in it")
     text = checked_file.read_text(path, checked_file.LARGEST_YAML)
-    return ConfigFile(text, str(path)).validate(Meta)
+    config = ConfigFile(text, str(path))
+    return config.validate(Meta, _find_files_outside(config, path.parent))
+
+
+def _find_files_outside(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
+    """Yields the keys that name a file outside the recording's folder: absolute, with .., or by a link."""
+    for at in (("stereo", "calibration"), ("calibration", "checkerboard")):
+        block = config.values.get(at[0])
+        if isinstance(block, dict) and isinstance(name := block.get(at[1]), str):
+            try:
+                inside = (folder / name).resolve().is_relative_to(folder.resolve())
+            except (RuntimeError, ValueError, OSError):  # a NUL, a loop of links, too long
+                inside = False
+            if not inside:
+                yield Mistake(at, f"{name[:80]!r} must be a file in the recording's folder: copy it there")

@@ -49,10 +49,10 @@ def write_pair(path: Path, left: Camera, right: Camera) -> None:
 
 def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
     """Writes matrices, (N, M) or (M,), as an OpenCV FileStorage."""
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage = cv2.FileStorage(path.name, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for name, values in matrices.items():
         storage.write(name, np.atleast_2d(values))
-    storage.release()
+    path.write_text(storage.releaseAndGetString(), "utf-8")  # OpenCV takes no path that is not UTF-8
 
 
 def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[Array]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from synth.arrays import Array, Floats, Mask
+from synth.flow.estimator import name_backend
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import by_severity, first_fault, problems
 from synth.recording_flow.flow import LocalFlow
@@ -79,7 +80,9 @@ def evaluate_recording(
         sync=sensor.offset,
         notes=(*missing, *tracked.notes, *sensor.notes, *unscored),
         steps=sensor.steps,
-        settings={**asdict(settings), **described, "meta": meta.model_dump(mode="json", exclude_none=True)},
+        settings=vars(settings)
+        | {"backend": name_backend(settings.backend), **described}
+        | {"meta": meta.model_dump(mode="json", exclude_none=True)},
         tracked=tracked,
         turn=sensor.rotation,
         findings=problems(findings),

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 from bench.methods import comparison, plugins
@@ -24,7 +23,9 @@ from bench.tracking.tracking import Progress
 from learn import Predictor
 from learn.inference.shipped import choose_model, find_model
 from learn.training.threads import set_threads
-from synth.errors import UserError, as_path
+from synth.arguments import checked
+from synth.errors import UserError
+from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.flow import open_flow_process
 from synth.system import checked_file
@@ -35,6 +36,7 @@ _OUTPUT_BYTES = 32 << 20  # for score.json and report.html
 _LONG = 100  # frames from which a second process is worth the seconds that it takes to start
 
 
+@checked
 def score(
     recording: str | Path | Recording,
     model: str | Path | Predictor | None = None,
@@ -71,7 +73,7 @@ def score(
         UserError: unusable recording, model or settings, or nothing to score; nothing is written.
     """
     if not isinstance(recording, Recording):
-        recording = open_recording(as_path("recording", recording))
+        recording = open_recording(Path(recording))
     model = _require_model(model, methods, train, recording.has_stereo)
     frames = len(recording.numbers()) or None
     bar: AbstractContextManager[Progress]
@@ -79,13 +81,15 @@ def score(
     with ExitStack() as stack:
         if out is not None:
             stack.enter_context(checked_file.made_folder(Path(out), _OUTPUT_BYTES))
-        flow = None
-        if own_process and (frames or _LONG) >= _LONG:
+        flow, used = None, settings or Settings()
+        # Another process is given an estimator by its name.
+        if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
             # The process takes seconds to start, during which the baselines are fitted.
             flow = stack.enter_context(open_flow_process(set_threads))
-        chosen = _choose_methods(model, methods or {}, recording.has_stereo, baselines, train)
+        network = None if model is None else Model(model, name_motion(used.backend))
+        chosen = _choose_methods(network, model, methods or {}, recording.has_stereo, baselines, train)
         scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
-        used, about = settings or Settings(), _describe(chosen)
+        about = _describe(chosen)
         with bar as done:
             result = evaluate_recording(recording, chosen, main, scale, used, about, done, flow)
         if out is not None:
@@ -102,10 +106,6 @@ def _require_model(
     """The model to score, None: only own methods. UserError if the arguments don't fit each other."""
     if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
         raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
-    if not isinstance(model, (str, Path, Predictor, NoneType)):
-        raise UserError(f"model: expected a folder or a result of `load_model`, got {type(model).__name__}")
-    if not isinstance(methods or {}, Mapping):
-        raise UserError(f"methods: expected a mapping by name, got {type(methods).__name__}")
     if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
         raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
     if model is None and not methods:
@@ -114,6 +114,7 @@ def _require_model(
 
 
 def _choose_methods(
+    network: Model | None,
     model: Path | Predictor | None,
     own: Mapping[str, Method],
     stereo: bool,
@@ -121,7 +122,7 @@ def _choose_methods(
     train: str | Path | None,
 ) -> dict[str, Method]:
     """All methods by name, in the table's order; the result is about the first."""
-    chosen: dict[str, Method] = {} if model is None else {MAIN: Model(model)}
+    chosen: dict[str, Method] = {} if network is None else {MAIN: network}
     for name, one in own.items():
         chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
     if baselines:

@@ -71,6 +71,7 @@ class Clip:
     """(T, 2, N, N) 0..1 of recovered stereo motion, across and along the optical axis; None without it."""
     opening: str = ""  # place of the craniotomy on a user's brain; empty for procedural brains
     membrane: MembraneState = "unknown"
+    recovered_by: str = ""  # estimator and version of the recovered motion; empty if unknown
 
     @property
     def frames(self) -> int:
@@ -163,6 +164,7 @@ def _plain(sequence: Sequence) -> dict[str, Any]:
         "content_hash": sequence.attrs["content_hash"],
         "group": name_anatomy(sequence.attrs),
         "young_kpa": float(sequence.attrs["young_kpa"]),
+        "recovered_by": sequence.recovered_by,
         "opening": sequence.attrs.get("opening_id") or "",
         "membrane": ("intact" if tissue.get("membrane") else "stripped") if tissue else "unknown",
     }

@@ -3,20 +3,87 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
-from learn.inference.motion import Motion
-from learn.inference.predict import Predictor, force_size, net_force
+from learn.inference.motion import Motion, VideoOptions, has_right_camera, motions
+from learn.inference.predict import Predictor, force_size, load_model, net_force
+from learn.inference.shipped import choose_model
 from learn.uncertainty.conformal import LEVELS
-from synth.arrays import Floats, Map, Mask
-from synth.errors import UserError
+from synth.arguments import checked
+from synth.arrays import Array, Floats, Map, Mask
+from synth.errors import UserError, as_positive
+from synth.flow.estimator import Estimator
 from synth.job.types import MembraneState
+from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import first_fault, judge_young, problems
+from synth.video.mask_files import read_choice
+from synth.video.read import FPS
+
+
+@checked
+def predict(
+    source: str | Path | Array,
+    model: Predictor | str | Path | None = None,
+    *,
+    scale_mm_per_px: float | Literal["unknown"] | None = None,
+    young_kpa: float | None = None,
+    membrane: MembraneState = "unknown",
+    tissue: str | Path | Array | None = None,
+    masks: str | Path | Array = "auto",
+    pulse: bool = True,
+    flow: str | Estimator = "tvl1",
+    shrink: int = 0,
+    rate_hz: float | None = 10.0,
+    fps: float = FPS,
+    input: str | None = None,
+) -> dict[str, Any]:
+    """Force of every frame of one video, as `learn predict` estimates it, by the names of its NAME.npz.
+
+    Args:
+        source: frames (T, H, W, 3) uint8 from the rest frame on, a video, a folder of PNGs, a sequence or an
+            .npz of flow.
+        model: from `load_model`, or its folder; None: the pretrained one that fits.
+        scale_mm_per_px: of a video, or unknown: forces are then right up to a factor.
+        young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
+        membrane: state of the membrane (pia), for a model with that input.
+        tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.
+        masks: auto, none, glare, tool or both; or instrument masks: (T, H, W), (H, W) or a folder.
+        pulse: whether heartbeat and breathing are subtracted from a video's motion.
+        flow: estimator of a video's flow.
+        shrink: factor by which a video is downsampled before flow; 0: to 320 columns.
+        rate_hz: most frames per second that are used; None: all.
+        fps: frames per second of an array or a folder of PNGs.
+        input: displacement read from a sequence, as of `learn predict`.
+
+    Raises:
+        UserError: an argument of another type, shape or range, or a source of several videos.
+    """
+    as_positive("fps", fps)
+    source = Path(source) if isinstance(source, str) else source
+    kind, tool = read_choice(str(masks)) if isinstance(masks, (str, Path)) else ("auto", np.asarray(masks))
+    tissue = Path(tissue) if isinstance(tissue, str) else tissue
+    settings = RecordingFlowSettings(flow, shrink, rate_hz, pulse, kind)
+    options = VideoOptions(scale_mm_per_px, tissue, settings, tool, fps)
+    predictor, each = open_source(source, model, options, input)
+    motion = next(each)
+    if next(each, None) is not None:
+        raise UserError(f"source: {source} holds several sequences: give one of them")
+    return apply(predictor, motion, young_kpa, membrane)
+
+
+def open_source(
+    source: Path | Array, model: Predictor | str | Path | None, options: VideoOptions, input: str | None
+) -> tuple[Predictor, Iterator[Motion]]:
+    """The model, by default the pretrained one that fits, and the motions of a source for it."""
+    if not isinstance(model, Predictor):
+        model = load_model(model or choose_model(has_right_camera(source)), quick=True)
+    return model, motions(source, model.stored(input), options)
 
 
 def apply(
@@ -67,7 +134,7 @@ def apply(
     if last.force_mn is not None:
         out["force_mn"] = force
     notes = [finding.message for finding in findings if finding.severity == "warning"]
-    notes += one.notes() + estimator.notes
+    notes += one.notes() + estimator.notes + predictor.card.doubt(motion.recovered_by)
     if motion.scale_known:
         notes += estimator.interval_notes
         out |= _ends(found, trusted)

@@ -15,6 +15,7 @@ from learn.inference.predict import ForceMap, Predictor, net_force
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.intervals import Band, Prediction
 from learn.uncertainty.out_of_distribution import describe_out_of_distribution
+from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.confidence import LOW_CONFIDENCE
@@ -24,6 +25,7 @@ from synth.plugins import check_answer
 from synth.recording_flow.frame_motion import FrameMotion
 
 
+@checked
 def predict_force(
     model: Predictor,
     flow: Iterable[Map],
@@ -49,8 +51,6 @@ def predict_force(
     Raises:
         UserError: shapes that don't match, values that aren't finite, or a stereo model.
     """
-    if not isinstance(model, Predictor):
-        raise UserError(f"model: expected what `load_model` returns, got {type(model).__name__}")
     if len(size := np.shape(tissue)) != 2:
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0

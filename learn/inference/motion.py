@@ -16,10 +16,11 @@ from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.arrays import Array, Floats, Mask
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError
+from synth.flow.estimator import name_motion
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, judge_scale
-from synth.recording_flow.frame_motion import FrameMotion
+from synth.recording_flow.frame_motion import FrameMotion, Size
 from synth.recording_flow.passes import VideoPass, passes
 from synth.system import checked_file
 from synth.video import read as video
@@ -48,6 +49,7 @@ class Motion:
     young_kpa: float | None
     force_mn: Floats | None = None  # (T,) size of the true force, if known
     shrink: int = 1  # factor by which pictures were shrunk before flow
+    recovered_by: str = ""  # estimator and version of recovered motion; empty if unknown
     scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
 
 
@@ -56,20 +58,22 @@ class VideoOptions:
     """What a video file lacks, and settings of its flow."""
 
     scale_mm_per_px: StatedScale | None = None
-    tissue: Path | None = None  # a picture, white on tissue; None: found
+    tissue: Path | Array | None = None  # a picture, white on tissue, or (H, W); None: found
     settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
-    tool: MaskFiles | None = None  # instrument masks; None: detected in the pictures
+    tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
+    fps: float = video.FPS  # of pictures without times
 
 
-def motions(path: Path, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
-    """Motions in a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video or its PNGs.
+def motions(path: Path | Array, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
+    """Motions in a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video, its PNGs or its frames
+    (T, H, W, 3) uint8.
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
     instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for anything
     else, and for a video without a scale.
     """
-    if video.is_video(path):
+    if isinstance(path, np.ndarray) or video.is_video(path):
         yield _video(path, options or VideoOptions())
     elif path.suffix == ".npz":
         yield _arrays(path)
@@ -78,9 +82,9 @@ def motions(path: Path, source: str, options: VideoOptions | None = None) -> Ite
             yield _stored(sequence, source)
 
 
-def has_right_camera(path: Path) -> bool:
+def has_right_camera(path: Path | Array) -> bool:
     """Whether `path` holds motion in three dimensions; of a dataset its first sequence decides."""
-    if video.is_video(path):
+    if isinstance(path, np.ndarray) or video.is_video(path):
         return False
     if path.suffix == ".npz":
         return "motion" in checked_file.read_arrays(path)
@@ -117,21 +121,34 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
         young_kpa=young,
+        recovered_by=sequence.recovered_by if source in ("recovered", "motion") else "",
         force_mn=np.linalg.norm(force, axis=1),
     )
 
 
-def _video(path: Path, options: VideoOptions) -> Motion:
+def _video(source: Path | Array, options: VideoOptions) -> Motion:
+    path = source if isinstance(source, Path) else Path("frames")
     if options.scale_mm_per_px is None:
-        raise UserError(f"{path}: a video needs its scale: give --scale in mm/px, or --scale unknown")
+        raise UserError(f"{path}: a video needs its scale (scale_mm_per_px, --scale): mm/px, or unknown")
+    if isinstance(source, np.ndarray) and (source.dtype != np.uint8 or source.shape[3:] != (3,)):
+        raise UserError(f"{path}: {source.dtype} {source.shape}, expected uint8 (T, H, W, 3)")
     scale_known = options.scale_mm_per_px != "unknown"
-    tissue = None if options.tissue is None else partial(video.read_mask, options.tissue)
+    tissue: Callable[[Size], Mask] | None = None
+    if isinstance(options.tissue, Path):
+        tissue = partial(video.read_mask, options.tissue)
+    elif options.tissue is not None:
+        tissue = partial(_mask, "tissue", options.tissue, 0)
     taken: list[str] = [] if scale_known else [UNKNOWN_NOTE]
-    if path.is_dir():
-        taken.append(f"the pictures have no times: {video.FPS:g} per second are assumed")
-    count = range(0 if path.is_dir() else video.count_frames(path) or 0)
-    tool = options.tool.of_frames(count, taken).read if options.tool else None
-    footage = Footage(partial(video.read_frames, path, video.FPS), str(path), tissue, tool)
+    is_file = isinstance(source, Path) and not source.is_dir()
+    if isinstance(source, Path) and not is_file and options.fps == video.FPS:
+        taken.append(f"the pictures have no times: {options.fps:g} per second are assumed")
+    tool: Callable[[int, Size], Mask | None] | None = None
+    if isinstance(options.tool, MaskFiles):
+        count = video.count_frames(path) if is_file else None
+        tool = options.tool.of_frames(range(count or 0), taken).read
+    elif options.tool is not None:
+        tool = partial(_mask, "masks", options.tool)
+    footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool)
     every = passes(footage, options.settings)
     first = next(every)
     rest = first.rest
@@ -152,9 +169,23 @@ def _video(path: Path, options: VideoOptions) -> Motion:
         tissue=rest.tissue,
         scale_mm_per_px=scale * rest.shrink,
         young_kpa=None,
+        recovered_by=name_motion(options.settings.backend),
         shrink=rest.shrink,
         scale_known=scale_known,
     )
+
+
+def _pictures(source: Path | Array, fps: float) -> Iterator[video.Picture]:
+    if isinstance(source, Path):
+        return video.read_frames(source, fps)
+    return (video.Picture(t, t / fps, np.ascontiguousarray(rgb)) for t, rgb in enumerate(source))
+
+
+def _mask(what: str, given: Array, index: int, size: Size) -> Mask:
+    """The mask of a frame, (H, W), from one for all or from (T, H, W)."""
+    if given.shape[-2:] != size or given.ndim not in (2, 3) or (given.ndim == 3 and index >= len(given)):
+        raise UserError(f"{what}: {given.shape}, but frame {index} of the video is {size}")
+    return np.asarray((given if given.ndim == 2 else given[index]) != 0)
 
 
 def _arrays(path: Path) -> Motion:

@@ -18,12 +18,15 @@ from learn.data.grid import Grid, GridView, certainty, channels, membrane_code
 from learn.inference.shipped import find_model
 from learn.network.d2fnet import freeze, fused
 from learn.uncertainty.features import motion_features
+from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
-from synth.errors import UserError, as_path, as_positive, as_user_error
+from synth.errors import UserError, as_positive, as_user_error
 from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
+from synth.plugins import check_answer
 
 
+@checked
 def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
     """A trained model, to be called frame by frame (`Predictor`) or for a whole video (`predict_force`).
 
@@ -35,7 +38,7 @@ def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: b
     Raises:
         UserError: the folder is missing, damaged or edited.
     """
-    network, card = checkpoint.read_model(find_model(as_path("model", name)))
+    network, card = checkpoint.read_model(find_model(name))
     return Predictor(network, card, device, quick)
 
 
@@ -49,7 +52,7 @@ class Predictor:
         self.card, self.grid = card, card.settings.grid
         with as_user_error(f"device {device}"):
             self.device = torch.device(device)
-        self.model = fused(network).to(self.device)
+            self.model = fused(network).to(self.device)
         self._network: Callable[..., Any] = self.model
         if quick and self.device.type == "cpu":
             self._network = freeze(network, card.settings.arch, card.settings.size)
@@ -67,6 +70,7 @@ class Predictor:
         """The source to read from a store; the recovered one if none is given. Raises as `readable`."""
         return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
 
+    @checked
     def __call__(
         self,
         flow: Map,
@@ -121,6 +125,8 @@ class Predictor:
         height, width = view.tissue.shape
         if flow.shape != (height, width, 2):
             raise UserError(f"flow: expected ({height}, {width}, 2), got {flow.shape}")
+        if confidence is not None:
+            confidence = check_answer("Predictor", "confidence", confidence, (height, width), (0.0, 1.0))
         if not self.card.settings.arch.depth:
             shift = view.mean(flow.transpose(2, 0, 1) * view.scale_mm_per_px)
             return shift, None if confidence is None else view.mean(confidence)[None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from learn.data.grid import to_image
 from learn.inference.apply import apply
-from learn.inference.motion import VideoOptions, motions
+from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, length
 from synth.arrays import Pixels
 from synth.dataset.store import Sequence, open_sequence
@@ -85,22 +85,21 @@ class PredictedFile(NamedTuple):
 
 def predict_files(
     predictor: Predictor,
+    each: Iterable[Motion],
     source: Path,
     out: Path,
-    options: VideoOptions,
-    input: str | None = None,
     young_kpa: float | None = None,
     membrane: MembraneState = "unknown",
     overlay: bool = False,
 ) -> Iterator[PredictedFile]:
     """Estimates and writes the forces of each video of a source, one after the other, into the folder `out`.
 
-    `source`, `options`: as of `motions`; `input`: as of `Predictor.stored`; `young_kpa`, `membrane`: as of
-    `apply`; `overlay`: whether to write NAME.force.mp4 where the source has pictures. Raises UserError as
+    `predictor`, `each`: of `source` as `open_source` returns them; `young_kpa`, `membrane`: as of `apply`;
+    `overlay`: whether to write NAME.force.mp4 where the source has pictures. Raises UserError as
     those, and for a file that would overwrite its source.
     """
     alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
-    for motion in motions(source, predictor.stored(input), options):
+    for motion in each:
         stem = out / motion.name
         if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
             raise UserError(f"{file}: is the input and would be overwritten; choose another --out")

@@ -76,10 +76,11 @@ def pack_model(
 
 def describe(card: ModelCard) -> str:
     """A one-line summary of a model."""
-    settings, arch = card.settings, card.settings.arch
+    settings, arch, motion = card.settings, card.settings.arch, " and ".join(card.motion)
     return (
         f"{'stereo' if arch.depth else 'monocular'}, {arch.output}, {settings.size}² cells, "
-        f"{settings.extent_mm:g} mm, input {settings.input}; R² {card.score:.3f} on validation sequences, "
+        f"{settings.extent_mm:g} mm, input {settings.input} ({motion or 'version unknown'}); "
+        f"R² {card.score:.3f} on validation sequences, "
         f"{len(card.split.get('fit', []))} training sequences"
     )
 

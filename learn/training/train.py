@@ -20,7 +20,7 @@ from torchmetrics.aggregation import MeanMetric
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
-from learn.data.clips import Clip, sources
+from learn.data.clips import Clip, scored_source, sources
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
@@ -32,6 +32,7 @@ from learn.training.gpu_batches import place_frames
 from learn.training.threads import make_fabric
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
+from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
 
 CLIP = 1.0  # largest norm of the gradient
@@ -64,7 +65,10 @@ def train(
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     typical_young = float(np.exp(np.mean([np.log(clip.young_kpa) for clip in fit])))
-    card = ModelCard(settings, scales, typical_young, *name_parts(clips, split), [*split.hashes])
+    is_recovered = scored_source(settings.input) in ("recovered", "motion")
+    motion = sorted({clip.recovered_by for clip in fit if is_recovered} - {""})
+    parts = name_parts(clips, split)
+    card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)
     state = _open(out, card)
     try:
         run = _start(card, state)
@@ -263,7 +267,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     bound = planned or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
-    return checkpoint.load_tensors(out / "last.pt") if (out / "last.pt").exists() else None
+    return checked_file.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None
 
 
 def _cpu(state: dict[str, Any]) -> dict[str, Any]:

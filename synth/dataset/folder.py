@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import shutil
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,11 +20,10 @@ from synth.formats import FOLDER, check_format
 from synth.job import identity, writer
 from synth.job.schema import Job
 from synth.plugins import STORED
-from synth.system import checked_file
+from synth.system import checked_file, file_lock
 from synth.system.checked_file import write_whole as write_whole
 from synth.system.config_file import first_mistake
 
-_LOCK_WAIT_S = 5.0
 _NAME = "dataset.json"
 _STATE = ".run"
 
@@ -164,7 +161,7 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
                 raise UserError(f"{place}: is a link; remove it")
         makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
-        with _locked(folder.state / "lock") as folder.lock_fd:
+        with file_lock.hold(folder.state / "lock") as folder.lock_fd:
             _refuse_foreign(folder, job, name)
             for place in (folder.state / "failed", folder.logs, folder.scratch):
                 place.mkdir(exist_ok=True)
@@ -184,6 +181,8 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
                     folder.discard()
                     if created and not any(root.iterdir()):  # an interrupted sequence may be left
                         root.rmdir()
+    except file_lock.Locked:
+        raise UserError(f"{root}: another run is writing to it") from None
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR):
             raise UserError(f"{root}: cannot be written ({os.strerror(error.errno)})") from error
@@ -241,23 +240,3 @@ def _changes(before: dict[str, Any], now: dict[str, Any], at: str = "") -> list[
         elif old != new and f"{at}{key}" != "sequences":
             found.append(f"{at}{key} is {json.dumps(old)} there and {json.dumps(new)} here")
     return found
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[int]:
-    """Locks the file; workers inherit its descriptor, so that it is locked until the last one has ended."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    until = time.monotonic() + _LOCK_WAIT_S
-    try:
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise UserError(f"{path.parents[1]}: another run is writing to it") from None
-                time.sleep(0.1)
-            else:
-                break
-        yield descriptor
-    finally:
-        os.close(descriptor)

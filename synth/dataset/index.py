@@ -111,13 +111,13 @@ def read_index(root: Path) -> pa.Table:
     """
     path = root / NAME
     try:
-        checked_file.check_file(path, _LARGEST_BYTES)
-        about = pq.read_metadata(path)
+        # Arrow refuses a path that is not UTF-8.
+        data = pa.BufferReader(checked_file.read_bytes(path, _LARGEST_BYTES))
+        file = pq.ParquetFile(data, page_checksum_verification=True)
         # A dataset of format 2 has no instruments in its index.
-        names = [name for name in SCHEMA.names if name != "instrument" or name in about.schema.names]
-        if about.num_rows > _MOST_ROWS or about.schema.names != names:
+        names = [name for name in SCHEMA.names if name != "instrument" or name in file.metadata.schema.names]
+        if file.metadata.num_rows > _MOST_ROWS or file.metadata.schema.names != names:
             raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
-        file = pq.ParquetFile(path, memory_map=False, page_checksum_verification=True)
         table = pa.Table.from_pylist(file.read(use_threads=False).to_pylist(), SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:

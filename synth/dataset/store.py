@@ -13,12 +13,13 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
+from synth.arguments import checked
 from synth.arrays import Array
 from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
-from synth.errors import InvalidValue, NotFinite, UserError, as_path, did_you_mean
+from synth.errors import InvalidValue, NotFinite, UserError, did_you_mean
 from synth.fields import FIELDS, Field
-from synth.formats import STORE
+from synth.formats import MOTION, STORE
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
@@ -40,6 +41,8 @@ class Writer:
         self.path = location.store(folder, index)
         self._part = self.path.with_name(f"{self.path.name}.part")
         self._frames, self._size = frames, size
+        if self.path.exists():
+            raise UserError(f"{self.path}: exists already")
         if self._part.exists():
             shutil.rmtree(self._part)
         self._group = zarr.create_group(str(self._part), zarr_format=3)
@@ -101,7 +104,7 @@ class Writer:
             **attributes,
             "summary": summary,
             "field_hashes": hashes,
-            "versions": {**packages.versions(), "generator": provenance.fingerprint()},
+            "versions": {**packages.versions(), "generator": provenance.fingerprint(), "motion": str(MOTION)},
         }
         attrs = json.loads(identity.canonical(attrs))  # as it is read back
         attrs["content_hash"] = content_hash(attrs)
@@ -250,6 +253,12 @@ class Sequence:
         return {name: stage.get("cpu_s", 0.0) for name, stage in timings.items() if isinstance(stage, dict)}
 
     @property
+    def recovered_by(self) -> str:
+        """Estimator and version of its recovered motion, as `name_motion`; empty if unknown."""
+        version = self.attrs.get("versions", {}).get("motion")
+        return f"{self.attrs['flow_backend']} {version}" if version and "flow_backend" in self.attrs else ""
+
+    @property
     def fields(self) -> list[str]:
         """Names of its fields, in the table's order."""
         return [name for name in FIELDS if name in self]
@@ -311,8 +320,9 @@ class Sequence:
 class Dataset:
     """The sealed sequences of a folder or address, sorted by name, with `len`, iteration and indexing."""
 
+    @checked
     def __init__(self, root: Path | str) -> None:
-        self.root = as_path("dataset", root)
+        self.root = Path(root)
         self._addresses: list[str] | None = None
         if isinstance(root, str) and "://" in root:
             self._addresses = location.stores(root)
@@ -334,6 +344,7 @@ class Dataset:
         return (self[position] for position in range(len(self)))
 
 
+@checked
 def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
     """Opens a sealed sequence, by path or address.
 
@@ -344,7 +355,6 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
     Raises:
         UserError: the store is missing, unfinished, not a sequence, truncated or edited.
     """
-    as_path("sequence", path)
     if str(path).partition("::")[0].endswith(".part"):
         raise UserError(f"{path}: is an unfinished sequence")
     at = location.find_location(path)

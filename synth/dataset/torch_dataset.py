@@ -9,6 +9,7 @@ from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
+from synth.arguments import checked
 from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
@@ -26,6 +27,7 @@ class TorchDataset:
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 
+    @checked
     def __init__(self, root: Path | str, fields: Several[str], sequences: Several[int] | None = None) -> None:
         """
         Args:
@@ -40,6 +42,8 @@ class TorchDataset:
             raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
+        if not all(0 <= position < len(self._dataset) for position in self._chosen):
+            raise UserError(f"sequences: the dataset has positions 0 to {len(self._dataset) - 1}")
         self._ends: list[int] = []
         for sequence in map(self._dataset.__getitem__, self._chosen):
             missing = [name for name in fields if name not in sequence]

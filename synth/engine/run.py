@@ -7,16 +7,17 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from synth.arguments import checked
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
 from synth.engine.child import Attempt, Child, Setup, Slot, choose_gpus, environment, share_of_memory
 from synth.engine.journal import Journal, RunBars, Watcher
-from synth.errors import UserError
+from synth.errors import UserError, as_positive
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.publish import card, croissant, sequence_video
@@ -40,6 +41,12 @@ class Options:
     environment: Mapping[str, str] = field(default_factory=dict)  # added to the environment of the workers
     mix_versions: bool = False  # continue a dataset that another version of the program began
 
+    def __post_init__(self) -> None:
+        """Raises UserError for a number of processes or a limit that isn't positive."""
+        for name in ("workers", "memory_gb"):
+            if getattr(self, name) is not None:
+                as_positive(name, getattr(self, name))
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -56,6 +63,7 @@ class Summary:
     """Hash of the content hashes of all finished sequences in order."""
 
 
+@checked
 def render_job(
     job: Job | str | Path, out: str | Path, *, progress: bool | Watcher = False, **options: Any
 ) -> Summary:
@@ -74,10 +82,11 @@ def render_job(
         UserError: the folder is not for this job, the disk is full, or the job cannot be carried out.
     """
     job = as_job(job)
+    chosen = checked(Options)(**options)
     if progress is True:
         with RunBars() as bars:
-            return run_job(job, Path(out), Options(**options), bars)
-    return run_job(job, Path(out), Options(**options), progress or Watcher())
+            return run_job(job, Path(out), chosen, bars)
+    return run_job(job, Path(out), chosen, progress or Watcher())
 
 
 def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
@@ -133,6 +142,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         )
 
 
+@checked
 @contextmanager
 def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
     """A folder for custom scenes, written by `write_scene`; index, preview and card are written at the end.
@@ -147,8 +157,11 @@ def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
     with claim(Path(root), as_job(job)) as folder:
         try:
             yield folder.root
-        finally:
-            index.write_index(folder)
+        except BaseException:
+            with suppress(Exception):  # the error of the block is the one to show
+                index.write_index(folder)
+            raise
+        index.write_index(folder)
         _publish(folder)
 
 

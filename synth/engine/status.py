@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
 from collections import ChainMap, Counter
 from contextlib import suppress
@@ -19,7 +17,7 @@ from synth.dataset.size_forecast import Forecast
 from synth.dataset.store import open_sequence
 from synth.engine.journal import FILE, RunProgress
 from synth.errors import UserError
-from synth.system import checked_file
+from synth.system import checked_file, file_lock
 from synth.system.terminal import clock
 
 
@@ -91,20 +89,12 @@ def lines(status: Status) -> list[str]:
 
 def _progress(folder: Folder) -> RunProgress | None:
     """Progress of the current run; None if there is none."""
-    try:
-        descriptor = os.open(folder.state / "lock", os.O_RDONLY | os.O_NONBLOCK)
-    except FileNotFoundError:
+    if not file_lock.is_held(folder.state / "lock"):
         return None
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        return None
-    except BlockingIOError:
-        try:
-            return TypeAdapter(RunProgress).validate_python(checked_file.read_json(folder.state / FILE))
-        except (UserError, ValidationError):  # it has just begun, or is of another version
-            return RunProgress()
-    finally:
-        os.close(descriptor)
+        return TypeAdapter(RunProgress).validate_python(checked_file.read_json(folder.state / FILE))
+    except (UserError, ValidationError):  # it has just begun, or is of another version
+        return RunProgress()
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, side_areas
+from synth.plugins import check_answer
 
 _PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
 FRICTION = 0.4  # drag of a sliding tip, as a part of its push
@@ -145,6 +147,20 @@ def trajectory(gesture: Gesture, frames: int) -> ToolMotion:
     load[0] = 0.0
     shift = slid[:, None] * np.asarray(gesture.path_mm)
     return ToolMotion(load, np.maximum(away, lifted * (load < 1e-3)), shift)
+
+
+def check_motions(
+    motions: Sequence[ToolMotion], gestures: Sequence[Gesture], frames: int
+) -> list[ToolMotion]:
+    """The motions; UserError unless each gesture has one over those frames, finite and at rest in frame 0."""
+    if len(motions) != len(gestures):
+        raise UserError(f"motions: {len(motions)} for the scene's {len(gestures)} instruments")
+    for k, motion in enumerate(motions):
+        for name, shape in (("load", (frames,)), ("away", (frames,)), ("shift", (frames, 2))):
+            value = check_answer(f"motions[{k}]", name, getattr(motion, name), shape)
+            if name != "away" and value[0].any():
+                raise UserError(f"motions[{k}]: {name}: is not 0 in frame 0, the rest frame")
+    return [ToolMotion(*(np.asarray(value, np.float64) for value in vars(one).values())) for one in motions]
 
 
 def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floats) -> Floats:

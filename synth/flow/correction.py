@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from synth.arrays import Array, Map, Mask, Pixels
 from synth.flow import kernels
 from synth.flow.image import GREY
+from synth.system import checked_file
 from synth.system.jit import vectorised
 
 WEIGHTS = Path(__file__).with_name("correction.pt")
@@ -90,7 +91,7 @@ class CorrectionNet(nn.Module):
 def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
     """A network with its weights."""
     net = CorrectionNet(channels, parts)
-    state = torch.load(path, map_location="cpu", weights_only=True)
+    state = checked_file.read_tensors(path)
     net.load_state_dict({name: value.float() for name, value in state.items()})
     # This layout takes two thirds of the time on a CPU.
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import as_user_error
+from synth.formats import MOTION
 from synth.plugins import ESTIMATORS, check_answer
 
 
@@ -28,6 +29,16 @@ class Estimator(Protocol):
             Flow (H, W, 2) float32 px, finite everywhere, and confidence (H, W) float32 in 0..1.
         """
         ...
+
+
+def name_backend(backend: str | Estimator) -> str:
+    """The name of an estimator, or of its class."""
+    return backend if isinstance(backend, str) else type(backend).__qualname__
+
+
+def name_motion(backend: str | Estimator) -> str:
+    """Estimator and version of motion that is recovered now, `tvl1 1`, as models' cards hold it."""
+    return f"{name_backend(backend)} {MOTION}"
 
 
 class CheckedEstimator:

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from synth.arrays import Map, Pixels
+from synth.system import checked_file
 
 WEIGHTS = Path(__file__).with_name("toolnet.pt")
 SIDE = 160  # px, longer side of the input
@@ -62,7 +63,7 @@ def prepare(rgb: Pixels) -> Map:
 def load() -> ToolNet:
     """The network with its weights."""
     net = ToolNet()
-    net.load_state_dict(torch.load(WEIGHTS, map_location="cpu", weights_only=True))  # half precision, widened
+    net.load_state_dict(checked_file.read_tensors(WEIGHTS))  # half precision, widened
     return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synth.arguments import checked
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import mask_detection
@@ -143,6 +144,7 @@ class Tracker:
         return found.flow * self.tissue[..., None], sure
 
 
+@checked
 def recover_flow(frames: Pixels, tool: Mask, tissue: Mask, backend: str | Estimator = "tvl1") -> Track:
     """Displacement through a video with known instrument masks; specular highlights are detected.
 

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from synth.arguments import checked
 from synth.arrays import Floats
 from synth.errors import InvalidValue, UserError, as_user_error
 from synth.plugins import Registry
@@ -58,6 +59,7 @@ class Law(Protocol):
         ...
 
 
+@checked
 def add_law(name: str, law: Law) -> None:
     """Registers a law under a name for `fem.law` in this process, to try it before it is packaged.
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 
-from synth.errors import UserError, as_path, did_you_mean
+from synth.arguments import checked
+from synth.errors import UserError, did_you_mean
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import checked_file
@@ -20,6 +21,7 @@ def names() -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in jobs if entry.name.endswith(".yaml"))
 
 
+@checked
 def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
@@ -31,7 +33,6 @@ def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     Raises:
         UserError: one line for each error, `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
     """
-    as_path("job", source)
     text, label, folder = read_source(str(source))
     return parse_job(text, label, folder, overrides)
 

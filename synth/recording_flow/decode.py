@@ -11,6 +11,7 @@ import numpy as np
 
 from synth.arrays import Mask
 from synth.errors import UserError, as_positive
+from synth.flow.estimator import Estimator
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.picture_faults import VideoFaults, find_bars, find_fault, is_inside_out
@@ -26,8 +27,8 @@ LEAST_COLUMNS = 320  # least width with `shrink` 0: the grids of the networks ar
 class RecordingFlowSettings:
     """Settings for tracking a video."""
 
-    backend: str = "tvl1"
-    """Flow estimator."""
+    backend: str | Estimator = "tvl1"
+    """Flow estimator, or its name."""
     shrink: int = 0
     """Factor by which pictures are downsampled for flow; 0: the largest that leaves `LEAST_COLUMNS`."""
     rate_hz: float | None = 10.0

@@ -20,6 +20,7 @@ from multiprocessing import get_context, parent_process
 
 from synth.arrays import Mask, Pixels
 from synth.flow.confidence import add_deviation
+from synth.flow.estimator import Estimator
 from synth.flow.mask_selection import Proposal, SelectingTracker
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -29,7 +30,7 @@ class LocalFlow:
 
     ahead = 0  # number of frames that may be submitted before the first result is awaited
 
-    def begin(self, backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
+    def begin(self, backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
         """Starts with the rest frame; arguments and errors as for `SelectingTracker`."""
         self._tracker = SelectingTracker(backend, rest, proposal, tissue)
 
@@ -69,7 +70,7 @@ class FlowProcess(LocalFlow):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
+    def begin(self, backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
         """See `LocalFlow`."""
         self._pool.submit(_begin, backend, rest, proposal, tissue).result()
 
@@ -108,7 +109,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
+def _begin(backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
     _flow.begin(backend, rest, proposal, tissue)
 
 

@@ -10,7 +10,7 @@ from synth.fem.deformation import Deformation
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.tool_gesture import ToolMotion
+from synth.fem.tool_gesture import ToolMotion, check_motions
 from synth.sequence.scene import RestScene
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -24,13 +24,14 @@ class FemMechanics:
 
     def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
         """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
+        motions = self.motions and check_motions(self.motions, rest.scenario.gestures, rest.job.frames)
         job, case, opening_mm = rest.job, rest.scenario, rest.job.anatomy.craniotomy.radius_mm
         with watch.stage("mesh"):
             tets = build_volume(rest)
         report("fem", 0, 1)
         with watch.stage("fem"):
             tissue, duration = (job.fem, case.tissue, case.gestures), (job.frames, job.fps)
-            return solver.deform(*tissue, tets, rest.shape, *duration, case.pulse, opening_mm, self.motions)
+            return solver.deform(*tissue, tets, rest.shape, *duration, case.pulse, opening_mm, motions)
 
 
 def build_volume(rest: RestScene) -> Tets:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.arguments import checked
 from synth.arrays import Mask, Pixels
 from synth.dataset.store import Writer
 from synth.errors import UserError
@@ -79,8 +80,9 @@ def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -
     return write_scene(simulate(job, index, report, watch), folder, report, watch)
 
 
+@checked
 def write_scene(
-    scene: Scene, folder: Path, report: StageCallback | None = None, watch: Stopwatch | None = None
+    scene: Scene, folder: str | Path, report: StageCallback | None = None, watch: Stopwatch | None = None
 ) -> Path:
     """Renders a scene, recovers its flow and writes `folder/NNNNNN.zarr`; else as `render_sequence`."""
     job, report, watch = scene.job, report or (lambda stage, done, of: None), watch or Stopwatch()
@@ -89,7 +91,7 @@ def write_scene(
 
     _refuse_unseen(scene)
     width, height = job.render.size
-    writer = Writer(folder, scene.index, frames=job.frames, size=(height, width), job=job)
+    writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=job)
     writer.put("time", scene.time)
     writer.put("force", scene.force)  # labels are in camera axes
     if writer.wants("force_of"):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.arguments import checked
 from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem import tool_gesture
@@ -74,9 +75,12 @@ class Scenario:
         return asdict(self)
 
 
+@checked
 def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     """Draws sequence `index` of `job`, independently of the others' number and order."""
     job = as_job(job)
+    if index < 0:
+        raise UserError(f"index {index}: sequences are numbered from 0")
     family = job.appearance.families[index % len(job.appearance.families)]
     generator = partial(_generator, job, _SEQUENCE, index)
     relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))

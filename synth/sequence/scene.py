@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
+from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.fem.deformation import Deformation
@@ -151,6 +152,7 @@ class Scene(RestScene):
         """Young's modulus of the tissue."""
         return self.scenario.tissue.young_kpa
 
+    @checked
     def frame(self, t: int) -> Frame:
         """Renders frame `t`, 0 <= t < T, independently of other frames.
 
@@ -176,6 +178,7 @@ class Scene(RestScene):
         """Renders the frames in order, one at a time."""
         return (self.frame(t) for t in range(len(self)))
 
+    @checked
     def recover_flow(self, frames: Sequence[Frame], backend: str | Estimator | None = None) -> Track:
         """Recovers flow (T, H, W, 2) px from the pictures, with its confidence (T, H, W) and trust (T,).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from synth.arguments import checked
 from synth.errors import UserError
 from synth.fem.deformation import check_deformation
 from synth.fem.tool_gesture import ToolMotion, trajectory
@@ -18,6 +19,7 @@ from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 
+@checked
 def simulate(
     job: Job | str | Path,
     index: int = 0,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import functools
 import hashlib
@@ -10,6 +9,7 @@ import os
 import stat
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -25,31 +25,35 @@ def folder(name: str) -> Path:
     """The cache folder of that name, created if necessary.
 
     It is in `SULCUS_CACHE`, else in the user's cache (`XDG_CACHE_HOME`, else ~/.cache); if neither is
-    writable (no home, read-only), in a private folder of this user in the system's temporary one.
+    writable (no home, read-only), in the system's temporary folder. Cached code is executed: where others own
+    the folder or may write to it, it is `user-UID` inside.
 
     Raises:
-        OSError: no folder is writable, or others own or may write to the temporary one: cached code is
-        executed.
+        OSError: no folder is writable, or others own or may write to the user's own.
     """
     user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
     places = [
         Path(os.environ["SULCUS_CACHE"]) if "SULCUS_CACHE" in os.environ else None,
         Path(user) / "sulcus" if user else Path(home) / ".cache" / "sulcus" if home else None,
     ]
-    for place in filter(None, places):
-        try:
-            (place / name).mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(place / name, os.W_OK):
-            return place / name
+    user_id = f"user-{os.getuid()}"
     mine = Path(tempfile.gettempdir()) / f"sulcus-{os.getuid()}"
-    mine.mkdir(mode=0o700, exist_ok=True)
-    about = mine.lstat()
-    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o077:
-        raise PermissionError(f"{mine}: is not this user's alone")
-    (mine / name).mkdir(exist_ok=True)
-    return mine / name
+    for inside in (*(one for place in filter(None, places) for one in (place, place / user_id)), mine):
+        with suppress(OSError):
+            (inside / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (inside / name).mkdir(mode=0o700, exist_ok=True)
+            if all(is_private(one) for one in {inside / name, inside} - set(places)):
+                return inside / name
+    raise PermissionError(f"{mine}: is not writable, or not by this user alone")
+
+
+def is_private(folder: Path) -> bool:
+    """Whether a folder exists, is no link, and only this user may write to it."""
+    with suppress(OSError):
+        about = folder.lstat()
+        own = about.st_uid == os.getuid() and not about.st_mode & 0o022
+        return stat.S_ISDIR(about.st_mode) and own and os.access(folder, os.W_OK)
+    return False
 
 
 def cached(
@@ -75,17 +79,15 @@ def cached(
     name, ending = file.split("/")
     word = hashlib.sha256(key).hexdigest()[:32]
     place = folder(name) / f"{word}.{ending}"
-    with contextlib.suppress(OSError, *faults):
+    with suppress(OSError, *faults):
         return load(place.read_bytes())
-    with contextlib.ExitStack() as held:
-        with contextlib.suppress(
-            OSError
-        ):  # few locks, as they are never deleted; sharing one only costs time
+    with ExitStack() as held:
+        with suppress(OSError):  # few locks, as they are never deleted; sharing one only costs time
             fcntl.flock(held.enter_context((place.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
-        with contextlib.suppress(OSError, *faults):
+        with suppress(OSError, *faults):
             return load(place.read_bytes())
         made = make()
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             write_whole(place, dump(made), durable=False)
             for old in sorted(place.parent.glob(f"*.{ending}"), key=lambda one: one.stat().st_mtime)[:-most]:
                 old.unlink()

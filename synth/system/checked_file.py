@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import shutil
 import stat
 import tempfile
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
@@ -51,7 +53,7 @@ def check_file(path: Path, largest: int) -> None:
 def read_bytes(path: Path, largest: int) -> bytes:
     """The bytes of a file. Raises as `open_file`."""
     with open_file(path, largest) as file:
-        return file.read(largest)
+        return file.read(os.fstat(file.fileno()).st_size)  # `read` allocates what it is given
 
 
 def read_text(path: Path, largest: int, encoding: str = "utf-8") -> str:
@@ -77,6 +79,26 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             if array.dtype.kind not in "biuf":
                 raise ValueError(f"{name} is not an array of numbers")
         return found
+
+
+def read_tensors(path: Path) -> dict[str, Any]:
+    """The tensors and plain values that `torch.save` wrote, by name, on the CPU. UserError for others."""
+    import torch
+
+    with open_file(path, _LARGEST_ARRAYS) as file, as_user_error(f"{path}: corrupt checkpoint"):
+        with zipfile.ZipFile(file) as archive:  # PyTorch ignores checksums
+            if sum(entry.file_size for entry in archive.infolist()) > os.fstat(file.fileno()).st_size:
+                raise ValueError("compressed")
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"a checksum of {damaged} does not match")
+        try:
+            file.seek(0)
+            tree = torch.load(file, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:  # its message advises to load them all the same
+            raise ValueError("holds other objects than tensors and plain values") from None
+        if not isinstance(tree, dict):
+            raise TypeError("holds no state")
+        return tree
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
@@ -159,13 +181,13 @@ def write_whole(path: Path, text: str | bytes, *, durable: bool = True) -> None:
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Writes (H, W, 3) sRGB in the format of the name's suffix. UserError if it can't be written."""
+    """Writes (H, W, 3) sRGB, or (H, W), in the format of the name's suffix. Raises UserError."""
     import cv2
 
     if not cv2.haveImageWriter(path.name):
         raise UserError(f"{path}: cannot be written as a picture (.png or .jpg)")
     with as_user_error(f"{path}: cannot be written as a picture"):
-        _, data = cv2.imencode(path.suffix, picture[..., ::-1])
+        _, data = cv2.imencode(path.suffix, picture[..., ::-1] if picture.ndim == 3 else picture)
         write_whole(path, data.tobytes(), durable=False)
 
 

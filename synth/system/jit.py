@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -15,16 +17,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 def compiled(function: F, **how: str) -> F:
     """Compiles with numba and its options `how`, once per machine rather than once per process.
 
-    The cache is in `NUMBA_CACHE_DIR`, else next to the package, else in the user's cache folder (numba's own
-    order), else in ours (`synth.system.cache`); if none of these is writable there is no cache.
+    The cache is in `NUMBA_CACHE_DIR` if it is this user's alone; without that next to the package, else in
+    the user's cache folder (numba's own order); else in ours (`synth.system.cache`), if it is writable.
 
     numba detects changes only in the file of the function itself. Hence the rule of this package: a compiled
     function only calls compiled functions of its own file.
     """
-    try:
-        return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # no writable folder: a read-only installation without a home
-        before = numba.config.CACHE_DIR
+    before = numba.config.CACHE_DIR
+    with suppress(RuntimeError):  # no writable folder: a read-only installation without a home
+        if not before or cache.is_private(Path(before)):
+            return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]
     try:
         numba.config.CACHE_DIR = str(cache.folder("loops"))
         return numba.njit(cache=True, nogil=True, **how)(function)  # type: ignore[no-any-return]

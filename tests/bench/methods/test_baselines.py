@@ -107,8 +107,8 @@ def test_rules_are_fitted_once_for_a_model(tmp_path: Path, monkeypatch: pytest.M
     fitted = [made_clip(k, rng.normal(size=(4, 2, N, N)), rng.normal(size=(4, 3))) for k in range(6)]
     times: list[int] = []
 
-    def cached(hashes: str, source: str = "recovered") -> dict[str, baselines.Rule]:
-        def fit() -> dict[str, baselines.Rule]:
+    def cached(hashes: str, source: str = "recovered") -> dict[str, baselines.Linear]:
+        def fit() -> dict[str, baselines.Linear]:
             times.append(1)
             return baselines.fitted_rules(fitted, "recovered")
 

@@ -158,3 +158,16 @@ def test_a_written_meta_is_read_back_as_the_defaults(tmp_path: Path) -> None:
     assert meta.read_meta(tmp_path / "meta.yaml") == meta.Meta(scale_mm_per_px="unknown")
     stills = Maker(tmp_path)(frames=4) / "frames"
     assert [one.time_s for one in video.read_frames(stills, 10.0)] == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize("name", ["/etc/hosts", "../pair.yaml", "link.yaml"])
+def test_a_calibration_stays_in_the_recordings_folder(tmp_path: Path, name: str) -> None:
+    inside = tmp_path / "recording"
+    inside.mkdir()
+    (tmp_path / "pair.yaml").touch()
+    (inside / "link.yaml").symlink_to("../pair.yaml")
+    for section in ("stereo:\n  calibration", "calibration: {corners: [3, 3], square_mm: 1, checkerboard"):
+        end = "}" if "{" in section else ""
+        (inside / "meta.yaml").write_text(f"{section}: {name}{end}\n")
+        with pytest.raises(UserError, match=name):
+            meta.read_meta(inside / "meta.yaml")

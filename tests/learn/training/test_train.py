@@ -15,6 +15,7 @@ from learn.training.batches import Batch, FrameDataset, FrameItem, add_surface_m
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
+from synth.system import checked_file
 from synth.system.config_file import override
 
 
@@ -36,7 +37,7 @@ def model(clips: list[Clip], split: Split, tmp_path_factory: pytest.TempPathFact
 
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
-    state: dict[str, torch.Tensor] = checkpoint.load_tensors(folder / "last.pt")["model"]
+    state: dict[str, torch.Tensor] = checked_file.read_tensors(folder / "last.pt")["model"]
     return state
 
 

@@ -157,7 +157,7 @@ def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("synth.dataset.folder._LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr("synth.system.file_lock._WAIT_S", 0.3)
     first = start(tmp_path / "out", JOB, "slow")
     try:
         wait_for(lambda: (tmp_path / "out/.run/lock").exists())

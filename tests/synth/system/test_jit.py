@@ -29,6 +29,20 @@ def test_the_cache_is_in_a_private_writable_folder(tmp_path: Path, monkeypatch: 
         cache.folder.__wrapped__("loops")
 
 
+def test_a_cache_that_others_may_write_to_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SULCUS_CACHE", str(tmp_path))
+    own = tmp_path / f"user-{os.getuid()}" / "loops"
+    for mode in (0o770, 0o707):
+        (tmp_path / "loops").mkdir(exist_ok=True)
+        (tmp_path / "loops").chmod(mode)
+        assert cache.folder.__wrapped__("loops") == own
+        (tmp_path / "loops").rmdir()
+    (tmp_path / "loops").symlink_to(tmp_path)  # which another user can direct elsewhere
+    assert cache.folder.__wrapped__("loops") == own
+
+
 def test_concurrent_calls_compute_a_result_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "folder", lambda name: tmp_path)
     made = list[int]()

@@ -1,0 +1,85 @@
+"""The check of a public function's arguments against its annotations."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import re
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union
+
+import numpy as np
+
+from synth.errors import UserError
+
+P, R = ParamSpec("P"), TypeVar("R")
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """The function; arguments that are not what its annotations state end in a UserError that names them.
+
+    Numbers of NumPy are numbers, Booleans are not; a number must be finite; a protocol needs its methods;
+    lists of numbers become arrays.
+    """
+    signature, title = inspect.signature(function), re.sub(r"\.__\w+__$", "", function.__qualname__)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        bound = signature.bind(*args, **kwargs)
+        for name, hint in _hints(function).items():
+            value = bound.arguments.get(name)
+            if (
+                name not in bound.arguments
+                or signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
+            ):
+                continue
+            if not _fits(value, hint):
+                wanted = re.sub(
+                    r"\b(Map|Mask|Floats|Pixels|Array)\b", "array", str(function.__annotations__[name])
+                )
+                given = repr(value)[:80] if isinstance(value, (str, Real, Path, list, tuple)) else type(value)
+                raise UserError(f"{title}: {name}: expected {wanted}, got {given}")
+            if isinstance(value, (list, tuple)) and np.ndarray in map(_kind, (hint, *typing.get_args(hint))):
+                bound.arguments[name] = np.asarray(value)
+        return function(*bound.args, **bound.kwargs)
+
+    return call
+
+
+_hints = functools.cache(typing.get_type_hints)
+
+
+def _kind(hint: Any) -> Any:
+    return typing.get_origin(hint) or hint
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    kind, args = _kind(hint), typing.get_args(hint)
+    if kind is Any:
+        return True
+    if kind in (Union, UnionType):
+        is_blank = Path in args and isinstance(value, str) and not value
+        return not is_blank and any(_fits(value, one) for one in args)
+    if kind is Literal:
+        return isinstance(value, str) and value in args
+    if kind in (int, float):
+        number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        return number and math.isfinite(value)
+    if kind is np.ndarray:
+        try:
+            return np.ndim(value) > 0 and np.asarray(value).dtype.kind in "biuf"
+        except (ValueError, TypeError):  # ragged lists
+            return False
+    if getattr(kind, "_is_protocol", False) and kind is not Iterable:
+        members = [name for name, one in vars(kind).items() if callable(one) and name[0] != "_"]
+        return all(callable(getattr(value, name, None)) for name in members or ["__call__"])
+    if kind in (Sequence, Iterable) and isinstance(value, (str, bytes)):
+        return False
+    if kind is Sequence and isinstance(value, Sequence):
+        return all(_fits(one, args[0]) for one in value)
+    return isinstance(value, kind)

@@ -1,0 +1,93 @@
+"""Exclusion of other processes by a locked file, also on file systems without locks (some Lustre and NFS)."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import time
+from _thread import interrupt_main
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_NONE = errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP
+_WAIT_S = 5.0
+_LEASE_S = 30.0  # after which a silent process of another machine has ended; refreshed three times as often
+
+
+class Locked(Exception):
+    """Another process holds the lock."""
+
+
+@contextmanager
+def hold(path: Path) -> Iterator[int]:
+    """Holds the lock of a file, which is created; yields its descriptor.
+
+    Processes that inherit the descriptor hold it too. Without locks of the file system a file next to it
+    states this process and is refreshed: a dead process's is taken at once, that of another machine after
+    half a minute. If it is lost, as after a suspension, this process is interrupted.
+
+    Raises `Locked` after some seconds.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    until = time.monotonic() + _WAIT_S
+    try:
+        while (locked := _try_lock(descriptor, fcntl.LOCK_EX)) is False or (locked and _is_leased(path)):
+            if time.monotonic() > until:
+                raise Locked
+            time.sleep(0.1)
+        if locked:
+            yield descriptor
+            return
+        from filelock import SoftFileLease, Timeout
+
+        lease = SoftFileLease(
+            _lease(path), lease_duration=_LEASE_S, on_compromise=lambda lost: interrupt_main()
+        )
+        try:
+            lease.acquire(timeout=_LEASE_S + _WAIT_S)
+        except Timeout:
+            raise Locked from None
+        try:
+            yield descriptor
+        finally:
+            lease.release()
+    finally:
+        os.close(descriptor)
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process holds the lock of a file; one that ended without notice counts for a minute."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return False
+    try:
+        return _try_lock(descriptor, fcntl.LOCK_SH) is False or _is_leased(path)
+    finally:
+        os.close(descriptor)
+
+
+def _try_lock(descriptor: int, how: int) -> bool | None:
+    """Whether the lock was free and is now held; None where the file system has none."""
+    try:
+        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno in _NONE:
+            return None
+        raise
+    return True
+
+
+def _lease(path: Path) -> Path:
+    return path.with_name(f"{path.name}.lease")
+
+
+def _is_leased(path: Path) -> bool:
+    """Whether a machine without locks has refreshed its lease lately, by the clock of this one."""
+    with suppress(FileNotFoundError):
+        return time.time() - _lease(path).stat().st_mtime < 2 * _LEASE_S
+    return False
