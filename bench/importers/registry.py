@@ -20,6 +20,7 @@ import numpy as np
 from bench.recording import clocks, writer
 from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
+from synth.flow.stereo.calibration import read_rig
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 from synth.video import read as video
@@ -134,9 +135,11 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if calibration is not None:
         if found.second is None:
             raise UserError("--use calibration=...: requires right=... or --stereo-layout")
-        found = replace(
-            found, second=replace(found.second, pair=checked_file.read_storage(Path(calibration)))
-        )
+        height, width = next(found.pictures()).shape[:2]
+        rig = read_rig(Path(calibration), (width, height))
+        pair = {"K1": rig.left.K, "D1": rig.left.distortion, "K2": rig.right.K, "D2": rig.right.distortion}
+        pair |= {"R": rig.rotation, "T": rig.translation[:, None]}
+        found = replace(found, second=replace(found.second, pair=pair))
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
