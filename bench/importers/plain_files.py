@@ -57,10 +57,13 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     second = None
     if "right" in use:
         other = Path(use["right"])
-        right, own, _ = _open(*((other, None) if other.exists() else (source, use["right"])), notes)
+        where, names = (other, None) if other.exists() else (source, use["right"])
+        right, own, _ = _open(where, names, notes)
         at = {number: k for k, number in enumerate(numbers)}
         second = SecondView("right", np.array([at.get(number, -1) for number in own]), right)
-    force = _read_forces(Path(use["force"]), notes) if "force" in use else ()
+    force = np.zeros(0), np.zeros((0, 3))
+    if "force" in use:
+        force = _read_forces(Path(use["force"]), notes)
     return Intake(times, pictures, *force, notes=tuple(notes), second=second)
 
 
@@ -108,7 +111,7 @@ def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
             wanted = min(_AT_ONCE, count - k)
             found = [checked_file.read_picture(path, flags)]
             if count > 1:
-                found = cv2.imreadmulti(str(path), start=k, count=wanted, flags=flags)[1]
+                found = [*cv2.imreadmulti(str(path), start=k, count=wanted, flags=flags)[1]]
             if len(found) < wanted:
                 raise UserError(f"{path}: page {k + len(found)} of {count} is damaged")
             yield from (picture[..., ::-1] for picture in found)
@@ -148,7 +151,7 @@ def _seconds(path: Path, notes: list[str]) -> Floats:
         why = "several stamps" if stamps else "no column of times"
         raise UserError(f"{path}: {why}; the header has {', '.join(csv_table.read_header(path))}")
     found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(path, _NANOSECONDS))])
-    name = stamps[0] if stamps and np.nanmax(found[stamps[0]]) > 0 else times[0]
+    name = stamps[0] if stamps and (not times or np.nanmax(found[stamps[0]]) > 0) else times[0]
     if stamps and times:
         notes.append(f"{path}: times are those of {name}, not {times[0] if name in stamps else stamps[0]}")
     values = found[name]

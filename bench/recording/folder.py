@@ -279,8 +279,8 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     forces = ("fx_n", "fy_n", "fz_n")
     columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
     columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
-    blank = np.isnan([columns[name] for name in forces]).all(axis=0)
-    if 0 < blank.sum() < len(blank):  # rows of other instruments, as in joined tables
+    blank = np.asarray(np.isnan([columns[name] for name in forces]).all(axis=0), bool)
+    if 0 < blank.sum() < blank.size:  # rows of other instruments, as in joined tables
         notes.append(f"{path.name}: {blank.sum()} rows without a force left out")
         columns = {name: column[~blank] for name, column in columns.items()}
     for fault, check in (("without a time", np.isfinite), ("whose time repeats or runs backwards", _rising)):

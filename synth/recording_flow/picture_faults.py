@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -159,6 +160,10 @@ class VideoFaults:
             (surely if noisy or caught_up else maybe).update(dict.fromkeys(self._numbers[first:stop], shown))
         return surely, maybe
 
+    @cached_property
+    def _layout(self) -> str:
+        return stereo_layout.find_layout(self._first)
+
     def findings(self) -> list[Finding]:
         """Findings after the last frame."""
         # The median over parts ignores an instrument that enters; a cut or bump changes most of the picture.
@@ -168,8 +173,8 @@ class VideoFaults:
         cuts = [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])]
         at = dict(zip(self._numbers, self._times, strict=True))
         found = [Finding("warning", "pictures", message) for message in self._rest]
-        if layout := stereo_layout.find_layout(self._first):
-            message = f"two cameras in one video: split it by bench import --stereo-layout {layout}"
+        if self._layout:
+            message = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
             found.append(Finding("error", "pictures", message))
         for times, fault in (
             (self._combed, "interlaced: deinterlace the video"),

@@ -69,10 +69,8 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
         # Two cores at most: a bench machine scores several recordings at a time.
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = 2
-        start_s, index = (
-            0.0 if container.format.name == "avi" else (container.start_time or 0) / av.time_base,
-            0,
-        )
+        has_times, index = container.format.name != "avi", 0
+        start_s = (container.start_time or 0) / av.time_base if has_times else 0.0
         try:
             for frame, ticks in _decode(container, stream):
                 width = _square_width(frame.width, stream.sample_aspect_ratio)
@@ -205,7 +203,7 @@ def as_8_bits(picture: Array, bits: int) -> Array:
     """A picture of 16 bits, of which so many are used, reduced to uint8; others as they are."""
     if picture.dtype.kind != "u" or picture.dtype.itemsize != 2:
         return picture
-    return np.minimum(picture >> (bits - 8), 255).astype(np.uint8)
+    return np.asarray(np.minimum(picture >> (bits - 8), 255), np.uint8)
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Mask:
