@@ -195,6 +195,8 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             held = io.BytesIO(_whole(data) if kind == "stl" else data)
             mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+            raise ValueError("a face refers to a missing point")
     except Exception as error:  # readers of formats raise anything
         why = first_line(error)
         raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({why})") from error

@@ -42,7 +42,7 @@ def read_vtk(data: bytes) -> tuple[Floats, Ints]:
             cells = [
                 (c, k) for (c, _), k in zip(cells, file.numbers(len(cells), "int").tolist(), strict=True)
             ]
-    return points, _triangles(points, cells)
+    return points, _triangles(cells)
 
 
 def read_vtp(data: bytes) -> tuple[Floats, Ints, str]:
@@ -87,11 +87,11 @@ def read_vtp(data: bytes) -> tuple[Floats, Ints, str]:
             cells += [(cell, kind) for cell in found]
         points = np.concatenate([points, array(piece.find("Points/DataArray")).reshape(-1, 3)])
     space = array(root.find(".//FieldData/Array[@Name='SPACE']"))
-    return points, _triangles(points, cells), bytes(space.astype(np.uint8)).decode("latin-1").strip("\0")
+    return points, _triangles(cells), bytes(space.astype(np.uint8)).decode("latin-1").strip("\0")
 
 
-def _triangles(points: Floats, cells: Iterable[tuple[Ints, int]]) -> Ints:
-    """Triangles (F, 3) of cells with their kinds. ValueError if there are none, or points are missing."""
+def _triangles(cells: Iterable[tuple[Ints, int]]) -> Ints:
+    """Triangles (F, 3) of cells with their kinds. ValueError if there are none."""
     found: list[tuple[int, int, int]] = []
     volumes = 0
     for cell, kind in cells:
@@ -106,8 +106,6 @@ def _triangles(points: Floats, cells: Iterable[tuple[Ints, int]]) -> Ints:
         raise ValueError(
             "it contains volume cells, not a surface: extract it" if volumes else "it contains no polygons"
         )
-    if not 0 <= faces.min() <= faces.max() < len(points):
-        raise ValueError("a polygon refers to a missing point")
     return faces
 
 
