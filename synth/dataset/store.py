@@ -337,6 +337,7 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.paths)
 
+    @checked
     def __getitem__(self, position: int) -> Sequence:
         return open_sequence((self._addresses or self.paths)[position])
 

@@ -7,7 +7,7 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -154,15 +154,21 @@ def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
     Raises:
         UserError: the folder is not for this job.
     """
-    with claim(Path(root), as_job(job)) as folder:
-        try:
-            yield folder.root
-        except BaseException:
-            with suppress(Exception):  # the error of the block is the one to show
+    mine: BaseException | None = None
+    try:
+        with claim(Path(root), as_job(job)) as folder:
+            try:
+                yield folder.root
+            except BaseException as error:
+                mine = error
+                raise
+            finally:
                 index.write_index(folder)
-            raise
-        index.write_index(folder)
-        _publish(folder)
+            _publish(folder)
+    except BaseException:
+        if mine is not None:  # not that of the cleaning after it
+            raise mine from mine.__cause__
+        raise
 
 
 def _publish(folder: Folder) -> None:

@@ -1,0 +1,67 @@
+"""Arguments of the public functions: whatever is given, one line names the argument."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bench
+import learn
+import synth
+from synth.errors import UserError
+
+ODD: tuple[Any, ...] = (
+    -1,
+    float("nan"),
+    True,
+    [1, "a", None],
+    {"a": 1},
+    object(),
+    np.zeros((2, 2, 2)),
+    int,
+    b"x",
+)
+CALLS = {
+    synth.simulate: ({"job": "tiny"}, "index", "case", "motions", "mechanics"),
+    synth.load_job: ({"source": "tiny"}, "source", "overrides"),
+    synth.render_job: ({"job": "tiny", "out": "out"}, "job", "out", "workers", "memory_gb"),
+    synth.write_scene: ({"scene": None, "folder": "out"}, "scene"),
+    synth.open_sequence: ({}, "path"),
+    synth.TorchDataset: ({"root": ".", "fields": ["rgb"]}, "root", "fields"),
+    learn.load_model: ({"name": "mono"}, "name", "device"),
+    learn.predict: ({"source": "video.mp4"}, "model", "membrane", "flow"),
+    bench.score: ({"recording": "here"}, "recording", "model", "settings", "out"),
+}
+
+
+@pytest.mark.parametrize("function", CALLS, ids=lambda one: one.__name__)
+def test_an_odd_argument_is_named(function: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    usual, *names = CALLS[function]
+    for name in names:
+        for value in ODD:
+            with pytest.raises(UserError) as refused:
+                function(**{**usual, name: value})
+            assert re.search(rf"\b{name}\b|sequence -1|no such", str(refused.value)), (name, value)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_motion_is_at_rest_in_frame_0_and_finite() -> None:
+    job = synth.load_job("tiny", ["frames=3", "fem.tets=300", "anatomy.vertices=1500", "render.size=[96,72]"])
+    load, shift = np.array([0, 1.0, 0]), np.zeros((3, 2))
+    for motion, name in (
+        (synth.ToolMotion(load + 0.5, 1 - load, shift), "load"),
+        (synth.ToolMotion(load * np.nan, 1 - load, shift), "load"),
+        (synth.ToolMotion(load, 1 - load, shift + 1), "shift"),
+        (synth.ToolMotion(load, load[:2], shift), "away"),
+    ):
+        with pytest.raises(UserError, match=rf"motions\[0\]: {name}"):
+            synth.simulate(job, motions=[motion])
+
+
+def test_an_error_in_a_dataset_is_the_one_that_is_raised(tmp_path: Path) -> None:
+    opened = synth.open_dataset(tmp_path / "out", "tiny")
+    with pytest.raises(PermissionError, match="mine"), opened as folder:
+        raise PermissionError(13, "mine", (folder / "000000.zarr").mkdir())  # a folder that is no sequence
