@@ -54,8 +54,7 @@ def train_command(
     changes: Annotated[
         list[str] | None,
         Argument(
-            help="Any setting of a model's config.json as KEY=VALUE or --KEY VALUE: --input mixed "
-            "--epochs 30 loss=mse arch.width=32."
+            help="Settings of config.json: KEY=VALUE or --KEY VALUE, as --input mixed loss=mse arch.width=32."
         ),
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
@@ -145,9 +144,7 @@ def eval_command(
     model: Annotated[Path, Argument(help="Model folder.")],
     dataset: Root,
     input: Input = None,
-    against: Annotated[
-        Path | None, Option(help="A second model, for paired tests on sequences new to both.")
-    ] = None,
+    against: Annotated[Path | None, Option(help="A second model, for tests on what is new to both.")] = None,
     all: Annotated[bool, Option("--all", help="Print all scores, not just four.")] = False,
     threads: Threads = None,
     cache: Cache = None,
@@ -199,53 +196,29 @@ def eval_command(
         screen.print(paired_table(pairs, f"against {against}, paired by sequence", all))
 
 
-ModelOrSource = Annotated[
-    Path, Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
-]
-Source = Annotated[
-    Path | None,
-    Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
-]
-Out = Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")]
-Young = Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")]
-Membrane = Annotated[MembraneState, Option(help="State of the membrane (pia), for a model with that input.")]
-Scale = Annotated[str | None, Option(help="A video's scale [mm/px], or unknown: forces up to a factor.")]
-Tissue = Annotated[
-    Path | None,
-    Option(help="Tissue mask of the video: a picture, white on tissue. Default: found by motion."),
-]
-Flow = Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")]
-Shrink = Annotated[
-    int, Option(min=0, max=8, help="Shrink a video by this factor before flow; 0: to 320 columns.")
-]
-Rate = Annotated[float, Option(min=0.0, help="Most frames per second read from a video; 0: all.")]
-Pulse = Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion first.")]
-Masks = Annotated[
-    str,
-    Option(
-        help="Masks of a video: auto, none, glare, tool, both, or a folder of instrument masks "
-        "NNNNNN.png or mask.png."
-    ),
-]
-Overlay = Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")]
-
-
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
-    model: ModelOrSource,
-    source: Source = None,
-    out: Out = Path("forces"),
+    model: Annotated[
+        Path, Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
+    ],
+    source: Annotated[
+        Path | None,
+        Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
+    ] = None,
+    out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
     input: Input = None,
-    young: Young = None,
-    membrane: Membrane = "unknown",
-    scale: Scale = None,
-    tissue: Tissue = None,
-    flow: Flow = "tvl1",
-    shrink: Shrink = 0,
-    rate: Rate = 10.0,
-    pulse: Pulse = True,
-    masks: Masks = "auto",
-    overlay: Overlay = True,
+    young: Annotated[float | None, Option(help="Young's modulus [kPa], instead of the data's.")] = None,
+    membrane: Annotated[MembraneState, Option(help="Of the pia, for a model with that input.")] = "unknown",
+    scale: Annotated[str | None, Option(help="A video's [mm/px], or unknown: forces up to a factor.")] = None,
+    tissue: Annotated[Path | None, Option(help="Picture, white on tissue. Default: found by motion.")] = None,
+    flow: Annotated[str, Option(help="Flow estimator for a video, as in a job's flow.backend.")] = "tvl1",
+    shrink: Annotated[int, Option(min=0, max=8, help="Shrink a video first; 0: to 320 columns.")] = 0,
+    rate: Annotated[float, Option(min=0.0, help="Most frames per second of a video; 0: all.")] = 10.0,
+    pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion.")] = True,
+    masks: Annotated[
+        str, Option(help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png.")
+    ] = "auto",
+    overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     threads: Threads = None,
     json: Json = False,
 ) -> None:
@@ -287,19 +260,10 @@ def calibrate_command(
     model: Annotated[Path, Argument(help="Model folder.")],
     data: Annotated[
         list[Path],
-        Argument(
-            help="Presses of known force (NNNNNN.zarr stores or .npz with force_mn), or datasets: the "
-            "training data and any with sequences that are new to the model."
-        ),
+        Argument(help="Presses of known force (.zarr or .npz), or datasets: the training data and new ones."),
     ],
     input: Input = None,
-    from_test: Annotated[
-        bool,
-        Option(
-            "--from-test",
-            help="Use half of the datasets' test brains, which `learn eval` then leaves out.",
-        ),
-    ] = False,
+    from_test: Annotated[bool, Option("--from-test", help="Use half of the datasets' test brains.")] = False,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,

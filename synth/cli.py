@@ -59,12 +59,8 @@ def tune(
 @app.command(epilog="Example: synth fit photo.jpg --out look.yaml --width-mm 38")
 def fit(
     photo: Annotated[Path, Argument(help="A photograph of exposed cortex by your microscope.")],
-    out: Annotated[Path, Option("--out", "-o", help="The job file (YAML) to write.")] = Path(
-        "appearance.yaml"
-    ),
-    width_mm: Annotated[
-        float, Option(min=5, max=400, help="Width of the picture at the cortex [mm].")
-    ] = 35.0,
+    out: Annotated[Path, Option("--out", "-o", help="The job file to write.")] = Path("appearance.yaml"),
+    width_mm: Annotated[float, Option(min=5, max=400, help="The picture's width at the cortex [mm].")] = 35.0,
     mask: Annotated[Path | None, Option(help="A mask of the cortex, white; default: detected.")] = None,
     json: Json = False,
 ) -> None:
@@ -106,9 +102,7 @@ def new(path: Annotated[Path, Argument(help="The job file to write.")] = Path("j
 
 @app.command(epilog="Example: synth schema > job.schema.json")
 def schema(
-    fields: Annotated[
-        bool, Option("--fields", help="Print the fields of a sequence instead: axes, type, unit.")
-    ] = False,
+    fields: Annotated[bool, Option("--fields", help="Print the fields of a sequence instead.")] = False,
 ) -> None:
     """Prints the JSON schema of job files, for editors."""
     from synth.dataset.size_forecast import describe_fields
@@ -119,9 +113,7 @@ def schema(
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Annotated[
-        str, Argument(help="A job file, a named job, or a brain's surface (OBJ, STL, PLY, OFF, VTK, VTP).")
-    ],
+    job: Annotated[str, Argument(help="A job file, a named job, or a brain (OBJ, STL, PLY, OFF, VTK, VTP).")],
     overrides: Overrides = None,
     out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
@@ -170,26 +162,15 @@ def preview(
 def render(
     job: Source,
     overrides: Overrides = None,
-    out: Annotated[
-        Path, Option("--out", "-o", help="The dataset's folder; an unfinished one is continued.")
-    ] = Path("out"),
+    out: Annotated[Path, Option("--out", "-o", help="A folder; if unfinished, continued.")] = Path("out"),
     workers: Annotated[int | None, Option(min=1, help="Number of processes; default: one per core.")] = None,
     engine: Annotated[
-        str,
-        Option(
-            help="local, dask://host:port, tls://host:port, or a YAML file that describes a SLURM cluster."
-        ),
+        str, Option(help="local, dask://host:port, tls://host:port, or a SLURM cluster's YAML file.")
     ] = "local",
     gpus: Annotated[str, Option(help="GPUs shared by the workers: auto, none, or numbers as 0,1.")] = "auto",
-    memory: Annotated[
-        float | None, Option(help="Memory limit of each process [GB]; default: its share of free memory.")
-    ] = None,
-    mix_versions: Annotated[
-        bool, Option("--mix-versions", help="Continue a dataset that another version of Sulcus began.")
-    ] = False,
-    retry: Annotated[
-        bool, Option("--retry", help="Compute sequences of this folder again that failed before.")
-    ] = False,
+    memory: Annotated[float | None, Option(help="Of each process [GB]; default: its share.")] = None,
+    mix_versions: Annotated[bool, Option("--mix-versions", help="Continue another version's data.")] = False,
+    retry: Annotated[bool, Option("--retry", help="Compute sequences again that failed before.")] = False,
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 if some of its sequences failed."""
@@ -238,12 +219,8 @@ def split_command(
     out: Out,
     by: Annotated[str, Option(help="anatomy, opening, family, gesture, stiffness or sequence.")] = "anatomy",
     shares: Annotated[str, Option(help="Of train, validation and test.")] = "0.7,0.15,0.15",
-    hold_out: Annotated[
-        list[str] | None, Option(help="An appearance family that is used for testing only.")
-    ] = None,
-    share_anatomy: Annotated[
-        bool, Option("--share-anatomy", help="Allow one brain on all sides: for a dataset of one brain.")
-    ] = False,
+    hold_out: Annotated[list[str] | None, Option(help="An appearance family for testing only.")] = None,
+    share_anatomy: Annotated[bool, Option("--share-anatomy", help="Allow one brain on all sides.")] = False,
     json: Json = False,
 ) -> None:
     """Replaces the split of a dataset. No anatomy is on two sides, no held-out family in training."""
@@ -292,15 +269,10 @@ def export(
     out: Out,
     target: Annotated[Path, Argument(help="The new folder.")],
     to: Annotated[
-        str,
-        Option(
-            "--to",
-            help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video.",
-        ),
+        str, Option(help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video.")
     ] = "folder",
     overlay: Annotated[
-        list[str] | None,
-        Option(help="Overlays of a video: flow, recovered, force, none. [default: flow and force]"),
+        list[str] | None, Option(help="Of a video: flow, recovered, force, none. [default: flow and force]")
     ] = None,
     interval: Annotated[str | None, Option(help="Time range of a video: FIRST:LAST in seconds.")] = None,
 ) -> None:
@@ -331,9 +303,7 @@ def _interval(text: str | None) -> tuple[float, float] | None:
 @app.command(epilog="Example: synth verify out --fast")
 def verify(
     out: Out,
-    fast: Annotated[
-        bool, Option("--fast", help="Check some frames of some sequences, without checksums.")
-    ] = False,
+    fast: Annotated[bool, Option("--fast", help="Only some frames and sequences, no checksums.")] = False,
     json: Json = False,
 ) -> None:
     """Checks the integrity and physical consistency of a dataset. Exit code 1 if a check fails."""
@@ -350,18 +320,13 @@ def view(
     out: Out,
     sequence: Index = 0,
     save: Annotated[
-        Path | None,
-        Option(
-            "--save", help="Write a recording (.rrd) or a picture (.png, .jpg) instead of opening the viewer."
-        ),
+        Path | None, Option(help="Write a recording (.rrd) or a picture (.png, .jpg) instead.")
     ] = None,
     frame: Annotated[
         list[int] | None,
-        Option("--frame", "-f", help="Frame of a picture; repeatable; default: the largest force."),
+        Option("--frame", "-f", help="Of a picture; repeatable; default: the largest force."),
     ] = None,
-    web: Annotated[
-        bool, Option("--web", help="Open a browser, on a machine without a window system.")
-    ] = False,
+    web: Annotated[bool, Option("--web", help="In a browser, where there is no window system.")] = False,
 ) -> None:
     """Opens a sequence in the viewer rerun: frames, depth, flow, traction and force over time.
 
