@@ -151,21 +151,15 @@ def _ends(found: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
     if not found[0].bands:
         return {}
     wide, narrow = ([one.bands[level] for one in found] for level in LEVELS)
-    out = {
-        "low_mn": np.array([one.low[0] for one in wide]),
-        "high_mn": np.array([one.high[0] for one in wide]),
-        "low68_mn": np.array([one.low[0] for one in narrow]),
-        "high68_mn": np.array([one.high[0] for one in narrow]),
-        "force_low_mn": np.array([one.axes_low[0] for one in wide]),
-        "force_high_mn": np.array([one.axes_high[0] for one in wide]),
-    }
-    for values in out.values():
-        values[~trusted] = np.nan
-    return out
+    out = {"low_mn": [one.low for one in wide], "high_mn": [one.high for one in wide]}
+    out |= {"low68_mn": [one.low for one in narrow], "high68_mn": [one.high for one in narrow]}
+    out |= {"force_low_mn": [one.axes_low for one in wide], "force_high_mn": [one.axes_high for one in wide]}
+    sure = np.where(trusted, 1.0, np.nan)
+    return {name: (np.concatenate(ends).T * sure).T for name, ends in out.items()}
 
 
 def calibrate(predictor: Predictor, press: Motion) -> float:
-    """Young's modulus [kPa] from one press. Raises UserError if its force is not known."""
+    """Young's modulus [kPa] by `stiffness` from one press. Raises UserError if its force is not known."""
     if press.force_mn is None:
         raise UserError(f"{press.name}: needs a known force (force_mn in an .npz)")
     frames = next(press.passes).frames
@@ -177,26 +171,13 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
 
 
 def stiffness(
-    predictor: Predictor,
-    displacement: Map,
-    mask: Map,
-    force_mn: Floats,
-    confidence: Map | None = None,
+    predictor: Predictor, displacement: Map, mask: Map, force_mn: Floats, confidence: Map | None = None
 ) -> float:
     """Young's modulus [kPa] by a least-squares fit of the prediction to the known force of a press.
 
     Force is the network's prediction per unit stiffness times E, so one press with a known force (a weight, a
-    sensor on the tool) gives E for the rest of the recording.
-
-    Args:
-        predictor: the model.
-        displacement: (T, 2, N, N) mm on the model's grid, for a stereo model (T, 3, N, N).
-        mask: (N, N) tissue.
-        force_mn: (T,) size of the known force.
-        confidence: as of `Predictor.density`.
-
-    Raises:
-        UserError: the lengths differ, or force or prediction are zero.
+    sensor on the tool) gives E for the rest of the recording. `force_mn`: (T,) size of the known force;
+    others as of `Predictor.density`. Raises UserError if the lengths differ, or force or prediction are zero.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import repeat
-from typing import Any
+from itertools import zip_longest
 
 import numpy as np
 
@@ -55,24 +54,15 @@ def predict_force(
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0
     estimator = ForceEstimator(model, inside, scale_mm_per_px, young_kpa, membrane)
-    known: Iterator[Map] = repeat(np.ones(size, np.float32))
-    if confidence is not None:
-        known = _each("confidence", confidence, size, (0.0, 1.0))
-    found = list[Floats]()
-    for moved in _each("flow", flow, (*size, 2)):
-        if (weight := next(known, None)) is None:
-            raise UserError(f"confidence: has {len(found)} frames, flow has more")
+    sure, found = np.ones(size, np.float32), list[Floats]()
+    pairs = ((one, sure) for one in flow) if confidence is None else zip_longest(flow, confidence)
+    for moved, weight in pairs:
+        if moved is None or weight is None:
+            raise UserError("confidence: has another number of frames than flow")
+        moved = check_answer("predict_force", "flow", moved, (*size, 2))
+        weight = check_answer("predict_force", "confidence", weight, size, (0.0, 1.0))
         found.append(estimator.estimate(FrameMotion(moved, weight)).force_mn)
-    if confidence is not None and next(known, None) is not None:
-        raise UserError(f"confidence: has more frames than flow's {len(found)}")
     return np.array(found).reshape(-1, 3)
-
-
-def _each(what: str, frames: object, *about: Any) -> Iterator[Map]:
-    """Checked frames of an argument. UserError for another shape or range, as `check_answer`."""
-    if not isinstance(frames, Iterable):
-        raise UserError(f"{what}: expected an array a frame, got {type(frames).__name__}")
-    return (check_answer("predict_force", what, one, *about) for one in frames)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,7 +14,7 @@ import numpy as np
 from learn.data.clips import FIELDS, check_readable, has_depth
 from synth.arrays import Array, Floats, Mask
 from synth.dataset.store import Dataset, Sequence, open_sequence
-from synth.errors import UserError
+from synth.errors import UserError, as_positive
 from synth.flow.estimator import name_motion
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
@@ -225,6 +224,4 @@ def _arrays(path: Path) -> Motion:
 
 def _positive(path: Path, found: dict[str, Array], name: str) -> float:
     """The number under a name. UserError unless it is one and positive."""
-    if found[name].size != 1 or not 0 < found[name].item() < math.inf:
-        raise UserError(f"{path}: {name} must be one positive number")
-    return float(found[name].item())
+    return as_positive(f"{path}: {name}", found[name].item() if found[name].size == 1 else found[name].shape)

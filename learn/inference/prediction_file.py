@@ -17,7 +17,7 @@ from learn.inference.apply import apply
 from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, length
 from synth.arrays import Pixels
-from synth.dataset.store import Sequence, open_sequence
+from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job.types import MembraneState
 from synth.publish import picture, sequence_video
@@ -117,11 +117,6 @@ def write_prediction(found: dict[str, Any], stem: Path) -> None:
     stem.parent.mkdir(parents=True, exist_ok=True)
     with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
         np.savez_compressed(file, **{name: found[name] for name in FIELDS if name in found})
-    write_whole(stem.with_name(f"{stem.name}.force.csv"), tabulate(found), durable=False)
-
-
-def tabulate(found: dict[str, Any]) -> str:
-    """The force by frame as CSV text with the header `COLUMNS`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
@@ -129,9 +124,10 @@ def tabulate(found: dict[str, Any]) -> str:
         time = found["time_s"][t] if "time_s" in found else np.nan
         force = found["force_mn"][t] if "force_mn" in found else (np.nan,) * 3
         ends = [found[name][t] if name in found else np.nan for name in _ENDS]
-        values = [_number(value) for value in (time, found["total_force_mn"][t], *force, *ends)]
+        numbers = (time, found["total_force_mn"][t], *force, *ends)
+        values = [f"{value:.6g}" if np.isfinite(value) else "" for value in numbers]
         table.writerow([int(number), values[0], int(found["trusted"][t]), *values[1:]])
-    return text.getvalue()
+    write_whole(stem.with_name(f"{stem.name}.force.csv"), text.getvalue(), durable=False)
 
 
 def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
@@ -140,26 +136,18 @@ def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | Non
     The map is drawn in the rest frame. `found`: fields that `apply` returns; `source`: a video, or a
     sequence's store. Returns None, without a file, if the source holds no pictures.
     """
-    pictures = _pictures(source, {int(number) for number in found["frame"]})
-    if pictures is None:
+    wanted = {int(number) for number in found["frame"]}
+    if video.is_video(source):
+        pictures = (one.rgb for one in video.read_frames(source, video.FPS) if one.index in wanted)
+    elif source.suffix == ".zarr":
+        sequence = open_sequence(source)
+        pictures = (sequence["rgb"][t] for t in sorted(wanted))
+    else:
         return None
     times = found.get("time_s", np.arange(len(found["frame"])) / video.FPS)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
     return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}" if np.isfinite(value) else ""
-
-
-def _pictures(source: Path, wanted: set[int]) -> Iterator[Pixels] | None:
-    if video.is_video(source):
-        return (one.rgb for one in video.read_frames(source, video.FPS) if one.index in wanted)
-    if source.suffix != ".zarr":
-        return None
-    sequence: Sequence = open_sequence(source)
-    return (sequence["rgb"][t] for t in sorted(wanted))
 
 
 def _drawn(

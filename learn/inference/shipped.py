@@ -63,7 +63,12 @@ def pack_model(
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
     card = checkpoint.write_model(folder, card, net.state_dict())
-    write_whole(folder / "README.md", _readme(folder.name, card, commit, metrics, limits).encode())
+    line = describe(card)
+    rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
+    listed = "\n".join(f"- {one}" for one in limits)
+    head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
+    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{listed}\n".encode())
     size = folder_bytes(folder)
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
@@ -83,14 +88,3 @@ def describe(card: ModelCard) -> str:
         f"R² {card.score:.3f} on validation sequences, "
         f"{len(card.split.get('fit', []))} training sequences"
     )
-
-
-def _readme(
-    name: str, card: ModelCard, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
-) -> str:
-    line = describe(card)
-    rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
-    listed = "\n".join(f"- {one}" for one in limits)
-    head = f"# {name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
-    return f"{head}{table}\n\nLimits:\n\n{listed}\n"
