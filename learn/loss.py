@@ -64,31 +64,18 @@ def loss(
         raise UserError("a batch has no tissue cell: check the tissue masks")
     squared = ((prediction - target) / spread * mask).square().sum(1, keepdim=True)
     if kind == "antighost":
-        squared = squared * false_positive_weights(prediction, target, unit)
+        low = _length(target) < LOW * unit
+        over_predicted = low & (_length(prediction.detach()) > _length(target))
+        squared = squared * torch.where(over_predicted, FALSE_POSITIVE, 1.0)
     fit, share = squared.sum() / (cells * prediction.shape[1]), R2_SHARE[kind]
     r2 = off_target = squared.new_zeros(())
     if share > 0:
         r2 = unexplained(prediction, target, mask, spread, by_frame=kind != "antighost")
     if kind == "off-target":
         weight = OFF_TARGET * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
-        off_target = weight * off_target_force(prediction, target, mask, FREE * unit) / spread
+        contact_free = mask * (_length(target) < FREE * unit)
+        off_target = weight * ((_length(prediction).abs() * contact_free).sum() / cells) / spread
     return (1 - share) * fit + share * r2 + off_target
-
-
-def off_target_force(prediction: Tensor, target: Tensor, mask: Tensor, free: float) -> Tensor:
-    """Predicted force density where the true one is under `free`, averaged over all tissue.
-
-    `prediction`, `target`: (B, C, N, N), `free` in their unit, as is the result; `mask`: (B, 1, N, N) 0/1.
-    Times the tissue's area it is the off-target force [mN at 1 kPa].
-    """
-    contact_free = mask * (_length(target) < free)
-    return (_length(prediction).abs() * contact_free).sum() / mask.sum()
-
-
-def false_positive_weights(prediction: Tensor, target: Tensor, unit: float) -> Tensor:
-    """(B, 1, N, N): `FALSE_POSITIVE` where force is low and over-predicted (longer than the true), else 1."""
-    predicted, true = _length(prediction.detach()), _length(target)
-    return torch.where((true < LOW * unit) & (predicted > true), FALSE_POSITIVE, 1.0)
 
 
 def unexplained(

@@ -43,16 +43,8 @@ def divide(
     """The clips with their groups, and their division by the datasets' splits.
 
     Of a group on different sides in two datasets only the sequences on the later side (train, validation,
-    test) are used, so that no brain of a test side is trained on.
-
-    Args:
-        clips: all sequences of the datasets.
-        datasets: their folders.
-        seed: for the draw of the interval part.
-        note: see `Note`.
-
-    Raises:
-        UserError: a dataset with too few groups to split, or an empty fit or select part.
+    test) are used, so that no brain of a test side is trained on. `seed`: for the draw of the interval part.
+    Raises UserError for a dataset with too few groups to split, or an empty fit or select part.
     """
     splits, where = [read_split(one) for one in datasets], " ".join(map(str, datasets))
     if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
@@ -140,13 +132,7 @@ def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], fr
 
     The interval part is the card's; else every brain that is neither in the card nor in a test; with
     `from_test` a random half of the test brains. If the select part has fewer brains than the error model
-    needs, the missing ones are drawn from the interval part.
-
-    Args:
-        clips: of the dataset.
-        card: of the model.
-        test: content hashes of further test sequences.
-        from_test: whether to use test sequences.
+    needs, the missing ones are drawn from the interval part. `test`: hashes of further test sequences.
     """
     number = groups(clips)
 

@@ -32,17 +32,10 @@ def add_intervals(
 ) -> ModelCard:
     """Fits intervals and writes them, or why there are none, into a model's card, which is returned.
 
-    Sequences of `split.select` that did not choose the epoch count as used for intervals from then on.
-
-    Args:
-        folder: of the model `predictor`.
-        clips: sequences of known force.
-        split: `fit`: training sequences, for the distribution of motion; `select`: for the error model;
-            `intervals`: for the factors.
-        source: displacement that the intervals are for; None: the one that the model is scored on.
-
-    Raises:
-        UserError: nothing moves in the sequences.
+    Of `clips`, `split.fit` is for the distribution of motion, `select` for the error model, `intervals` for
+    the factors. Sequences of `select` that did not choose the epoch count as used for intervals from then on.
+    `source`: displacement that the intervals are for; None: the one that the model is scored on. Raises
+    UserError if nothing moves in the sequences.
     """
     parts = split.fit, split.select, split.intervals
     fitted, selection, calibration = ([clips[i] for i in part] for part in parts)

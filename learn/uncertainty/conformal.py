@@ -25,15 +25,9 @@ def least_units(level: float) -> int:
 def quantile(scores: Sequence[Floats], level: float) -> float:
     """Bound on the score of a frame of a new unit that holds with a probability of at least `level`.
 
-    Every unit weighs 1 / (K + 1), shared by its frames; the remaining weight is at infinity, for the new
-    unit.
-
-    Args:
-        scores: (n,) of each of K exchangeable units, any n > 0.
-        level: between 0 and 1.
-
-    Returns:
-        The quantile; infinity if K is under `least_units`.
+    `scores`: (n,) of each of K exchangeable units, any n > 0. Every unit weighs 1 / (K + 1), shared by its
+    frames; the remaining weight is at infinity, for the new unit, as is the quantile if K is under
+    `least_units`.
     """
     return _weighted_quantile(scores, 1 / (len(scores) + 1), level)
 

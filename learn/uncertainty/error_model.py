@@ -30,11 +30,8 @@ class ErrorModel:
 def fit_error_model(features: Floats, error: Floats, weight: Floats, least: float) -> ErrorModel:
     """Least squares on the logarithm of the error, slightly regularised (ridge).
 
-    Args:
-        features: (n, F).
-        error: (n,) ≥ 0.
-        weight: (n,) > 0.
-        least: > 0, added to an error before its logarithm, in its unit.
+    `features`: (n, F); `error`: (n,) ≥ 0; `weight`: (n,) > 0; `least` > 0: added to an error before its
+    logarithm, in its unit.
     """
     spread = np.maximum(features.std(0), 1e-6)
     wanted, share = np.log(error + least), weight / weight.mean()

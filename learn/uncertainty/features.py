@@ -23,24 +23,11 @@ def motion_names(depth: bool) -> tuple[str, ...]:
     return MOTION + DEPTH * depth
 
 
-def motion_features(
-    displacement: Map,
-    mask: Map,
-    confidence: Map | None,
-    extent_mm: float,
-) -> Floats:
-    """Features of each frame, in the order of `motion_names`.
+def motion_features(displacement: Map, mask: Map, confidence: Map | None, extent_mm: float) -> Floats:
+    """Features of each frame, (T, F), in the order of `motion_names`.
 
-    None needs the stiffness or the frame rate, which differs between sequences and videos.
-
-    Args:
-        displacement: (T, 2 or 3, N, N) mm.
-        mask: (N, N) 0/1, tissue.
-        confidence: (T, 1 or 2, N, N) in 0..1; None: 1.
-        extent_mm: width of the grid.
-
-    Returns:
-        (T, F).
+    None needs the stiffness or the frame rate, which differs between sequences and videos. `displacement`:
+    (T, 2 or 3, N, N) mm; `mask`: (N, N) 0/1, tissue; `confidence`: (T, 1 or 2, N, N) in 0..1, None: 1.
     """
     inside = mask > 0
     shift, weight = _coarse(displacement * inside, inside)
@@ -80,10 +67,7 @@ def is_moving(motion: Floats) -> Mask:
 def estimate_features(size: Floats, magnitude: Map, cell_mm2: float) -> Floats:
     """Features of each frame's force estimate, in the order of `ESTIMATE`, (T, 2).
 
-    Args:
-        size: (T,) of the total force, as a share of the training data's.
-        magnitude: (T, N, N) of the map, any unit.
-        cell_mm2: area of a cell.
+    `size`: (T,) of the total force, as a share of the training data's; `magnitude`: (T, N, N), any unit.
     """
     flat = magnitude.reshape(len(magnitude), -1).astype(np.float64)
     area = cell_mm2 * flat.sum(1) ** 2 / np.maximum(np.square(flat).sum(1), 1e-30)

@@ -121,11 +121,8 @@ def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and the cost.
 
     Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011). Directions in
-    which the photograph varies little have more weight, as lightness would dominate hue.
-
-    Args:
-        light: (N, 3) of rendered tissue, white-balanced, 1 at full scale.
-        video: (M, 3) levels of the photograph's tissue, 0 to 1.
+    which the photograph varies little have more weight, as lightness would dominate hue. `light`: (N, 3) of
+    rendered tissue, as of `TissueFrame.light`; `video`: (M, 3) levels of the photograph's tissue, 0 to 1.
     """
     rng, plain = np.random.default_rng(0), np.array(PLAIN.curves)
     ours, theirs = rng.choice(light, _PIXELS)[None], rng.choice(video, _PIXELS)

@@ -116,12 +116,8 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
 
     `vignette`: loss of light in the corners, a logarithm. `noise`: standard deviation in grey levels where
     tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave relative to two
-    octaves coarser, both without the noise.
-
-    Args:
-        rgb: (H, W, 3) sRGB.
-        usable: (H, W) tissue, without instruments.
-        reach: width of this picture, the centre of a photograph, relative to that of the photograph.
+    octaves coarser, both without the noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue, without
+    instruments; `reach`: width of this picture, the centre of a photograph, relative to the photograph's.
     """
     tissue, clear = (usable & ~mask_detection.glare(rgb, grown) for grown in (2, 4))
     levels = np.arange(256, dtype=np.float32) / 255

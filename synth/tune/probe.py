@@ -47,9 +47,8 @@ class Probe:
     def measure(self, job: Job) -> list[float]:
         """The sequence with the settings of `job`. UserError if they cannot carry it out.
 
-        Returns:
-            Force error of the true displacement, and of the recovered one (the true one where none is), as
-            parts of the force; CPU-s a frame of physics, scene, rendering and flow, all above 0.
+        Returns the force error of the true displacement, and of the recovered one (the true one where none
+        is), as parts of the force; CPU-s a frame of physics, scene, rendering and flow, all above 0.
         """
         at_rest(job)  # grows the surface, which stays in memory for other settings: it counts for none
         watch = Stopwatch()

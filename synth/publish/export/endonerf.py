@@ -44,10 +44,8 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
     """Writes a folder per sequence, named by its index, with `images_right/`, rectified, of a right camera.
 
     Masks are white where there is no tissue: on the instrument and outside the recorded picture. World axes
-    are those of frame 0's camera. `scene.json` contains unit, focal length, baseline and force.
-
-    Raises:
-        UserError: a sequence has no depth, or its camera moved in a way that is not stored.
+    are those of frame 0's camera. `scene.json` contains unit, focal length, baseline and force. Raises
+    UserError if a sequence has no depth, or its camera moved in a way that is not stored.
     """
     for sequence in dataset:
         if "depth" not in sequence:

@@ -30,17 +30,10 @@ FORMATS: dict[str, Callable[..., None]] = {
 def export_dataset(root: Path, target: Path, to: str, **options: Any) -> int:
     """Exports the finished sequences of `root` to the new folder `target`; returns their number.
 
-    In addition to the files of the format, `split.csv` contains the side of each sequence in the dataset's
-    split.
-
-    Args:
-        root: the dataset.
-        target: a folder that does not exist yet; it is written as a whole or not at all.
-        to: one of `FORMATS`.
-        options: of the format: `overlays` and `interval_s` of a video.
-
-    Raises:
-        UserError: an unknown format, an existing folder, a damaged store, or a missing package.
+    In addition to the files of the format, one of `FORMATS`, `split.csv` contains the side of each sequence
+    in the dataset's split. `target` is written as a whole or not at all. `options`: `overlays` and
+    `interval_s` of a video. Raises UserError for an unknown format, an existing folder, a damaged store, or a
+    missing package.
     """
     if to not in FORMATS:
         raise UserError(f"{to}: is not one of {', '.join(FORMATS)}")

@@ -31,10 +31,7 @@ def write_tracks(dataset: Dataset, target: Path) -> None:
 
     Tracks are the ground truth: in space and picture they agree to 1e-3 px, or to the attribute
     `summary.rounding_px` where flow is stored as float16. STIR (github.com/athaddius/STIRLoader) uses the
-    first and last frame only.
-
-    Raises:
-        UserError: no tissue is visible in frame 0 of a sequence.
+    first and last frame only. Raises UserError if no tissue is visible in frame 0 of a sequence.
     """
     for sequence in dataset:
         pixels = _choose(sequence)
