@@ -53,9 +53,7 @@ def train_command(
     dataset: Root,
     changes: Annotated[
         list[str] | None,
-        Argument(
-            help="Settings of config.json: KEY=VALUE or --KEY VALUE, as --input mixed loss=mse arch.width=32."
-        ),
+        Argument(help="Settings of config.json, KEY=VALUE or --KEY VALUE: --input mixed arch.width=32."),
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
@@ -198,9 +196,7 @@ def eval_command(
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
 def predict_command(
-    model: Annotated[
-        Path, Argument(help="Model folder, mono or stereo. Default: the pretrained one that fits.")
-    ],
+    model: Annotated[Path, Argument(help="Folder, mono or stereo. Default: the pretrained one that fits.")],
     source: Annotated[
         Path | None,
         Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),

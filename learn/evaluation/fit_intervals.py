@@ -106,9 +106,7 @@ def _fit(
     report(len(brains), len(brains))
     some = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
     motion = [
-        motion_features(
-            np.asarray(c.displacement[source]), c.mask, c.confidence_of(source), card.settings.extent_mm
-        )
+        motion_features(c.displacement[source], c.mask, c.confidence_of(source), card.settings.extent_mm)
         for c in some
     ]
     first, second = examples[: len(selection)], examples[len(selection) :]

@@ -162,11 +162,10 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     """Young's modulus [kPa] by `stiffness` from one press. Raises UserError if its force is not known."""
     if press.force_mn is None:
         raise UserError(f"{press.name}: needs a known force (force_mn in an .npz)")
-    frames = next(press.passes).frames
     view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
+    frames = next(press.passes).frames
     inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in frames]
-    known = [confidence for _, confidence in inputs if confidence is not None]
-    displacement, confidence = np.stack([shift for shift, _ in inputs]), np.stack(known) if known else None
+    displacement, confidence = (np.stack([*part]) for part in zip(*inputs, strict=True))  # a frame has both
     return stiffness(predictor, displacement, view.mask, press.force_mn, confidence)
 
 

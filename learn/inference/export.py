@@ -12,7 +12,6 @@ from __future__ import annotations
 import importlib
 import json
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +79,14 @@ def export(predictor: Predictor, file: Path) -> float:
     module = Portable(predictor.model.cpu(), card).eval()
     file.parent.mkdir(parents=True, exist_ok=True)
     cases = [examples(card, batch, seed=batch) for batch in (1, 3)]
-    run = _write(module, cases[-1], input_names(card), file)
-    worst = 0.0
+    names, worst = input_names(card), 0.0
+    session = _write(module, cases[-1], names, file)
     for inputs in cases:
         expected = module(*inputs)
         largest = max(card.scales.target, float(expected.abs().max()))
-        worst = max(worst, float((run(inputs) - expected).abs().max()) / largest)
+        named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
+        found = torch.from_numpy(session.run(None, named)[0])
+        worst = max(worst, float((found - expected).abs().max()) / largest)
     if not worst <= TOLERANCE:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
@@ -129,10 +130,8 @@ def describe(card: ModelCard, difference: float) -> dict[str, Any]:
     }
 
 
-def _write(
-    module: nn.Module, inputs: list[Tensor], names: list[str], file: Path
-) -> Callable[[list[Tensor]], Tensor]:
-    """Writes `file`, for batches of any size, and returns a function that runs it."""
+def _write(module: nn.Module, inputs: list[Tensor], names: list[str], file: Path) -> Any:
+    """Writes `file`, for batches of any size, and returns a session of ONNX Runtime that runs it."""
     try:
         importlib.import_module("onnx")
         runtime: Any = importlib.import_module("onnxruntime")
@@ -150,10 +149,4 @@ def _write(
             dynamo=False,
             opset_version=17,
         )
-    session = runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-
-    def run(inputs: list[Tensor]) -> Tensor:
-        named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(None, named)[0])
-
-    return run
+    return runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])

@@ -45,9 +45,7 @@ def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: b
 class Predictor:
     """A trained model for pictures of any size and scale."""
 
-    def __init__(
-        self, network: nn.Module, card: ModelCard, device: torch.device | str = "cpu", quick: bool = False
-    ) -> None:
+    def __init__(self, network: nn.Module, card: ModelCard, device: torch.device | str, quick: bool) -> None:
         """`quick`: as of `load_model`."""
         self.card, self.grid = card, card.settings.grid
         with as_user_error(f"device {device}"):
@@ -223,12 +221,10 @@ class ForceMap:
         return self.view.to_image(self.magnitude)
 
 
-def length(density: Map, axis: int = -3) -> Map:
-    """Length over the component axis; the value itself if there is one component."""
-    if density.shape[axis] == 1:
-        return density.squeeze(axis)
-    out: Map = np.sqrt(np.square(density).sum(axis))
-    return out
+def length(density: Map) -> Map:
+    """Length over the component axis (..., C, N, N); the value itself if there is one component."""
+    one = density.shape[-3] == 1
+    return density.squeeze(-3) if one else np.asarray(np.sqrt(np.square(density).sum(-3)))
 
 
 def total_force(density: Map, grid: Grid) -> Floats:

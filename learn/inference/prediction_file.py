@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from learn.data.grid import to_image
 from learn.inference.apply import apply
 from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, length
-from synth.arrays import Pixels
+from synth.arrays import Floats, Pixels
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job.types import MembraneState
@@ -42,17 +41,9 @@ FIELDS: dict[str, PredictedField] = {
     "time_s": PredictedField("T", "s", "on the video's clock; absent without one"),
     "trusted": PredictedField("T", "-", "whether the frame could be followed"),
     "total_force_mn": PredictedField("T", "mN", "size of the total force on the tissue; NaN if not trusted"),
-    "force_mn": PredictedField(
-        "T, 3", "mN", "total force on the tissue, camera axes (x right, y down, z away); of a vector model"
-    ),
-    "density": PredictedField(
-        "T, C, N, N",
-        "mN/mm²",
-        "force density on the network's grid, nothing subtracted: its size (C = 1) or x, y, z",
-    ),
-    "low_mn": PredictedField(
-        "T", "mN", "lower end of the size's 90% interval; as the next five, of a model with intervals"
-    ),
+    "force_mn": PredictedField("T, 3", "mN", "the same by x right, y down, z away; of a vector model"),
+    "density": PredictedField("T, C, N, N", "mN/mm²", "on the grid, nothing subtracted: size or x, y, z"),
+    "low_mn": PredictedField("T", "mN", "lower end of the size's 90% interval; these six if fitted"),
     "high_mn": PredictedField("T", "mN", "upper end of the size's 90% interval"),
     "low68_mn": PredictedField("T", "mN", "lower end of the size's 68% interval"),
     "high68_mn": PredictedField("T", "mN", "upper end of the size's 68% interval"),
@@ -150,9 +141,7 @@ def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | Non
     return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
 
 
-def _drawn(
-    found: dict[str, Any], times: NDArray[np.floating], pictures: Iterator[Pixels]
-) -> Iterator[Pixels]:
+def _drawn(found: dict[str, Any], times: Floats, pictures: Iterator[Pixels]) -> Iterator[Pixels]:
     force, size = found["total_force_mn"], length(found["density"])
     largest, curve = float(np.max(size, initial=0.0)), None
     for t, rgb in enumerate(pictures):

@@ -103,9 +103,7 @@ class FrameDataset:
         self.sources = sources(settings.input)
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
-                raise UserError(
-                    f"{clip.name}: on a {clip.mask.shape[0]}² grid, the model needs {settings.size}²"
-                )
+                raise UserError(f"{clip.name}: its grid is {len(clip.mask)}², the model's {settings.size}²")
 
     def order(self, rng: np.random.Generator, share_recovered: float) -> list[FrameItem]:
         """The frames of one epoch, turned at random, in random order."""

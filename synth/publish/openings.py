@@ -85,9 +85,7 @@ def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: 
     return "\n".join(lines)
 
 
-def draw_openings(
-    mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False
-) -> Pixels:
+def draw_openings(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool) -> Pixels:
     """Picture (H, W, 3) of the brain from six sides, with the outline and number (from 1) of each opening."""
     vertices, faces = read_brain(mesh, fill_holes)
     corners, middle = vertices[faces], (vertices.max(axis=0) + vertices.min(axis=0)) / 2

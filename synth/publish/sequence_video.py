@@ -121,9 +121,8 @@ def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> M
 def glow(picture: Rgb, values: NDArray[np.floating], largest: float) -> Rgb:
     """The picture with non-negative values (H, W) as overlay, from transparent (0) to yellow (`largest`)."""
     share = np.clip(values / max(largest, 1e-12), 0, 1)
-    return drawing.overlay(
-        picture, drawing.heat(values, largest), np.where(share > 0.02, 0.2 + 0.6 * share, 0.0)
-    )
+    weight = np.where(share > 0.02, 0.2 + 0.6 * share, 0.0)
+    return drawing.overlay(picture, drawing.heat(values, largest), weight)
 
 
 def draw_curve(time_s: NDArray[np.floating], force_mn: NDArray[np.floating], width_px: int) -> Rgb:

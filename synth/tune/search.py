@@ -202,9 +202,8 @@ def differences(settings: Settings, start: Settings) -> Settings:
 
 def show(settings: Settings, start: Settings) -> str:
     """The same in words."""
-    return (
-        ", ".join(f"{key} {one}" for key, one in differences(settings, start).items()) or "the job as given"
-    )
+    words = ", ".join(f"{key} {one}" for key, one in differences(settings, start).items())
+    return words or "the job as given"
 
 
 def lines(tuned: Tuned) -> list[str]:
