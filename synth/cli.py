@@ -245,8 +245,7 @@ def split_command(
 
 @app.command(epilog="Example: synth report out --to report.html")
 def report(
-    out: Out,
-    to: Annotated[Path | None, Option("--to", help="The page; default: report.html in OUT.")] = None,
+    out: Out, to: Annotated[Path | None, Option("--to", help="The page; default: report.html in OUT.")] = None
 ) -> None:
     """Writes the description of a dataset again: report.html, its card README.md, and croissant.json."""
     from synth.dataset.folder import Folder
@@ -359,8 +358,7 @@ def view(
 
 @app.command(epilog="Example: synth doctor .")
 def doctor(
-    folder: Annotated[Path, Argument(help="Where datasets are to be written.")] = Path(),
-    json: Json = False,
+    folder: Annotated[Path, Argument(help="Where datasets are to be written.")] = Path(), json: Json = False
 ) -> None:
     """Reports what this machine offers, what it lacks, and how to fix that."""
     from synth.system.doctor import diagnose, lines

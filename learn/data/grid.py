@@ -74,11 +74,7 @@ class GridView:
     """
 
     def __init__(
-        self,
-        tissue: Mask,
-        scale_mm_per_px: float,
-        grid: Grid,
-        centre_px: tuple[float, float] | None = None,
+        self, tissue: Mask, scale_mm_per_px: float, grid: Grid, centre_px: tuple[float, float] | None = None
     ) -> None:
         """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid.
 

@@ -150,10 +150,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def evaluate(
-    predictor: Predictor,
-    clips: Sequence[Clip],
-    source: str,
-    report: ProgressCallback = lambda done, of: None,
+    predictor: Predictor, clips: Sequence[Clip], source: str, report: ProgressCallback = lambda done, of: None
 ) -> EvaluationReport:
     """Scores a model on clips, with displacement from `source`, as in `learn.data.clips.FIELDS`."""
     columns: dict[str, list[ClipScore]] = {}

@@ -87,10 +87,7 @@ def open_source(
 
 
 def apply(
-    predictor: Predictor,
-    motion: Motion,
-    young_kpa: float | None = None,
-    membrane: MembraneState = "unknown",
+    predictor: Predictor, motion: Motion, young_kpa: float | None = None, membrane: MembraneState = "unknown"
 ) -> dict[str, Any]:
     """Force of every frame of a video, by `ForceEstimator`.
 

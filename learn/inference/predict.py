@@ -110,11 +110,7 @@ class Predictor:
         return ForceMap(density[0], self.grid, young, young_kpa is not None, view, motion)
 
     def on_grid(
-        self,
-        view: GridView,
-        flow: Map,
-        confidence: Map | None = None,
-        moved: Moved | None = None,
+        self, view: GridView, flow: Map, confidence: Map | None = None, moved: Moved | None = None
     ) -> tuple[Map, Map | None]:
         """The network's input of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
 

@@ -38,10 +38,7 @@ def describe(folder: Folder) -> dict[str, Any]:
     )
     base = json.loads(_BASE.read_text("utf-8"))
     table = (folder.root / index.NAME).read_bytes()
-    base["distribution"][0] |= {
-        "contentSize": f"{len(table)} B",
-        "sha256": hashlib.sha256(table).hexdigest(),
-    }
+    base["distribution"][0] |= {"contentSize": f"{len(table)} B", "sha256": hashlib.sha256(table).hexdigest()}
     base["recordSet"][0]["field"] = [
         {
             "@type": "cr:Field",

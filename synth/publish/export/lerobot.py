@@ -126,11 +126,7 @@ def _pooled(rows: list[dict[str, Any]], key: str) -> dict[str, Any]:
 
 
 def _write_meta(
-    first: Sequence,
-    about: list[dict[str, Any]],
-    tasks: list[str],
-    ranges: dict[str, str],
-    target: Path,
+    first: Sequence, about: list[dict[str, Any]], tasks: list[str], ranges: dict[str, str], target: Path
 ) -> None:
     """Writes `meta/info.json`, `stats.json`, `tasks.parquet` and the table of episodes."""
     height, width = (side // 2 * 2 for side in first.size)
