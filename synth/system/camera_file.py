@@ -73,7 +73,7 @@ def find_baseline_mm(path: Path) -> float:
         _, translation, unit = _pose(left, right)
     except UserError:
         return 0.0  # reported by those that read the cameras
-    if left.of == right.of:  # R and T are those of a single camera in the room
+    if left.of == right.of:  # R and T are the pose of a single camera
         return 0.0
     return float(np.linalg.norm(translation)) * (unit or 1.0)
 
