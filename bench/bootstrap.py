@@ -17,10 +17,7 @@ def block_length(x: Floats) -> float:
     """Mean block length for the stationary bootstrap of the mean of `x`, in samples.
 
     Politis and White, "Automatic block-length selection for the dependent bootstrap" (Econometric Reviews
-    2004), with the correction of Patton, Politis and White (2009).
-
-    Args:
-        x: (T,) finite.
+    2004), with the correction of Patton, Politis and White (2009). `x`: (T,) finite.
     """
     n = len(x)
     centred = x - x.mean()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json as json_
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,8 +18,6 @@ from synth.system.cli_errors import Commands, printable
 if TYPE_CHECKING:
     from bench.scoring.result import Result
     from bench.tracking.live import LiveFrame
-    from synth.recording_flow.decode import Footage
-    from synth.video.mask_files import MaskFiles
 
 app = typer.Typer(
     name="bench",
@@ -38,41 +37,34 @@ Masks = Annotated[
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
 
-ScoredRecording = Annotated[Path, Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")]
-ScoredModel = Annotated[
-    Path | None,
-    Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
-]
-ScoreFolder = Annotated[
-    Path | None,
-    Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score."),
-]
-Shrink = Annotated[
-    int, Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
-]
-Rate = Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")]
-Pulse = Annotated[
-    bool, Option(help="Remove heartbeat and breathing from the motion before estimating force.")
-]
-Train = Annotated[Path | None, Option(help="The model's training data, to fit the baselines on it too.")]
-Region = Annotated[str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")]
-
-
 @app.command(epilog="Example: bench score recording --model model --also other=other-model")
 def score(
-    recording: ScoredRecording,
-    model: ScoredModel = None,
-    out: ScoreFolder = None,
+    recording: Annotated[Path, Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")],
+    model: Annotated[
+        Path | None,
+        Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
+    ] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score.")
+    ] = None,
     flow: Backend = "tvl1",
-    shrink: Shrink = 0,
-    rate: Rate = 10.0,
-    pulse: Pulse = True,
+    shrink: Annotated[
+        int, Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
+    ] = 0,
+    rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
+    pulse: Annotated[
+        bool, Option(help="Remove heartbeat and breathing from the motion before estimating force.")
+    ] = True,
     title: Annotated[str, Option(help="Heading of the report.")] = "",
-    train: Train = None,
+    train: Annotated[
+        Path | None, Option(help="The model's training data, to fit the baselines on it too.")
+    ] = None,
     also: Annotated[list[str] | None, Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
-    region: Region = "",
+    region: Annotated[
+        str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")
+    ] = "",
     json: Json = False,
 ) -> None:
     """Estimates force from a recording's video and scores it against the sensor: score.json, report.html.
@@ -204,7 +196,7 @@ def import_(
     use: Annotated[
         list[str] | None,
         Option(
-            help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, tip, fps, "
+            help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, fps, "
             "right, calibration; in a ROS bag also depth, right_calibration."
         ),
     ] = None,
@@ -292,19 +284,15 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
     return named
 
 
-LiveModel = Annotated[Path | None, Option("--model", "-m", help="Model folder, mono or stereo: forces too.")]
-LiveFolder = Annotated[
-    Path | None, Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
-]
-
-
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
     video: Annotated[
         Path,
         Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
     ],
-    model: LiveModel = None,
+    model: Annotated[
+        Path | None, Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
+    ] = None,
     scale: Annotated[
         str | None, Option(help="mm per pixel of the video, or unknown; needed with a model.")
     ] = None,
@@ -313,7 +301,9 @@ def live(
     shrink: Annotated[int, Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
     every: Annotated[bool, Option("--every", help="Process every frame, however late.")] = False,
-    out: LiveFolder = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""
@@ -323,18 +313,22 @@ def live(
     from bench.tracking import live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
-    from synth.recording_flow.decode import RecordingFlowSettings
+    from synth.recording_flow.decode import Footage, RecordingFlowSettings
     from synth.recording_flow.flow import open_flow_process
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
+    from synth.video.read import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
+    drawn = video.parent / "tissue.png"
+    tissue = partial(read_mask, drawn) if drawn.exists() else None
+    footage = Footage(partial(read_video, video, FPS), str(video), tissue, files.read if files else None)
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
     threadpool_limits(set_threads(None))
     with open_flow_process(set_threads) as process:
         stream = live.stream_video(
-            _open_footage(video, files),
+            footage,
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
             method=None if model is None else Model(model),
             scale_mm_per_px=read_scale(scale),
@@ -352,18 +346,6 @@ def live(
         how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
         live.write_live(out, summary, **how, paced=not every, model=model is not None)
     print(json_.dumps(summary) if json else ", ".join(f"{name} {one:.4g}" for name, one in summary.items()))
-
-
-def _open_footage(path: Path, masks: MaskFiles | None) -> Footage:
-    """A video with the tissue mask next to it, if there is one, and tool masks."""
-    from functools import partial
-
-    from synth.recording_flow.decode import Footage
-    from synth.video.read import FPS, read_mask, read_video
-
-    drawn = path.parent / "tissue.png"
-    tissue = partial(read_mask, drawn) if drawn.exists() else None
-    return Footage(partial(read_video, path, FPS), str(path), tissue, masks.read if masks else None)
 
 
 def _print_frame(frame: LiveFrame) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.checks import clocks, contradiction, files, scale, sensor, stereo, times
+from bench.checks import contradiction, files, scale, sensor, stereo, times
 from bench.checks.sensor import SensorMotion
 from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
@@ -33,8 +33,8 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     stereo.check_scale,
     times.check_times,
     times.check_spans,
-    clocks.check_overlap,
-    clocks.check_margin,
+    times.check_overlap,
+    times.check_margin,
     sensor.check_rest_frame,
     sensor.check_start,
 )
@@ -52,10 +52,8 @@ def judge(
 ) -> list[Finding]:
     """Findings of every check, errors first.
 
-    Args:
-        recording: the opened recording.
-        tracked: its tracked frames; if tracking failed, with the decoded pictures only.
-        sensor: sensor and motion at the tracked frames, if there is a sensor and methods were applied.
+    `tracked`: if tracking failed, with the decoded pictures only; `sensor`: sensor and motion at the tracked
+    frames, if there is a sensor and methods were applied.
     """
     found = [one for check in RECORDING_CHECKS for one in check(recording)]
     found += [one for check in TRACKED_CHECKS for one in check(recording, tracked)]

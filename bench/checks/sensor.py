@@ -109,9 +109,7 @@ def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
     Tissue that was loaded in the rest frame rests when the load has gone. Under a contact that lasts to the
     end it does so too, but mostly after it has rested in the rest frame. None: it rests there only.
 
-    Args:
-        time_s: (T,) times of the frames [s].
-        moved: (T,) mean motion since the rest frame, any unit.
+    `time_s`: (T,) times of the frames [s]; `moved`: (T,) mean motion since the rest frame, any unit.
     """
     share = moved / max(float(moved.max()), 1e-12)
     calm = np.abs(np.diff(share, prepend=share[0])) < _CALM

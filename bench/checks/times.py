@@ -1,9 +1,13 @@
-"""Checks of the frames' times and of the spans for calibration."""
+"""Checks of the frames' times, of the sensor's against them, and of the spans for calibration.
+
+For the sensor's clock see `bench.checks.contradiction`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from bench.recording.clocks import find_other_unit
 from bench.recording.folder import Recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
 from bench.tracking.tracking import TrackedRecording
@@ -14,12 +18,13 @@ from synth.recording_flow.finding import Finding
 _GAP = 3.0  # median intervals
 _RATES_HZ = 0.5, 1000.0  # of frames whose times are in seconds
 _TRACKED_HZ = 10.0  # default rate of tracked frames
+_COVERED = 0.9  # least share of the video that the sensor should cover
 _LEAST_PRESS = 5  # frames of a press that determine its gain
 
 
 def check_times(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on the frames' times: missing, backwards, with gaps or in another unit."""
-    t = rising_times(tracked)
+    t = _rising_times(tracked)
     if len(t) < 2:
         return [Finding("error", "times", "fewer than two frames have a time")]
     # From first to last frame: the median interval misleads where stamps come in bursts.
@@ -40,7 +45,7 @@ def check_times(recording: Recording, tracked: TrackedRecording) -> list[Finding
 
 def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on the spans for calibration: too short, or outside the video."""
-    meta, t, found = recording.meta, rising_times(tracked), []
+    meta, t, found = recording.meta, _rising_times(tracked), []
     if len(t) < 2:
         return []
     rate = min((len(t) - 1) / (t[-1] - t[0]), _TRACKED_HZ)
@@ -57,7 +62,34 @@ def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding
     return found
 
 
-def rising_times(tracked: TrackedRecording) -> Floats:
+def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on the unit of both clocks, and on the share of the video that the sensor covers."""
+    force, t, sync = recording.force, _rising_times(tracked), recording.meta.sync
+    if force is None or len(t) < 2:
+        return []
+    if other := find_other_unit(t, force.time_s):
+        return [Finding("warning", "clocks", f"{other}: nothing is scored")]
+    offset = sync.offset_s if sync.method == "offset" else 0.0
+    margin = sync.search_s if sync.method == "correlate" else 0.0
+    first, last = force.time_s[0] + offset - margin, force.time_s[-1] + offset + margin
+    share = max(min(t[-1], last) - max(t[0], first), 0.0) / (t[-1] - t[0])
+    message = f"the sensor covers {100 * share:.0f}% of the video"
+    message += "" if share else ": are both clocks in seconds?"
+    return [Finding("ok" if share > _COVERED else "warning", "clocks", message)]
+
+
+def check_margin(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on samples that the search for the clocks' offset lacks."""
+    force, sync = recording.force, recording.meta.sync
+    if force is None or sync.method != "correlate" or sync.calibration_s is None:
+        return []
+    (start, stop), t, margin = sync.calibration_s, force.time_s, sync.search_s
+    lacks = max(t[0] - (start - margin), (stop + margin) - t[-1], 0.0)
+    message = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
+    return [Finding("warning", "clocks", message)] if lacks > 0 else []
+
+
+def _rising_times(tracked: TrackedRecording) -> Floats:
     """Times (T,) [s] of the decoded frames whose time is later than all before."""
     t = np.array([time_s for _, time_s in tracked.decoded if time_s is not None], np.float64)
     latest = np.maximum.accumulate(np.append(-np.inf, t[:-1])) if len(t) else t

@@ -19,18 +19,14 @@ _COMMON_NAMES = {
     "frame_time": ("frame_time", "frame_times", "frame_timestamps", "timestamps", "timestamp", "time", "t"),
     "force": ("force", "forces", "wrench", "ft"),
     "force_time": ("force_time", "force_times", "force_timestamps", "ft_time", "wrench_time"),
-    "tip": ("tip", "tip_position", "tool_tip"),
 }
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,), tip (T, 3).
+    """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,).
 
     Arrays are found by common names anywhere in the file, or named by `use`. A force array without times has
-    those of the frames.
-
-    Raises:
-        UserError: an array is missing, ambiguous or of the wrong shape.
+    those of the frames. Raises UserError if an array is missing, ambiguous or of the wrong shape.
     """
     import h5py
 
@@ -62,9 +58,6 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         clock = chosen["force_time"]
         force_s = seconds if clock is None else np.asarray(clock[:], np.float64).ravel()
         found = replace(found, force_s=force_s, force=force[:, :3])
-    if chosen["tip"] is not None:
-        place = np.asarray(chosen["tip"][:], np.float64).reshape(-1, 3)
-        found = replace(found, tip=np.column_stack([seconds, place]))
     return found
 
 

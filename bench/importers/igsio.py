@@ -5,17 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bench.importers.registry import MOST_FRAMES, Intake, one_of
+from bench.importers.registry import LARGEST_BYTES, MOST_FRAMES, Intake, one_of
 from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 
-_LARGEST_BYTES = 1 << 42
 _LONGEST_LINE = 65536
 
 Fields = dict[str, dict[int, str]]  # text of a field by name and frame
@@ -26,11 +24,8 @@ _FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
 def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a sequence.
 
-    `Timestamp` is the frame's time, `Force` (one or three numbers) its force, and the translation of a
-    `*TipToWorldTransform` the tip. Frames whose tracker status is not OK have no tip.
-
-    Raises:
-        UserError: not a MetaImage, or no times.
+    `Timestamp` is the frame's time, `Force` (one or three numbers) its force. Raises UserError for another
+    format, or no times.
     """
     import SimpleITK
 
@@ -38,7 +33,10 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(source))
     reader.ReadImageInformation()
-    fields = _fields(reader)
+    fields: Fields = {}
+    for key in reader.GetMetaDataKeys():
+        if match := _FIELD.fullmatch(key):
+            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
     size = reader.GetSize()
     if len(size) != 3 or size[2] > MOST_FRAMES:
         raise UserError(f"{source}: not a sequence of pictures, or one of more than {MOST_FRAMES} frames")
@@ -52,7 +50,6 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     times = _column(source, stamp, fields[stamp], count, (1,))[:, 0]
     notes: list[str] = []
     force = _force(source, fields, count, use, notes)
-    tip = _tip(source, fields, times, use)
     if "UltrasoundImageOrientation" in reader.GetMetaDataKeys():
         orientation = reader.GetMetaData("UltrasoundImageOrientation")
         notes.append(f"orientation {orientation}: pictures are imported as stored")
@@ -64,12 +61,12 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             yield SimpleITK.GetArrayFromImage(reader.Execute())
 
     good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
-    return Intake(times, pictures, times[: len(force)][good], force[good], tip, tuple(notes))
+    return Intake(times, pictures, times[: len(force)][good], force[good], tuple(notes))
 
 
 def _refuse_elsewhere(source: Path) -> None:
     """Raises UserError for a header that names another file for its pictures, or is not a MetaImage's."""
-    with checked_file.open_file(source, _LARGEST_BYTES) as file:
+    with checked_file.open_file(source, LARGEST_BYTES) as file:
         while line := file.readline(_LONGEST_LINE):
             key, _, value = line.partition(b"=")
             if key.strip() == b"ElementDataFile":
@@ -79,14 +76,6 @@ def _refuse_elsewhere(source: Path) -> None:
             if not value or len(line) == _LONGEST_LINE:
                 break
     raise UserError(f"{source}: not a readable MetaImage")
-
-
-def _fields(reader: Any) -> Fields:
-    fields: Fields = {}
-    for key in reader.GetMetaDataKeys():
-        if match := _FIELD.fullmatch(key):
-            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
-    return fields
 
 
 def _force(source: Path, fields: Fields, count: int, use: dict[str, str], notes: list[str]) -> Floats:
@@ -100,18 +89,6 @@ def _force(source: Path, fields: Fields, count: int, use: dict[str, str], notes:
         notes.append(f"{name} is one number per frame: imported as a magnitude, in fx_n")
         force = np.column_stack([force, np.zeros((count, 2))])
     return force
-
-
-def _tip(source: Path, fields: Fields, times: Floats, use: dict[str, str]) -> Floats:
-    """(M, 4) time and position of the tip in the frames where it was tracked."""
-    names = sorted(fields) if "tip" in use else [n for n in fields if n.endswith("TipToWorldTransform")]
-    name = one_of("tip", use.get("tip"), names, "field")
-    if name is None:
-        return np.zeros((0, 4))
-    poses = _column(source, name, fields[name], len(times), (16,))
-    status = fields.get(f"{name}Status", {})
-    tracked = [status.get(k, "OK").strip() == "OK" for k in range(len(times))]
-    return np.asarray(np.column_stack([times, poses[:, [3, 7, 11]]])[np.array(tracked)], np.float64)
 
 
 def _column(source: Path, name: str, values: dict[int, str], count: int, widths: tuple[int, ...]) -> Floats:

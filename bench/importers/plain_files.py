@@ -33,11 +33,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a video, a folder of pictures or stacks of them, a stack, or an .npy of (T, H, W[, C]).
 
     Times come from `--use frame_time=TABLE.csv`, from `--use fps=RATE` and the numbers in the names, or from
-    the video. `--use frames=GLOB` and `right=GLOB` choose among a folder's pictures. Forces come from
-    `--use force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n.
-
-    Raises:
-        UserError: no times, a table without the columns, or not as many times as pictures.
+    the video. `--use frames=GLOB` and `right=GLOB` choose among a folder's pictures. Forces come from `--use
+    force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n. Raises UserError for no
+    times, a table without the columns, or not as many times as pictures.
     """
     notes: list[str] = []
     pictures, numbers, times = _open(source, use.get("frames"), notes)

@@ -27,26 +27,23 @@ from synth.video import read as video
 from synth.video import stereo_layout
 from synth.video.file_numbers import find_stills
 
-ROLES = ("frames", "frame_time", "force", "force_time", "tip")
+ROLES = ("frames", "frame_time", "force", "force_time")
 """Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
-PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right")  # names of files, or *.* among a folder's
-BAG_ROLES = ("frames", "force", "tip", "right", "depth", "calibration", "right_calibration")  # topics
+PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")  # files, *.* in a folder
+BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
 STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-_PLAIN = "bench.importers.plain_files"
+_BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
-    ".h5": "bench.importers.hdf5",
-    ".hdf5": "bench.importers.hdf5",
-    ".bag": "bench.importers.rosbag",
-    ".mcap": "bench.importers.rosbag",
-    ".db3": "bench.importers.rosbag",
+    **dict.fromkeys((".h5", ".hdf5"), "bench.importers.hdf5"),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), _BAG),
     **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
 }
-_LARGEST_BYTES = 1 << 42
 _LEAST_PX = 8
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 10.0
 
+LARGEST_BYTES = 1 << 42  # of a file
 MOST_FRAMES = 10_000_000  # of a source, and samples of a sensor
 
 
@@ -73,7 +70,6 @@ class Intake:
     (H, W, 3) uint8."""
     force_s: Floats = field(default_factory=lambda: np.zeros(0))  # (N,) s; empty: no force
     force: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) in the source's unit
-    tip: Floats = field(default_factory=lambda: np.zeros((0, 4)))  # (M, 4) time [s], tool tip [mm]
     notes: tuple[str, ...] = ()
     second: SecondView | None = None
 
@@ -89,19 +85,19 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     """
     use = dict(use or {})
     if not source.is_dir():
-        checked_file.check_file(source, _LARGEST_BYTES)
+        checked_file.check_file(source, LARGEST_BYTES)
     maker = _MAKERS.get(source.suffix.lower())
     if source.is_dir():
         bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
         pictures_only = not recording and find_stills(source, STILLS)
-        maker = "bench.importers.rosbag" if bag else _PLAIN if pictures_only else None
+        maker = _BAG if bag else _PLAIN if pictures_only else None
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
-    is_bag = maker.endswith("rosbag")
-    roles = BAG_ROLES if is_bag else (*(PLAIN_ROLES if maker == _PLAIN else ROLES), "calibration")
+    is_bag = maker == _BAG
+    roles = {_BAG: BAG_ROLES, _PLAIN: PLAIN_ROLES}.get(maker, (*ROLES, "calibration"))
     if unknown := sorted(set(use) - set(roles)):
         raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
     calibration = None if is_bag else use.pop("calibration", None)
@@ -117,9 +113,8 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     def decoded(view: Intake | SecondView, rgb: bool = True) -> Iterator[Array]:
         with _damage_as_user_error(source):
             size = None
-            for k, picture in enumerate(
-                (_as_rgb(one, bits) for one in view.pictures()) if rgb else view.pictures()
-            ):
+            for k, picture in enumerate(view.pictures()):
+                picture = _as_rgb(picture, bits) if rgb else picture
                 if picture.shape != (size := size or picture.shape):
                     raise UserError(f"{source}: frame {k} has another size than the frames before it")
                 yield picture
@@ -182,7 +177,7 @@ def _refuse_odd(source: Path, found: Intake) -> None:
     """Raises UserError for times that are not seconds, or not as many as the forces."""
     if len(found.times_s) == 0:
         raise UserError(f"{source}: holds no frames")
-    for what, times in (("frame", found.times_s), ("force", found.force_s), ("tip", found.tip[:, 0])):
+    for what, times in (("frame", found.times_s), ("force", found.force_s)):
         step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         if not (np.abs(times) < _LATEST_S).all() or step >= _LONGEST_STEP_S:
             raise UserError(f"{source}: {what} times are {step:g} s apart: are they in seconds?")
@@ -209,25 +204,22 @@ def write_recording(
         writer.write_frames(part, found.times_s)
         if len(found.force):
             writer.write_force(part, found.force_s, newtons * found.force)
-        if len(found.tip):
-            writer.write_tip(part, found.tip)
-        more: dict[str, object] = {}
+        about = dict(about)
         if (second := found.second) is not None:
             writer.write_second(part / second.kind, second.frame.tolist(), second.pictures())
             if second.pair is not None:
                 writer.write_storage(part / "stereo.yaml", second.pair)
-                more["stereo"] = {"calibration": "stereo.yaml"}
+                about["stereo"] = {"calibration": "stereo.yaml"}
             if second.lens is not None:
-                more["depth"] = dict(second.lens)
-        writer.write_meta(part, {**about, **more})
+                about["depth"] = dict(second.lens)
+        writer.write_meta(part, about)
     return out
 
 
 def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
     """The name for a role: the requested one, else the only one, else None.
 
-    Raises:
-        UserError: the requested one is missing, or there are several and none is requested.
+    Raises UserError if the requested one is missing, or there are several and none is requested.
     """
     if wanted is not None:
         if wanted not in names:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -11,35 +11,23 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+from scipy.spatial import KDTree
 
-from bench.importers import camera_info
-from bench.importers.camera_info import Lens, join_pair
-from bench.importers.registry import Intake, SecondView, one_of
+from bench.importers.registry import LARGEST_BYTES, Intake, SecondView, one_of
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file
 
-_LARGEST_BYTES = 1 << 42
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _FORCES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3Stamped")
 _UNSTAMPED = ("geometry_msgs/msg/Wrench",)
-_TIPS = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PointStamped",
-    "geometry_msgs/msg/TransformStamped",
-)
 _LENSES = ("sensor_msgs/msg/CameraInfo",)
+_TERMS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}  # of distortion, by its model
 _BAYER = ("rggb", "bggr", "gbrg", "grbg")
 _CHANNELS = {"mono": 1, "rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, **{f"bayer_{order}": 1 for order in _BAYER}}
 _SAME = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16", "16UC3": "bgr16"}
-_YUV = {
-    "yuv422": "UYVY",
-    "uyvy": "UYVY",
-    "yuv422_yuy2": "YUYV",
-    "yuyv": "YUYV",
-    "nv12": "NV12",
-    "nv21": "NV21",
-}
+_YUV = {name: name.upper() for name in ("uyvy", "yuyv", "nv12", "nv21")}  # OpenCV's names
+_YUV |= {"yuv422": "UYVY", "yuv422_yuy2": "YUYV"}
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _HEADER = 12  # bytes before the PNG in a compressed depth picture
 
@@ -48,14 +36,12 @@ _Pictures = Callable[..., Iterator[Array]]
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a bag: its only topic of pictures, of forces and of poses, or those named by `use`.
+    """Opens a bag: its only topic of pictures and of forces, or those named by `use`.
 
-    Times are the messages' header stamps; if a topic's stamps are all zero, the bag's times. Positions, in
-    metres by the ROS convention, become mm. Each picture of the topic `right` or `depth` is assigned to the
-    nearest frame, at most half a frame interval away.
+    Times are the messages' header stamps; if a topic's stamps are all zero, the bag's times. Each picture of
+    the topic `right` or `depth` is assigned to the nearest frame, at most half a frame interval away.
 
-    Raises:
-        UserError: no pictures, several topics of a kind, an unknown encoding, or as in `camera_info`.
+    Raises UserError for no pictures, several topics of a kind, an unknown encoding, an unusable calibration.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -75,20 +61,14 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         second = use.get("right") or use.get("depth")
         stamped = "force" not in use and any(c.msgtype in _FORCES for c in bag.connections)
         forces = _FORCES if stamped else (*_FORCES, *_UNSTAMPED)
-        topics = {
-            role: _topic(bag, role, kinds, use, second)
-            for role, kinds in (("frames", _PICTURES), ("force", forces), ("tip", _TIPS))
-        }
-        notes: list[str] = []
-        if topics["frames"] is None:
+        notes, frames = list[str](), _topic(bag, "frames", _PICTURES, use, second)
+        if frames is None:
             raise UserError(f"{source}: holds no topic of pictures")
-        stamps = _table(bag, topics["frames"], lambda message: (), 0, notes)[:, 0]
-        force = _table(bag, topics["force"], _vector, 3, notes)
-        tip = _table(bag, topics["tip"], _place, 3, notes) * [1.0, 1000.0, 1000.0, 1000.0]
-        first = partial(pictures, topics["frames"])
-        found = Intake(stamps, first, force[:, 0], force[:, 1:], tip, tuple(notes))
+        stamps = _table(bag, frames, lambda message: (), 0, notes)[:, 0]
+        force = _table(bag, _topic(bag, "force", forces, use), _vector, 3, notes)
+        found = Intake(stamps, partial(pictures, frames), force[:, 0], force[:, 1:], tuple(notes))
         if second is not None:
-            return _add_second(bag, found, topics["frames"], use, pictures)
+            return _add_second(bag, found, frames, use, pictures)
         if lone := {"calibration", "right_calibration"} & use.keys():
             raise UserError(f"--use {min(lone)}=...: requires right=TOPIC or depth=TOPIC")
         return found
@@ -116,7 +96,7 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
     view = SecondView(kind, np.where(frame < 0, -1, frame - first), partial(pictures, topic))
     if kind == "right":
         right = _lens(bag, topic, use.get("right_calibration"), next(pictures(topic)))
-        view = replace(view, pair=None if left is None or right is None else join_pair(left, right))
+        view = replace(view, pair=None if left is None or right is None else _join_pair(left, right))
     else:
         view = replace(view, pictures=partial(pictures, topic, _depth))
         if left is not None:
@@ -140,31 +120,22 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
 def partners(times_s: Floats, frames_s: Floats) -> Ints:
     """The frame of each picture of another camera, (M,), mutually nearest in time; -1: none.
 
-    Args:
-        times_s: (M,) times of the pictures [s].
-        frames_s: (T,) times of the frames [s].
+    `times_s`: (M,) times of the pictures [s]; `frames_s`: (T,) times of the frames [s].
     """
-    frame, picture = _nearest(times_s, frames_s), _nearest(frames_s, times_s)
-    apart = np.abs(times_s - frames_s[frame])
+    apart, frame = KDTree(frames_s[:, None]).query(times_s[:, None])
+    picture = KDTree(times_s[:, None]).query(frames_s[:, None])[1]
     step = float(np.median(np.diff(np.sort(frames_s)))) if len(frames_s) > 1 else np.inf
     return np.where((picture[frame] == np.arange(len(times_s))) & (apart <= step / 2), frame, -1)
 
 
-def _nearest(times_s: Floats, among_s: Floats) -> Ints:
-    """Index into `among_s` of the time nearest to each of (N,) times."""
-    order = np.argsort(among_s, kind="stable")
-    rising = among_s[order]
-    return order[np.searchsorted((rising[1:] + rising[:-1]) / 2, times_s)]
-
-
-def _lens(bag: Any, pictures: str, named: str | None, picture: Array) -> Lens | None:
+def _lens(bag: Any, pictures: str, named: str | None, picture: Array) -> _Lens | None:
     names = sorted({c.topic for c in bag.connections if c.msgtype in _LENSES})
-    usual = camera_info.info_name(pictures)
+    usual = _info_name(pictures)
     if not named and usual not in names:
         return None
     topic = one_of("calibration", named or usual, names, "topic") or usual
     _, info = next(_messages(bag, topic))
-    return camera_info.read_lens(topic, info, pictures, (picture.shape[1], picture.shape[0]))
+    return _read_lens(topic, info, pictures, (picture.shape[1], picture.shape[0]))
 
 
 def _refuse_elsewhere(folder: Path) -> None:
@@ -177,10 +148,9 @@ def _refuse_elsewhere(folder: Path) -> None:
         raise UserError(f"{path}: relative_file_paths is missing")
     for name in names:
         if not isinstance(name, str) or name != Path(name).name:
-            raise UserError(
-                f"{path}: {str(name)[:80] if isinstance(name, str) else 'a file'} is not in the bag's folder"
-            )
-        checked_file.check_file(folder / name, _LARGEST_BYTES)
+            shown = name[:80] if isinstance(name, str) else "a file"  # other YAML may be endless
+            raise UserError(f"{path}: {shown} is not in the bag's folder")
+        checked_file.check_file(folder / name, LARGEST_BYTES)
 
 
 def _topic(
@@ -215,20 +185,10 @@ def _table(
 
 
 def _vector(message: Any) -> tuple[float, float, float]:
-    if hasattr(message, "wrench"):
-        message = message.wrench
-    vector = message.force if hasattr(message, "force") else message.vector
-    return vector.x, vector.y, vector.z
-
-
-def _place(message: Any) -> tuple[float, float, float]:
-    if hasattr(message, "pose"):
-        place = message.pose.position
-    elif hasattr(message, "point"):
-        place = message.point
-    else:
-        place = message.transform.translation
-    return place.x, place.y, place.z
+    """The force in a message of one of `_FORCES` and `_UNSTAMPED`."""
+    for part in ("wrench", "force", "vector"):
+        message = getattr(message, part, message)
+    return message.x, message.y, message.z
 
 
 def _picture(source: Path, message: Any) -> Array:
@@ -280,3 +240,59 @@ def _depth(source: Path, message: Any) -> Array:
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
     found = np.ascontiguousarray(rows[:, : message.width * kind.itemsize]).view(kind)
     return 1000 * found.astype(np.float32) if kind.kind == "f" else found.astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera and its pose in its stereo pair."""
+
+    K: Floats  # (3, 3) px
+    distortion: Floats  # (D,) in OpenCV's order
+    turn: Floats  # (3, 3) rotation from its axes to the rectified pair's
+    shift_mm: float  # x of the left lens in the rectified axes, with this lens at the origin
+
+
+def _read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> _Lens:
+    """The camera of a calibration message `info` of ROS 1 or 2.
+
+    `pictures`: the topic of the camera's pictures, of width and height `size` [px]; those named
+    `image_rect...` are already rectified. Raises UserError for no calibration, or one for another size.
+    """
+    K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
+    if (info.width, info.height) != size:
+        calibrated = f"{info.width} x {info.height}"
+        raise UserError(f"{topic}: calibrated at {calibrated} px, but {pictures} has {size[0]} x {size[1]}")
+    K, P = K.reshape(3, 3), P.reshape(3, 4)
+    if not (np.isfinite([*K.flat, *P.flat]).all() and min(K[0, 0], K[1, 1], P[0, 0], P[1, 1]) > 0):
+        raise UserError(f"{topic}: the camera isn't calibrated (K or P is 0)")
+    shift_mm = 1000 * float(P[0, 3] / P[0, 0])
+    if _image_name(pictures).startswith("image_rect"):
+        return _Lens(P[:, :3], np.zeros(5), np.eye(3), shift_mm)
+    if D.any() and len(D) not in _TERMS.get(info.distortion_model, ()):
+        raise UserError(
+            f"{topic}: distortion {info.distortion_model} with {len(D)} terms is not one of OpenCV's models"
+        )
+    return _Lens(K, D if D.any() else np.zeros(5), R.reshape(3, 3), shift_mm)
+
+
+def _image_name(topic: str) -> str:
+    """The last part of a picture topic's name, without its transport."""
+    return [part for part in topic.split("/") if not part.startswith("compressed")][-1]
+
+
+def _info_name(topic: str) -> str:
+    """The topic on which ROS publishes the calibration of a picture topic."""
+    return topic[: topic.rindex(_image_name(topic))] + "camera_info"
+
+
+def _join_pair(left: _Lens, right: _Lens) -> dict[str, Floats]:
+    """K1, D1, K2, D2, R, T [mm] as in OpenCV's `stereoCalibrate`: x_right = R x_left + T.
+
+    Raises UserError if the baseline is 0.
+    """
+    baseline = right.shift_mm - left.shift_mm
+    if not baseline:
+        raise UserError("the calibrations have no baseline (P[0, 3] of the right camera's camera_info)")
+    rotation, translation = right.turn.T @ left.turn, right.turn.T @ [[baseline], [0.0], [0.0]]
+    lenses = {"K1": left.K, "D1": left.distortion, "K2": right.K, "D2": right.distortion}
+    return {**lenses, "R": rotation, "T": translation}

@@ -100,12 +100,8 @@ def ridge(
 ) -> Ridge:
     """Ridge regression without intercept (no motion is no force), its strength by cross-validation.
 
-    Args:
-        x: (n, features).
-        y: (n, targets).
-        fold: (n,) the fold that leaves each sample out.
-        strengths: candidates, in units of the features' mean sum of squares.
-        parts: columns of `y` that share a strength.
+    `x`: (n, features); `y`: (n, targets); `fold`: (n,) the fold that leaves each sample out; `strengths`:
+    candidates, in units of the features' mean sum of squares; `parts`: columns of `y` that share a strength.
     """
     alphas = strengths * np.square(x).sum() / x.shape[1]
     best = np.full(y.shape[1], alphas[0])

@@ -36,10 +36,8 @@ def simpler_methods(train: Path | None, model: Path | None, stereo: bool = False
     """Physics, the plug-ins of installed packages and, with training data, ridge regression.
 
     Ridge is fitted once per model on the model's own fit sequences; for a stereo recording on motion in three
-    dimensions if the data have it.
-
-    Raises:
-        UserError: none of the model's sequences is in `train`, or a plug-in has the name of a method of ours.
+    dimensions if the data have it. Raises UserError if none of the model's sequences is in `train`, or a
+    plug-in has the name of a method of ours.
     """
     methods = untrained()
     others = plugins.installed()

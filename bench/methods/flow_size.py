@@ -7,6 +7,7 @@ where the tissue moves. A length is not a force: scoring finds the one gain betw
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from synth.arrays import Floats
 PEAK_PERCENTILE = 98.0  # for the largest displacement, without outliers of flow at edges; by hand
 
 
+@dataclass(frozen=True)
 class FlowSize:
     """A statistic of the flow's length over the tissue [mm], in place of a force.
 
@@ -23,15 +25,13 @@ class FlowSize:
     in some frames only would change the statistic more.
     """
 
-    def __init__(self, measure: Callable[[Floats], float]) -> None:
-        """`measure`: the statistic [mm] of at least one length, (P,) mm."""
-        self._measure = measure
+    measure: Callable[[Floats], float]  # the statistic [mm] of at least one length, (P,) mm
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`; NaN where no tissue is visible."""
         lengths = np.linalg.norm(frame.flow[scene.tissue].astype(np.float64), axis=1) * scene.scale_mm_per_px
         visible = bool((frame.confidence[scene.tissue] > 0).any())
-        return ForceEstimate(np.array([self._measure(lengths) if visible else np.nan, np.nan, np.nan]))
+        return ForceEstimate(np.array([self.measure(lengths) if visible else np.nan, np.nan, np.nan]))
 
 
 def flow_sizes() -> dict[str, FlowSize]:

@@ -67,8 +67,7 @@ class Plugged:
 def installed() -> dict[str, Method]:
     """New methods of installed packages, by name.
 
-    Raises:
-        UserError: one can't be loaded or called.
+    Raises UserError if one can't be loaded or called.
     """
     methods: dict[str, Method] = {}
     for name in METHODS.names():

@@ -171,10 +171,7 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
 def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
     """The posterior of a frame's loads.
 
-    Args:
-        basis: of the tissue.
-        frame: the frame's displacement.
-        own_mm: (C,) size of the tissue's own motion.
+    `own_mm`: (C,) size of the tissue's own motion.
     """
     rank, count = len(basis.size), basis.contacts.shape[1]
     sizes = np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))

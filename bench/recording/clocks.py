@@ -18,9 +18,7 @@ def find_other_unit(frame_s: Floats, force_s: Floats) -> str:
     A sensor may run for hours next to a short video. So the longer record must be far longer, and sampled
     more slowly than such devices are: a fast sensor in milliseconds looks as if sampled about once a second.
 
-    Args:
-        frame_s: (T,) times of the frames [s].
-        force_s: (N,) times of the sensor [s].
+    `frame_s`: (T,) times of the frames [s]; `force_s`: (N,) times of the sensor [s].
     """
     if min(len(frame_s), len(force_s)) < 2 or min(np.ptp(frame_s), np.ptp(force_s)) <= 0:
         return ""

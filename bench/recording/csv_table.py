@@ -24,13 +24,9 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
 
     Dates of ISO 8601 are seconds since 1970, in UTC unless they state a zone.
 
-    Args:
-        path: the CSV; comma or tab, or semicolon and then also decimal commas; UTF-8, or UTF-16 with BOM.
-        required: columns that must be present exactly once.
-        optional: columns returned if present.
-
-    Raises:
-        UserError: unreadable, too large, a missing column, no rows, a cell that is not a number.
+    `path`: with comma or tab, or semicolon and then also decimal commas, in UTF-8, or UTF-16 with BOM.
+    `required`: columns that must be present exactly once; `optional`: columns returned if present. Raises
+    UserError: unreadable, too large, a missing column, no rows, a cell that is not a number.
     """
     header, rows = _split(path)
     missing = [name for name in required if header.count(name) != 1]

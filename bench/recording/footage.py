@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 
 from bench.recording.folder import Recording
+from bench.recording.meta import Depth
 from synth.arrays import Floats, Map
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.flow.stereo import calibration
-from synth.flow.stereo.rig import StereoRig
 from synth.recording_flow.decode import Footage
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion, Size
@@ -23,12 +25,13 @@ _LARGEST_BYTES = 1 << 30  # of an array of points
 def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     """The recording's video; `mm_per_px`: scale of its own pixels."""
     depth: RightVideo | DepthVideo | None = None
-    if recording.right:
-        depth = RightVideo(recording.right_frames, lambda size: _rig(recording, size), mm_per_px)
-    elif recording.depths:
-        depth = DepthVideo(
-            lambda frame, size: _depth(recording, frame, size), lambda size: _K(recording, size), mm_per_px
+    if (pair := recording.meta.stereo) is not None:
+        path, unit_mm = recording.folder / pair.calibration, pair.mm_per_unit
+        depth = RightVideo(
+            recording.right_frames, lambda size: calibration.read_rig(path, size[::-1], unit_mm), mm_per_px
         )
+    elif (lens := recording.meta.depth) is not None:
+        depth = DepthVideo(partial(_depth, recording, lens.mm_per_unit), partial(_K, lens), mm_per_px)
     return Footage(
         recording.frames,
         str(recording.folder),
@@ -40,23 +43,13 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
     )
 
 
-def _rig(recording: Recording, size: Size) -> StereoRig:
-    about = recording.meta.stereo
-    assert about is not None
-    return calibration.read_rig(recording.folder / about.calibration, size[::-1], about.mm_per_unit)
-
-
-def _K(recording: Recording, size: Size) -> Floats:
-    about, (height, width) = recording.meta.depth, size
-    assert about is not None
-    x, y = about.centre_px or ((width - 1) / 2, (height - 1) / 2)
+def _K(about: Depth, size: Size) -> Floats:
+    x, y = about.centre_px or ((size[1] - 1) / 2, (size[0] - 1) / 2)
     return np.array([[about.focal_px, 0, x], [0, about.focal_px, y], [0, 0, 1.0]])
 
 
-def _depth(recording: Recording, frame: FrameMotion, size: Size) -> Map | None:
+def _depth(recording: Recording, unit_mm: float, frame: FrameMotion, size: Size) -> Map | None:
     """Depth (H, W) mm of a frame, or the third coordinate of its points; None: missing."""
-    about = recording.meta.depth
-    assert about is not None
     if frame.index not in recording.depths:
         if not frame.is_rest and frame.index < max(recording.depths):
             return None
@@ -64,14 +57,12 @@ def _depth(recording: Recording, frame: FrameMotion, size: Size) -> Map | None:
     path = recording.depths[frame.index]
     if path.suffix == ".npy":
         checked_file.check_file(path, _LARGEST_BYTES)
-        try:
+        with as_user_error(f"{path}: not a readable array"):
             found = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError):
-            raise UserError(f"{path}: not a readable array") from None
     else:
         found = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
     if found.ndim == 3 and found.shape[2] == 3 and found.dtype.kind == "f":
         found = found[..., 2]
     if found.ndim != 2 or found.shape != size or found.dtype.kind not in "uif":
         raise UserError(f"{path}: {found.shape} {found.dtype}, but the video is {size}")
-    return np.asarray(found.astype(np.float32) * np.float32(about.mm_per_unit), np.float32)
+    return np.asarray(found.astype(np.float32) * np.float32(unit_mm), np.float32)

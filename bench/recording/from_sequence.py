@@ -34,8 +34,35 @@ def export_recording(
     on; None: all. Raises UserError if the folder exists, or there is no such instrument.
     """
     force = force_of(sequence, instrument)
+    time = np.asarray(sequence["time"][:], np.float64)
+    even = (slice(None), slice(None))
+    if frames == "mp4":  # the codec requires even sizes; masks must have the video's size
+        even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
+    about: dict[str, object] = {
+        "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
+        "scale_uncertainty": 0.0,
+        "young_kpa": float(sequence.attrs["young_kpa"]),
+        "rest_frame": 0,
+        "tissue": "brain" if (sequence.attrs.get("scenario") or {}).get("pulse") else "ex-vivo",
+        "specimen": f"anatomy {sequence.attrs.get('anatomy_id', sequence.index)}",
+        "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
+    }
     with checked_file.folder_of(Path(folder)) as part:
-        _write_files(sequence, part, frames, force)
+        (part / "masks").mkdir()
+        _write_pictures(sequence, "rgb", part, "video", frames)
+        for t in range(sequence.frames):
+            tool = np.asarray(sequence["tool"][t], bool)[even]
+            if tool.any():
+                checked_file.write_picture(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
+        tissue = np.asarray(sequence["tissue"][:], bool)[even]
+        checked_file.write_picture(part / "tissue.png", tissue.astype(np.uint8) * 255)
+        writer.write_force(part, time, force / 1000)
+        writer.write_frames(part, time)
+        if "rgb_right" in sequence:
+            _write_pictures(sequence, "rgb_right", part, "right", frames)
+            writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
+            about["stereo"] = {"calibration": _PAIR}
+        writer.write_meta(part, about)
     return Path(folder)
 
 
@@ -48,37 +75,6 @@ def force_of(sequence: Sequence, instrument: int | None) -> Floats:
         has = f"has instruments 1 to {len(each)}" if each else "has no instrument"
         raise UserError(f"instrument {instrument}: sequence {sequence.index} {has}")
     return np.asarray(each[instrument - 1]["force_mn"], np.float64)
-
-
-def _write_files(sequence: Sequence, part: Path, frames: Literal["png", "mp4"], force: Floats) -> None:
-    (part / "masks").mkdir()
-    time = np.asarray(sequence["time"][:], np.float64)
-    _write_pictures(sequence, "rgb", part, "video", frames)
-    even = (slice(None), slice(None))
-    if frames == "mp4":  # the codec requires even sizes; masks must have the video's size
-        even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
-    for t in range(sequence.frames):
-        tool = np.asarray(sequence["tool"][t], bool)[even]
-        if tool.any():
-            checked_file.write_picture(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
-    tissue = np.asarray(sequence["tissue"][:], bool)[even]
-    checked_file.write_picture(part / "tissue.png", tissue.astype(np.uint8) * 255)
-    writer.write_force(part, time, force / 1000)
-    writer.write_frames(part, time)
-    about: dict[str, object] = {
-        "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
-        "scale_uncertainty": 0.0,
-        "young_kpa": float(sequence.attrs["young_kpa"]),
-        "rest_frame": 0,
-        "tissue": "brain" if (sequence.attrs.get("scenario") or {}).get("pulse") else "ex-vivo",
-        "specimen": f"anatomy {sequence.attrs.get('anatomy_id', sequence.index)}",
-        "sensor": {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None},
-    }
-    if "rgb_right" in sequence:
-        _write_pictures(sequence, "rgb_right", part, "right", frames)
-        writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
-        about["stereo"] = {"calibration": _PAIR}
-    writer.write_meta(part, about)
 
 
 def _write_pictures(

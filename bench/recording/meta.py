@@ -227,8 +227,7 @@ def commented() -> str:
 def read_meta(path: Path) -> Meta:
     """The recording's `meta.yaml`.
 
-    Raises:
-        UserError: no such file, not YAML, or wrong fields, one line each.
+    Raises UserError: no such file, not YAML, or wrong fields, one line each.
     """
     if not os.path.lexists(path):
         raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px in it")

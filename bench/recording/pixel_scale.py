@@ -36,8 +36,7 @@ class PixelScale:
 def find_scale(meta: Meta, folder: Path) -> PixelScale:
     """The recording's scale, stated or calibrated by `meta.yaml`.
 
-    Raises:
-        UserError: no checkerboard found, points that coincide, or, for an unknown scale, no picture.
+    Raises UserError for no checkerboard found, points that coincide, or, for an unknown scale, no picture.
     """
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]

@@ -94,7 +94,6 @@ class RightPictures:
         return StereoQuality(*numbers, *pair, *self._timing.find_lag_s(), rows, self._sharpness, moved)
 
     def _last_rows_px(self, rectified: Rectified) -> float:
-        """See `StereoQuality`."""
         if self._last is None:
             return 0.0
         *pair, tissue = self._last
@@ -105,7 +104,6 @@ class RightPictures:
             return 0.0
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
-        """See `StereoQuality`."""
         if self._tool is None:
             return 0.0
         tool, *pair = self._tool

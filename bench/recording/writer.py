@@ -29,11 +29,6 @@ def write_force(folder: Path, time_s: Floats, newtons: Floats) -> None:
     _csv(folder / "force.csv", "t_s,fx_n,fy_n,fz_n", "%.6f,%.9f,%.9f,%.9f", columns)
 
 
-def write_tip(folder: Path, places: Floats) -> None:
-    """Writes tip.csv: times and positions of the instrument's tip, (N, 4) s, mm, mm, mm."""
-    _csv(folder / "tip.csv", "t_s,x_mm,y_mm,z_mm", "%.6f,%.6f,%.6f,%.6f", places)
-
-
 def write_meta(folder: Path, keys: Mapping[str, object]) -> None:
     """Writes meta.yaml."""
     with (folder / "meta.yaml").open("w", encoding="utf-8") as file:
@@ -58,11 +53,9 @@ def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
 def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[Array]) -> None:
     """Writes right or depth pictures as FOLDER/NNNNNN.png by frame number, without those of no frame (-1).
 
-    Args:
-        folder: `right` or `depth` of the recording; created.
-        frames: (M,).
-        pictures: M of (H, W, 3) uint8, or of depth (H, W): uint16, or float32 as .npy. An odd last row or
-            column is left out, as in the video.
+    `folder`: `right` or `depth` of the recording, which is created; `frames`: (M,); `pictures`: M of uint8
+    (H, W, 3), or of depth (H, W): uint16, or float32 as .npy. An odd last row or column is left out, as in
+    the video.
     """
     folder.mkdir()
     for frame, picture in zip(frames, pictures, strict=True):
@@ -85,12 +78,8 @@ def write_video(
 ) -> None:
     """Writes H.264 MP4 with each frame at its own time, to 1 ms; an odd last row or column is left out.
 
-    Args:
-        path: the file.
-        pictures: (H, W, 3) uint8 each, as many as `times_s`.
-        times_s: (T,) rising [s].
-        crf: x264's quality, 0 is lossless (4:4:4 colour).
-        progress: called with the number of frames written.
+    `pictures`: (H, W, 3) uint8 each, as many as `times_s`, (T,) rising [s]; `crf`: x264's quality, 0 is
+    lossless (4:4:4 colour); `progress`: called with the number of frames written.
     """
     options = {"crf": str(crf), "threads": "1"}
     rate = max(1, round((len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-3)))

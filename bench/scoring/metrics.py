@@ -53,9 +53,7 @@ _AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "
 def agreement(sensor: Floats, predicted: Floats) -> dict[str, float]:
     """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2 and gain over samples where both are finite.
 
-    Args:
-        sensor: (T,) mN.
-        predicted: (T,) mN.
+    `sensor`: (T,) mN; `predicted`: (T,) mN.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
@@ -102,10 +100,7 @@ def lag(time_s: Floats, sensor: Floats, predicted: Floats) -> dict[str, float]:
     It is only reported: scores are at lag 0. It is found on a uniform grid with a step of a quarter of the
     median frame time, within half a second in both directions.
 
-    Args:
-        time_s: (T,) rising [s].
-        sensor: (T,) mN.
-        predicted: (T,) mN.
+    `time_s`: (T,) rising [s]; `sensor`: (T,) mN; `predicted`: (T,) mN.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
@@ -184,9 +179,8 @@ def per_event(
 def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> dict[str, float]:
     """Scores of contact detection.
 
-    Returns:
-        contact_f1; false_positive_rate: share of contact-free samples where contact is predicted;
-        background_mn: mean predicted force in contact-free samples.
+    contact_f1; false_positive_rate: share of contact-free samples where contact is predicted; background_mn:
+    mean predicted force in contact-free samples.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted)
     truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
@@ -207,12 +201,9 @@ def compute_all(
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """All scores of a predicted curve against a sensor's, and the table of its contacts.
 
-    Args:
-        time_s: (T,) rising [s].
-        sensor: (T,) mN, NaN where unknown.
-        predicted: (T,) mN, NaN where unknown.
-        noise_floor_mn: standard deviation of the sensor without contact [mN].
-        used: (T,) samples that are scored; None: all. A contact ends at samples that are not.
+    `time_s`: (T,) rising [s]; `sensor`, `predicted`: (T,) mN, NaN where unknown; `noise_floor_mn`: standard
+    deviation of the sensor without contact; `used`: (T,) samples that are scored; None: all. A contact ends
+    at samples that are not.
     """
     used = np.ones(len(time_s), bool) if used is None else used
     sensor, predicted = np.where(used, sensor, np.nan), np.where(used, predicted, np.nan)
@@ -251,12 +242,11 @@ def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
 def limits_of_agreement(difference: Floats, group: NDArray[np.integer]) -> dict[str, float]:
     """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, for samples in groups of correlated error.
 
-    Bland and Altman, "Agreement between methods of measurement with multiple observations per individual"
-    (J. Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
+    Bland and Altman, "Agreement between methods of measurement with multiple observations per individual" (J.
+    Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
 
-    Args:
-        difference: (T,) predicted minus sensor [mN]; NaN are left out.
-        group: (T,) index of the contact, or span between contacts, of each sample.
+    `difference`: (T,) predicted minus sensor [mN]; NaN are left out; `group`: (T,) index of the contact, or
+    span between contacts, of each sample.
     """
     good = np.isfinite(difference)
     d, names = difference[good], np.unique(group[good], return_inverse=True)[1]

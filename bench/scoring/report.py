@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -28,17 +27,6 @@ _PEAKS, _WORST = 4, 2
 
 _NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "false_positive_rate")
 """Columns that fit into the 80 of a terminal, and those of the report's first table."""
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A selected frame: picture, flow, force map and motion in depth, as data URIs."""
-
-    caption: str
-    frame: str
-    flow: str
-    force: str | None
-    depth: str | None = None
 
 
 def render_report(result: Result, title: str = "") -> str:
@@ -139,8 +127,11 @@ def shown(value: float | None, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
-def pictures(result: Result) -> tuple[list[Panel], float, float]:
-    """The selected frames, and the flow [px of the panel] and density [kPa] at full colour."""
+def pictures(result: Result) -> tuple[list[dict[str, str | None]], float, float]:
+    """The selected frames, and the flow [px of the panel] and density [kPa] at full colour.
+
+    Of each frame the caption and, as data URIs, the picture, flow, force map and motion in depth.
+    """
     chosen = select_frames(result)
     done = result.tracked
     if not chosen or done.rest is None or done.tissue is None:
@@ -151,7 +142,7 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
     force_kpa = max([float(np.percentile(m[done.tissue], 99.8)) for m in maps], default=0.0)
     tissue = done.tissue.astype(np.float32)
     grey = np.repeat(done.rest.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
-    panels = []
+    panels = list[dict[str, str | None]]()
     for caption, snap in chosen:
         moved = picture.overlay(grey, picture.flow_colours(snap.flow, flow_px), 0.65 * tissue)
         moved = picture.arrows(moved, snap.flow, done.tissue, 1.0)
@@ -162,7 +153,8 @@ def pictures(result: Result) -> tuple[list[Panel], float, float]:
             force_map = _jpeg(picture.overlay(dark, picture.heat(snap.density, force_kpa), weight))
         if snap.depth is not None:
             depth = _jpeg(_depth_colours(grey, snap.depth, _largest_depth(done), tissue))
-        panels.append(Panel(caption, _jpeg(snap.rgb), _jpeg(moved), force_map, depth))
+        shown_too = {"flow": _jpeg(moved), "force": force_map, "depth": depth}
+        panels.append({"caption": caption, "frame": _jpeg(snap.rgb), **shown_too})
     return panels, flow_px, force_kpa
 
 

@@ -39,17 +39,13 @@ def find_offset(
 ) -> Offset:
     """The offset with the highest correlation between changes of force and motion.
 
-    Args:
-        frame_s: (T,) times of the frames in the calibration span [s].
-        speed: (T,) mean speed of the tissue over the interval that ends at each frame [mm/s]; NaN are left
-            out.
-        sensor_s: (N,) the sensor's own times [s].
-        force_mn: (N, 3) [mN]; NaN rows are left out.
-        search_s: largest offset that is tried, in both directions [s].
+    `frame_s`: (T,) times of the frames in the calibration span [s]; `speed`: (T,) mean speed of the tissue
+    over the interval that ends at each frame [mm/s], NaN are left out; `sensor_s`: (N,) the sensor's own
+    times [s]; `force_mn`: (N, 3) [mN], NaN rows are left out; `search_s`: largest offset that is tried, in
+    both directions [s].
 
-    Returns:
-        The offset; refused if there are too few intervals, the correlation is weak, its peak is at the end of
-        the search, or fewer than 95% of block-bootstrap resamples have their peak within a frame of it.
+    It is refused if there are too few intervals, the correlation is weak, its peak is at the end of the
+    search, or fewer than 95% of block-bootstrap resamples have their peak within a frame of it.
     """
     good = np.isfinite(force_mn).all(axis=1)
     t, force = sensor_s[good], force_mn[good]

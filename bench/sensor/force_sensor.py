@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
 from bench.recording.folder import Force
 from bench.recording.meta import SensorMeta
-from synth.arrays import Floats, Mask
+from synth.arrays import Floats
 from synth.errors import UserError
 
 STANDARD_GRAVITY = 9.80665  # m/s² = mN/g
@@ -34,13 +33,8 @@ class Processed:
 def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processed:
     """Removes gravity, tare and drift, filters, and shifts the clock, in this order.
 
-    Args:
-        force: raw samples.
-        sensor: settings of the processing.
-        offset_s: added to the sensor's times [s].
-
-    Raises:
-        UserError: a contact-free span without samples, or a mass without a unit vector of gravity.
+    `force`: raw samples; `offset_s`: added to the sensor's times [s]. Raises UserError for a
+    contact-free span without samples, or a mass without a unit vector of gravity.
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
@@ -112,9 +106,9 @@ def _smooth(time_s: Floats, values: Floats, cut_hz: float | None, steps: list[st
         return values
     sos = signal.butter(_ORDER, cut_hz, fs=1 / step, output="sos")
     out = np.full_like(values, np.nan)
-    good = np.asarray(np.isfinite(values).all(axis=1), bool)
-    short: list[int] = []
-    for run in runs(time_s, good, _GAP * step):
+    where, short = np.flatnonzero(np.isfinite(values).all(axis=1)), list[int]()
+    starts = np.flatnonzero(np.diff(time_s[where]) > _GAP * step) + 1
+    for run in np.split(where, starts) if len(where) else ():
         t = time_s[run]
         even = np.arange(t[0], t[-1] + step / 2, step)
         if len(even) <= 3 * (2 * len(sos) + 1):
@@ -137,14 +131,6 @@ def _step(time_s: Floats) -> float:
     """
     across = min(_ACROSS, max(len(time_s) // 4, 1))
     return float(np.median(time_s[across:] - time_s[:-across])) / across
-
-
-def runs(time_s: Floats, good: Mask, gap_s: float) -> list[NDArray[np.intp]]:
-    """Indices of good samples, split at gaps longer than `gap_s`."""
-    where = np.flatnonzero(good)
-    if len(where) == 0:
-        return []
-    return list(np.split(where, np.flatnonzero(np.diff(time_s[where]) > gap_s) + 1))
 
 
 def _floor(time_s: Floats, values: Floats, sensor: SensorMeta) -> float:

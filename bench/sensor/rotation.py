@@ -44,14 +44,12 @@ class SensorRotation:
 def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRotation:
     """The rotation for which the tissue's motion best follows the force.
 
-    Args:
-        moved: (T, P, 2) motion of P parts of the tissue in the picture (right, down) from rest, any unit.
-        visible: (T, P) visible share of each part, in 0..1.
-        force_mn: (T, 3) in the sensor's axes, tared; frames with NaN are left out.
+    `moved`: (T, P, 2) motion of P parts of the tissue in the picture (right, down) from rest, any unit;
+    `visible`: (T, P) visible share of each part, in 0..1; `force_mn`: (T, 3) in the sensor's axes, tared;
+    frames with NaN are left out.
 
-    Returns:
-        The rotation; refused for fewer than `LEAST_TURNING` frames, forces in a plane, less than half of the
-        motion explained, or an angle with a standard deviation above 15°.
+    It is refused for fewer than `LEAST_TURNING` frames, forces in a plane, less than half of the motion
+    explained, or an angle with a standard deviation above 15°.
     """
     good = np.isfinite(force_mn).all(axis=1)
     if good.sum() < LEAST_TURNING:

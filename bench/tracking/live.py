@@ -72,18 +72,13 @@ def stream_video(
 ) -> Stream:
     """Tracks a video as a stream; the first frame is the rest frame.
 
-    Args:
-        footage: the video.
-        settings: of the tracking; a stream has no limit on the rate and no search for pulsation.
-        method: estimates force from flow; requires the scale.
-        scale_mm_per_px: of the original pixels; "unknown": forces are correct up to a factor, for any E.
-        young_kpa: of the tissue, if known.
-        paced: drop frames that arrive while another is processed; False: process every frame.
-        report: called with the result of every frame.
-        flow: as of `track_recording`; another process also works while the next frame is masked.
+    `settings`: a stream has no limit on the rate and no search for pulsation. `method`: estimates force from
+    flow; requires the scale. `scale_mm_per_px`: of the original pixels; "unknown": forces are correct up to a
+    factor, for any E. `young_kpa`: of the tissue, if known. `paced`: whether frames that arrive while another
+    is processed are dropped. `report`: called with the result of every frame. `flow`: as of
+    `track_recording`; another process also works while the next frame is masked.
 
-    Raises:
-        UserError: unreadable video, fewer than two frames, or a model without a scale.
+    Raises UserError for an unreadable video, fewer than two frames, or a model without a scale.
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model requires --scale (mm per pixel, or unknown): forces depend on it")
@@ -118,14 +113,13 @@ def stream_video(
 
 
 class _VideoClock:
-    """A `Pace` with the clock of the video."""
+    """A `Pace`, which see, with the clock of the video."""
 
     def __init__(self, paced: bool) -> None:
         self.paced, self.dropped = paced, 0
         self.arrivals_s: dict[int, float] = {}  # of frames in process, by index
 
     def start(self, time_s: float) -> None:
-        """See `Pace`."""
         self.first_s, self.began_s = time_s, time.perf_counter()
 
     def is_due(self, index: int, time_s: float) -> bool:
@@ -140,10 +134,7 @@ class _VideoClock:
         return True
 
     def spare_s(self, time_s: float) -> float:
-        """See `Pace`."""
-        if not self.paced:
-            return 0.0
-        return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter())
+        return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter()) if self.paced else 0.0
 
 
 def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:

@@ -22,7 +22,7 @@ from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
-from synth.recording_flow.passes import VideoPass, passes
+from synth.recording_flow.passes import passes
 from synth.recording_flow.pulse import SurfaceMotion
 from synth.system.stopwatch import Stopwatch
 
@@ -89,18 +89,13 @@ def track_recording(
 ) -> TrackedRecording:
     """Tracks the video and applies every method, with a few frames in memory.
 
-    Args:
-        recording: the opened recording.
-        methods: by name; of `pictured` the snapshots show the force map.
-        scale_mm_per_px: of the original pixels.
-        settings: of the tracking.
-        flow: computes the flow and is closed by the caller; None: in this process. Another process computes
-            it while the methods are applied to the previous frame.
-        progress: called after every frame; `each`: with every tracked frame.
-        only: numbers of the frames to track, with the rest frame; None: all.
+    `methods`: by name; of `pictured` the snapshots show the force map. `scale_mm_per_px`: of the original
+    pixels. `flow`: computes the flow and is closed by the caller; None: in this process. Another process
+    computes it while the methods are applied to the previous frame. `progress`: called after every frame;
+    `each`: with every tracked frame. `only`: numbers of the frames to track, with the rest frame; None: all.
 
-    Raises:
-        UserError: unreadable video, no frame with a time, rest frame beyond the end, masks of another size.
+    Raises UserError for an unreadable video, no frame with a time, a rest frame beyond the end, and masks of
+    another size.
     """
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
@@ -121,33 +116,18 @@ def track_recording(
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     forces.finish(recording)  # of the last pass
-    forces.out.stereo, forces.out.turning = pictures.quality, turning if turning.time_s else None
-    _describe(forces.out, video, recording, methods, pictured, mm_per_px)
-    forces.out.timings |= watch.report()  # of all passes
-    return forces.out
-
-
-def _describe(
-    out: TrackedRecording,
-    video: VideoPass,
-    recording: Recording,
-    methods: Mapping[str, Method],
-    main: str,
-    mm_per_px: float,
-) -> None:
-    """Adds summary, findings and notes after the last frame."""
-    rest, decoder = video.rest, video.decoder
-    out.summary, out.size, out.notes = video.summary, rest.size, video.notes
-    out.findings, out.decoded, out.rest_s = [*video.findings], decoder.decoded, rest.time_s
-    out.scale_mm_per_px = mm_per_px / rest.shrink
-    out.repeats = decoder.faults.repeats()
+    out, decoder = forces.out, video.decoder
+    out.stereo, out.turning = pictures.quality, turning if turning.time_s else None
+    out.summary, out.size, out.notes = video.summary, video.rest.size, video.notes
+    out.findings, out.decoded, out.rest_s = [*video.findings], decoder.decoded, video.rest.time_s
+    out.scale_mm_per_px, out.repeats = scale_mm_per_px, decoder.faults.repeats()
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
     for name, method in methods.items():
         warnings = getattr(method, "warnings", ())
         out.notes += [f"{name}: {note}" for note in (*getattr(method, "notes", ()), *warnings)]
         # Doubts on a method that does not lead, or not alone, are in the interval of the one that does.
-        out.findings += [Finding("warning", name, one) for one in warnings if name == main]
+        out.findings += [Finding("warning", name, one) for one in warnings if name == pictured]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
@@ -158,6 +138,8 @@ def _describe(
             {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
             for rhythm, size in zip(removed.rhythms, removed.amplitudes_px, strict=True)
         ]
+    out.timings |= watch.report()  # of all passes
+    return out
 
 
 class _Forces:
