@@ -19,6 +19,7 @@ from synth.errors import UserError
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_ARRAYS = r"\b(Map|Mask|Floats|Pixels|Array)\b"
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -32,17 +33,10 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         bound = signature.bind(*args, **kwargs)
-        for name, hint in _hints(function).items():
-            value = bound.arguments.get(name)
-            if (
-                name not in bound.arguments
-                or signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
-            ):
-                continue
+        for name, value in list(bound.arguments.items()):
+            hint = _hints(function).get(name, Any)  # `self` has none; further keywords any
             if not _fits(value, hint):
-                wanted = re.sub(
-                    r"\b(Map|Mask|Floats|Pixels|Array)\b", "array", str(function.__annotations__[name])
-                )
+                wanted = re.sub(_ARRAYS, "array", str(function.__annotations__[name]))
                 given = repr(value)[:80] if isinstance(value, (str, Real, Path, list, tuple)) else type(value)
                 raise UserError(f"{title}: {name}: expected {wanted}, got {given}")
             if isinstance(value, (list, tuple)) and np.ndarray in map(_kind, (hint, *typing.get_args(hint))):

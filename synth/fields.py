@@ -7,6 +7,7 @@ from typing import Literal
 
 TIME, ROW, COLUMN, INSTRUMENT = "frame", "row", "column", "instrument"
 MOST_INSTRUMENTS = 3  # at once
+Stored = Literal["always", "usually", "several", "recovered", "stereo", "stereo recovered", "extra"]
 
 
 @dataclass(frozen=True)
@@ -19,9 +20,7 @@ class Field:
     unit: str
     meaning: str
     length: int = 0  # of the axis that is neither frame, row, column nor instrument
-    stored: Literal["always", "usually", "several", "recovered", "stereo", "stereo recovered", "extra"] = (
-        "always"
-    )
+    stored: Stored = "always"
     half: bool = False  # whether `store.flow: float16` stores it as float16
     packed: float = 0.1  # stored size over raw size, measured on rendered sequences, for forecasts
     low: float | None = None  # smallest plausible value, checked by `synth verify`
@@ -55,40 +54,26 @@ _VIDEO = (TIME, ROW, COLUMN)
 # fmt: off
 _TABLE = (
     Field("time", (TIME,), "float64", "s",
-          "time of the frame; frame 0 is the rest frame",
-          packed=8.8, low=0.0),
-    Field("rgb", (*_VIDEO, "rgb"), "uint8", "sRGB",
-          "recorded picture",
-          length=3, packed=0.94),
+          "time of the frame; frame 0 is the rest frame", packed=8.8, low=0.0),
+    Field("rgb", (*_VIDEO, "rgb"), "uint8", "sRGB", "recorded picture", length=3, packed=0.94),
     Field("flow", (*_VIDEO, "xy"), "float32", "px",
           "true motion of the material points from the rest frame to this one, on the rest frame's "
-          "pixels; 0 outside tissue",
-          length=2, half=True, packed=0.25, low=-1e4, high=1e4),
+          "pixels; 0 outside tissue", length=2, half=True, packed=0.25, low=-1e4, high=1e4),
     Field("visible", _VIDEO, "bool", "-",
           "whether the rest pixel's material point is visible in this frame: not hidden by the instrument "
-          "or tissue, nor outside the picture",
-          packed=0.008),
-    Field("tissue", _STILL, "bool", "-",
-          "brain surface, in the rest frame",
-          packed=0.008),
-    Field("tool", _VIDEO, "bool", "-",
-          "instrument, in this frame's own pixels",
-          packed=0.004),
-    Field("glare", _VIDEO, "bool", "-",
-          "specular highlight, in this frame's own pixels",
-          packed=0.01),
+          "or tissue, nor outside the picture", packed=0.008),
+    Field("tissue", _STILL, "bool", "-", "brain surface, in the rest frame", packed=0.008),
+    Field("tool", _VIDEO, "bool", "-", "instrument, in this frame's own pixels", packed=0.004),
+    Field("glare", _VIDEO, "bool", "-", "specular highlight, in this frame's own pixels", packed=0.01),
     Field("depth", _VIDEO, "float32", "mm",
-          "distance along the optical axis; 0 where nothing is hit",
-          stored="usually", packed=0.44, low=0.0),
+          "distance along the optical axis; 0 where nothing is hit", stored="usually", packed=0.44, low=0.0),
     Field("traction", (*_VIDEO, "xyz"), "float32", "kPa",
           "load on the tissue per rest area, camera axes, on the rest frame's pixels",
           length=3, packed=0.025, low=-1e4, high=1e4),
     Field("area", _STILL, "float32", "mm^2",
-          "surface area at rest that each pixel of the rest frame covers",
-          packed=0.26, low=0.0),
+          "surface area at rest that each pixel of the rest frame covers", packed=0.26, low=0.0),
     Field("force", (TIME, "xyz"), "float64", "mN",
-          "total load on the tissue, camera axes",
-          length=3, packed=3.5, low=-1e6, high=1e6),
+          "total load on the tissue, camera axes", length=3, packed=3.5, low=-1e6, high=1e6),
     Field("force_of", (TIME, INSTRUMENT, "xyz"), "float64", "mN",
           "load of each instrument on the tissue, camera axes, 0 beyond their number; force is their sum",
           length=3, stored="several", packed=2.0, low=-1e6, high=1e6),
@@ -107,8 +92,7 @@ _TABLE = (
           stored="extra", packed=0.1, low=0.0),
     Field("flow_next", (*_VIDEO, "xy"), "float32", "px",
           "true motion from this frame to the next, on this frame's pixels; 0 off tissue, and at the "
-          "end",
-          length=2, stored="extra", half=True, packed=0.4, low=-1e4, high=1e4),
+          "end", length=2, stored="extra", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("normals", (*_VIDEO, "xyz"), "float32", "-",
           "unit normal of the surface at each pixel of this frame, camera axes; 0 where nothing is hit",
           length=3, stored="extra", packed=0.6, low=-1.001, high=1.001),
@@ -119,8 +103,7 @@ _TABLE = (
           "linear light at the sensor, before exposure and noise; 1 is a white surface under the lamps",
           length=3, stored="extra", packed=0.9, low=0.0),
     Field("camera", (TIME, "to", "from"), "float64", "mm",
-          "transform from world axes (homogeneous) to this frame's camera axes",
-          length=4, stored="extra"),
+          "transform from world axes (homogeneous) to this frame's camera axes", length=4, stored="extra"),
     Field("rgb_right", (*_VIDEO, "rgb"), "uint8", "sRGB",
           "picture of the right camera, render.stereo_mm to the right of the left one",
           length=3, stored="stereo", packed=1.0),
@@ -128,11 +111,9 @@ _TABLE = (
           "as flow, in the right camera's pictures; 0 outside tissue",
           length=2, stored="stereo", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("visible_right", _VIDEO, "bool", "-",
-          "as visible, in the right camera's pictures",
-          stored="stereo"),
+          "as visible, in the right camera's pictures", stored="stereo"),
     Field("depth_right", _VIDEO, "float32", "mm",
-          "as depth, in the right camera's pictures",
-          stored="stereo", packed=0.6, low=0.0),
+          "as depth, in the right camera's pictures", stored="stereo", packed=0.6, low=0.0),
     Field("motion", (*_VIDEO, "xyz"), "float32", "mm",
           "true motion of the material points from the rest frame to this one, camera axes (each "
           "frame's own), on the rest frame's pixels; 0 outside tissue",

@@ -188,11 +188,10 @@ def check_sequence(
     except UserError as error:
         broken = without_path(error)
     for name, invariant in INVARIANTS.items():
+        empty = Nothing(_NOTHING.get(name, "no tissue in view"))
         try:
             with watch.stage(name):
-                measures = list(invariant(sequence, frames)) or [
-                    Nothing(_NOTHING.get(name, "no tissue in view"))
-                ]
+                measures = list(invariant(sequence, frames)) or [empty]
         except UserError as error:
             broken = broken or without_path(error)
             continue

@@ -91,11 +91,10 @@ class Folder:
                     found[int(path.stem)] = failure
         return found
 
-    def mark_failed(self, index: int, *, kind: str, reason: str, tries: int, log: str) -> None:
-        """Marks a sequence as failed, until `synth render --retry`."""
-        record = {"index": index, "kind": kind, "reason": reason, "tries": tries, "log": log}
-        write_whole(self.state / "failed" / f"{index:06d}.json", json.dumps(record, indent=1))
-        self.sweep(index)
+    def mark_failed(self, failure: dict[str, Any]) -> None:
+        """Marks the sequence `failure["index"]` as failed, until `synth render --retry`."""
+        write_whole(self.state / "failed" / f"{failure['index']:06d}.json", json.dumps(failure, indent=1))
+        self.sweep(failure["index"])
 
     def clear_failures(self, indices: Sequence[int] | None = None) -> list[int]:
         """Deletes the marks of failed sequences, all if `indices` is None; returns their indices."""
@@ -142,14 +141,8 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
     """The folder for `job`, created or continued, and locked for this process.
 
     A folder with other content is left unchanged. More sequences than before extend the dataset.
-
-    Args:
-        root: the folder.
-        job: the job.
-        mix_versions: continue a dataset of another version of the program; `dataset.json` names all versions.
-
-    Raises:
-        UserError: the dataset of another job or version, other files, another run, or no permission.
+    `mix_versions` continues that of another version of the program; `dataset.json` names all versions.
+    UserError: the dataset of another job or version, other files, another run, or no permission.
     """
     folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
     name = identity.identify_job(job)
@@ -165,9 +158,8 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
             _refuse_foreign(folder, job, name)
             for place in (folder.state / "failed", folder.logs, folder.scratch):
                 place.mkdir(exist_ok=True)
-            described = _Described(
-                format_version=FOLDER, identity=name, job=job.model_dump(mode="json"), generators=makers
-            )
+            values = job.model_dump(mode="json")
+            described = _Described(format_version=FOLDER, identity=name, job=values, generators=makers)
             write_whole(root / _NAME, described.model_dump_json(indent=1) + "\n")
             head = "# The job of this dataset, with all values.\n"
             write_whole(root / "job.yaml", head + writer.dump_job(job))
@@ -221,9 +213,8 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     if mix:
         return [*before, now]
     last = before[-1] if before else {}
-    changes = [
-        f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in now if last.get(key) != now[key]
-    ]
+    changed = (key for key in now if last.get(key) != now[key])
+    changes = [f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in changed]
     what = "; ".join(changes) or "several versions"
     raise UserError(
         f"{folder.root}: its {count} sequences were made by another version of this program ({what}): "

@@ -106,9 +106,7 @@ _REMEDY = "; `synth report` writes it again"
 
 def read_index(root: Path) -> pa.Table:
     """The index as stored; `synth verify` compares its rows with the stores.
-
-    Raises UserError if it is missing, damaged, or of another program or version.
-    """
+    UserError: it is missing, damaged, or of another program or version."""
     path = root / NAME
     try:
         # Arrow refuses a path that is not UTF-8.
@@ -127,9 +125,7 @@ def read_index(root: Path) -> pa.Table:
 
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
     """The split of the dataset in `root`, as stored, else as `write_index` would create it.
-
-    Raises UserError if there are too few groups to split and a split is `required`.
-    """
+    UserError: there are too few groups to split, and a split is `required`."""
     stored = split.read_stored(root)
     if stored.sides:
         return stored

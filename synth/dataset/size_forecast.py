@@ -47,9 +47,7 @@ def pilot(done: Sequence[int]) -> list[int]:
     return [done[int(k)] for k in np.unique(np.linspace(0, len(done) - 1, 10).astype(int))] if done else []
 
 
-def field_bytes(
-    field: Field, frames: int, size: tuple[int, int], *, half: bool = False
-) -> tuple[float, float]:
+def field_bytes(field: Field, frames: int, size: tuple[int, int], half: bool = False) -> tuple[float, float]:
     """Bytes of a field of `size` (height, width) in memory, and on disk by the measured compression.
 
     `half`: `store.flow: float16` is set.
@@ -61,21 +59,17 @@ def field_bytes(
 def describe_fields() -> Iterator[str]:
     """Lines of text on all fields, two or more each; sizes are of a frame of 640 x 480 px."""
     for field in FIELDS.values():
-        stored = amount(field_bytes(field, 1, (480, 640))[1])
-        axes = ", ".join(field.dims)
-        when = STORED_WHEN[field.stored]
-        yield f"{field.name}: {axes}, {field.dtype}, {field.unit}, {stored} on disk, {when}"
+        stored, axes = amount(field_bytes(field, 1, (480, 640))[1]), ", ".join(field.dims)
+        about = f"{axes}, {field.dtype}, {field.unit}, {stored} on disk"
+        yield f"{field.name}: {about}, {STORED_WHEN[field.stored]}"
         yield from hang("    ", field.meaning)
 
 
 def estimate(job: Job) -> float:
     """Bytes of one sequence of `job` on disk, from the field table."""
     width, height = job.render.size
-    half = job.store.flow == "float16"
-    total = sum(
-        field_bytes(FIELDS[name], job.frames, (height, width), half=half)[1] for name in job.stored_fields
-    )
-    return _MARGIN * total
+    how = job.frames, (height, width), job.store.flow == "float16"
+    return _MARGIN * sum(field_bytes(FIELDS[name], *how)[1] for name in job.stored_fields)
 
 
 def estimate_memory(job: Job) -> float:
@@ -91,10 +85,10 @@ def estimate_memory(job: Job) -> float:
     return _MARGIN * (_PROGRAM_BYTES + _STAGE_BYTES * pixels + each * job.frames)
 
 
-def refuse_if_too_long(job: Job, worker_bytes: int | None, workers: int) -> None:
-    """Raises UserError if a sequence needs more memory than a worker has; `worker_bytes` None: unknown."""
+def refuse_if_too_long(job: Job, worker_bytes: int, workers: int) -> None:
+    """Raises UserError if a sequence needs more memory than a worker has."""
     needed = estimate_memory(job)
-    if worker_bytes is not None and needed > worker_bytes:
+    if needed > worker_bytes:
         fewer = ", or --workers 1" if workers > 1 else ""
         raise UserError(
             f"a sequence of {job.frames} frames needs about {amount(needed)} of memory but each of {workers} "

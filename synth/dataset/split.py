@@ -105,13 +105,11 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     Sequences keep the side that they have, and new ones get that of their group. The remaining groups are
     assigned so as to approximate the shares, depending on their names but not on the order of rows. Sequences
     of a held-out family are always in the test set, with their whole groups. A new sequence that joins groups
-    on two sides gets none.
-
-    Raises:
-        UserError: an unknown family, shares that do not sum to 1, or fewer groups than sides.
+    on two sides gets none. UserError: an unknown family, shares that do not sum to 1, or fewer groups than
+    sides.
     """
     by, shares = chosen.by, chosen.shares
-    if len(shares) != 3 or not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
+    if not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
         raise UserError(f"shares {shares}: must not be negative and must sum to 1")
     done = [row for row in rows if row["status"] == "done"]
     unknown = set(chosen.held_out) - {str(row["family"]) for row in done}
@@ -149,20 +147,16 @@ def draw_groups(
     order: Sequence[Group],
     fixed: Mapping[Group, int] | None = None,
 ) -> list[int]:
-    """The part (0, 1, ...) of each member; no group is in two parts. Larger groups are assigned first.
+    """The part (0, 1, ...) of each of N members, by its group; no group is in two parts.
 
-    Args:
-        groups: (N,) the group of each member.
-        shares: of each part, in any unit; a part of share 0 stays empty.
-        order: of groups of equal size.
-        fixed: parts of groups that are assigned already.
+    Larger groups are assigned first, those of equal size in `order`. `shares`: of each part, in any unit; a
+    part of share 0 stays empty. `fixed`: parts of groups that are assigned already.
     """
     size = Counter(groups)
     part = dict(fixed or {})
-    lacking = [
-        share * len(groups) - sum(size[group] for group in part if part[group] == k)
-        for k, share in enumerate(shares)
-    ]
+    lacking = [share * len(groups) for share in shares]
+    for group, k in part.items():
+        lacking[k] -= size[group]
     open_parts = [k for k, share in enumerate(shares) if share > 0]
     for group in sorted((one for one in order if one not in part), key=lambda one: -size[one]):
         # The part that lacks most in proportion to its share gets the next group.
@@ -188,9 +182,8 @@ def misplaced(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[s
     ]
 
 
-def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit | None = None) -> list[str]:
+def leaks(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit = DatasetSplit()) -> list[str]:
     """Messages on anatomies and contents on more than one side, and on held-out families in training."""
-    chosen = chosen or DatasetSplit()
     done = [row for row in rows if row["status"] == "done" and row.get("split")]
     found = [
         f"family {row['family']} is held out and in {row['split']}"

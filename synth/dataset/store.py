@@ -90,10 +90,8 @@ class Writer:
         """
         for name in self._wanted:
             written = self._writers.get(name)
-            if written is None:
-                raise ValueError(f"{name}: was never written")
-            if written.filled != written.shape[0]:
-                raise ValueError(f"{name}: {written.filled} of {written.shape[0]} frames were written")
+            if written is None or written.filled != written.shape[0]:
+                raise ValueError(f"{name}: only {written.filled if written else 0} frames were written")
         hashes = {name: self._writers[name].hash.hexdigest() for name in FIELDS if name in self._writers}
         summary: dict[str, Any] = {key: self._writers[name].largest for name, key in _PEAKS.items()}
         if self._half:
@@ -180,8 +178,7 @@ class _FieldWriter:
         # A copy, since the caller may reuse its buffer before the shard is full.
         copy = np.array(array, dtype, order="C")
         if dtype.kind == "f" and not np.isfinite(copy).all():
-            at = tuple(int(k) for k in np.argwhere(~np.isfinite(copy))[0])
-            raise NotFinite(f"{name}{where}: not finite, first at {at}")
+            raise NotFinite(f"{name}{where}: not finite, first at {np.argwhere(~np.isfinite(copy))[0]}")
         if self._field.half and copy.dtype != array.dtype:
             self.rounding = max(self.rounding, float(np.abs(copy - array).max()))
         self.hash.update(copy.data)

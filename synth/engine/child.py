@@ -91,14 +91,13 @@ class Child:
 
     def close(self) -> None:
         """Kills the process and those that it started, and closes its pipes."""
-        if self._process is None:
+        if self._process is None or self._process.stdin is None:
             return
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         with contextlib.suppress(BrokenPipeError):
-            if self._process.stdin is not None:
-                self._process.stdin.close()
+            self._process.stdin.close()
         os.close(self._pipe)
         self._process = None
 
@@ -153,11 +152,9 @@ class Child:
         return [json.loads(line) for line in lines] if text else None
 
     def _log(self, index: int) -> str:
-        try:
-            text = (self._setup.logs / f"{index:06d}.log").read_text("utf-8", errors="replace")
-        except FileNotFoundError:
-            return ""
-        return text[-_LOG_TAIL:]
+        with contextlib.suppress(FileNotFoundError):
+            return (self._setup.logs / f"{index:06d}.log").read_text("utf-8", errors="replace")[-_LOG_TAIL:]
+        return ""
 
 
 def _write(process: subprocess.Popen[bytes], line: str) -> None:
@@ -171,7 +168,7 @@ def _write(process: subprocess.Popen[bytes], line: str) -> None:
 def _memory(pid: int) -> int:
     try:
         pages = Path(f"/proc/{pid}/statm").read_text().split()
-    except OSError:  # it has ended, or there is no /proc
+    except OSError:  # it has ended
         return 0
     return int(pages[1]) * os.sysconf("SC_PAGE_SIZE")
 
@@ -217,11 +214,7 @@ def environment(job: Job, workers: int) -> dict[str, str]:
     return {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or ""}
 
 
-def share_of_memory(workers: int) -> int | None:
-    """Bytes of the available memory for each of `workers` processes; None if unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:  # a system without /proc
-        return None
-    fields = dict(line.split(":") for line in lines)
+def share_of_memory(workers: int) -> int:
+    """Bytes of the available memory for each of `workers` processes."""
+    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
     return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)

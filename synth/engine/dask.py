@@ -33,12 +33,9 @@ _thread = threading.local()  # on a Dask worker: setup and child of each of its 
 def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
     """The slots of `dask://host:port`, `tls://host:port`, or of a SLURM cluster described in a YAML file.
 
-    Anyone who can connect to a scheduler can run code on it, so a note on stderr warns if the connection is
-    unencrypted or the scheduler listens on every interface. `tls://` uses the certificates in Dask's
-    configuration.
-
-    Raises:
-        UserError: the extra is not installed, no scheduler answers, or the file is wrong.
+    Anyone who can connect to a scheduler can run code on it, so a note on stderr warns if others can. `tls://`
+    uses the certificates in Dask's configuration. UserError: the extra is not installed, no scheduler
+    answers, or the file is wrong.
     """
     try:
         import distributed
@@ -153,9 +150,7 @@ def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
 
 def open_to(cluster: str | dict[str, Any]) -> str:
     """A warning if others could run code on a cluster (an address or the dict of `read_slurm`), else empty.
-
-    Raises UserError for an address without a host or a port.
-    """
+    UserError: an address without a host or a port."""
     if isinstance(cluster, str):
         kind, _, place = cluster.partition("://")
         host, _, port = place.rpartition(":")

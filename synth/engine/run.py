@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,12 +90,10 @@ def render_job(
 
 
 def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
-    """Computes the sequences of `job` that `root` lacks.
+    """Computes the sequences of `job` that `root` lacks; raises as `render_job`.
 
-    Raises:
-        UserError: the folder is not for this job, the disk is full, or the job cannot be carried out at all
-            (then nothing is left behind).
-        KeyboardInterrupt: after the workers have ended; sealed sequences stay, the next run continues.
+    Of a job that can't be carried out nothing is left behind. KeyboardInterrupt: when the workers have ended;
+    sealed sequences stay, the next run continues.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
     share = share_of_memory(workers) if memory is None else int(memory * 1e9)
@@ -260,9 +258,7 @@ class _Pool:
         self._events.put(lambda watcher: watcher.end(attempt, again))
 
     def _fail(self, attempt: Attempt, tries: int) -> None:
-        self._folder.mark_failed(
-            attempt.index, kind=attempt.kind, reason=attempt.reason, tries=tries, log=attempt.log
-        )
+        self._folder.mark_failed({**asdict(attempt), "tries": tries})
         if attempt.kind != "input":
             return
         with self._change:

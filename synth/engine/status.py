@@ -67,9 +67,8 @@ def lines(status: Status) -> list[str]:
     if status.running:
         left = "" if status.left_s is None else f", {clock(status.left_s)} left"
         found.append(f"a run is in progress{left}")
-        found += [
-            f"  {int(key):06d} {stage} {step} of {of}" for key, (stage, step, of) in status.in_flight.items()
-        ]
+        for key, (stage, step, of) in status.in_flight.items():
+            found.append(f"  {int(key):06d} {stage} {step} of {of}")
     elif status.ahead.sequences:
         found.append("no run is in progress; `synth render` with the same job and folder continues")
     if status.stages_cpu_s:

@@ -99,12 +99,11 @@ def _log_to(path: Path) -> None:
 
 def _die_with_parent() -> None:
     parent = os.getppid()
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
-        # If memory runs out, the kernel shall kill this process and not the engine.
-        Path("/proc/self/oom_score_adj").write_text("800")
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+    # If memory runs out, the kernel shall kill this process and not the engine.
+    Path("/proc/self/oom_score_adj").write_text("800")
 
 
 if __name__ == "__main__":

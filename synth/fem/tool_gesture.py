@@ -108,8 +108,7 @@ def form(kind: str, instrument: str) -> float:
 def grip(
     kind: str, point: Floats, direction: Floats, spread_mm: float, azimuth_deg: float
 ) -> tuple[Floats, Floats]:
-    """Centres (C, 2) mm and load directions (C, 3), unit vectors, of an instrument's tips: one, or two of a
-    grasp.
+    """Centres (C, 2) mm and load directions (C, 3), unit vectors, of an instrument's tips, two of a grasp.
 
     `point`: (2,) mm, middle of the contacts; `direction`: (3,) unit vector; else as in `Gesture`.
     """
@@ -165,10 +164,7 @@ def check_motions(
 
 def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floats) -> Floats:
     """Load (T, V, 3) kPa on the surface at rest, (V, 3) mm: sum(area * result) is the force; `area`: (V,)
-    mm^2.
-
-    Raises UserError as `footprint`.
-    """
+    mm^2. Raises as `footprint`."""
     out = np.zeros((len(motion.load), len(vertices), 3))
     for contact in gesture.contacts:
         start = np.asarray(contact.point_mm)
@@ -188,14 +184,9 @@ def footprint(
     """Pressure (V,) 1/mm^2 of a unit force: the kernel (1 - (r/a)^2)^2 on the surface, sum(area * result) =
     1.
 
-    Args:
-        centre: (2,) world x, y, mm.
-        size: a [mm], or the two half axes (2, 2) mm of an ellipse.
-        vertices, area: (V, 3) mm at rest, and (V,) mm^2.
-        ring: the kernel is that of the distance from a ring in its outer part.
-
-    Raises:
-        UserError: fewer than 3 vertices lie under the contact.
+    `centre`: (2,) mm, world x, y; `size`: a [mm], or the half axes (2, 2) mm of an ellipse; `vertices`,
+    `area`: (V, 3) mm at rest, (V,) mm^2; `ring`: the kernel is that of the distance from a ring in its outer
+    part. UserError: fewer than 3 vertices lie under the contact.
     """
     flat = np.hypot(*(vertices[:, :2] - centre).T)
     middle = np.append(centre, vertices[flat.argmin(), 2])
@@ -208,18 +199,14 @@ def footprint(
     kernel = (1 - np.minimum(reach, 1) ** 2) ** 2
     total = float(kernel @ area)
     if np.count_nonzero(kernel) < 3 or total <= 0:
-        raise UserError(
-            f"fem.footprint_mm: {radius_mm:g} mm covers fewer than 3 vertices of the surface; "
-            "raise it, or anatomy.vertices"
-        )
+        few = f"{radius_mm:g} mm covers fewer than 3 vertices of the surface"
+        raise UserError(f"fem.footprint_mm: {few}; raise it, or anatomy.vertices")
     return np.asarray(kernel / total)
 
 
 def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints, Floats]:
     """Points where the two tips touch in each frame: (T, 2, 3) vertices of the surface and their weights.
-
-    Raises UserError beyond the edge of the surface.
-    """
+    UserError: they are beyond the edge of the surface."""
     aside = gesture.sides
     start = np.asarray(gesture.point_mm) - 0.5 * np.asarray(gesture.path_mm)
     reach = np.abs(aside).max() + np.abs(motion.shift).max() + 3 * gesture.footprint_mm
@@ -240,9 +227,8 @@ def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) ->
     `surface` is at rest; `moved` (T, V, 3) mm are its vertices over time. Raises UserError as `anchors`.
     """
     corners, weights = anchors(gesture, motion, surface)
-    touched = np.stack(
-        [np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in zip(weights, corners, moved, strict=True)]
-    )
+    each = zip(weights, corners, moved, strict=True)
+    touched = np.stack([np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in each])
     tips = touched + gesture.hover_mm * motion.away[:, None, None] * gesture.shaft
     return tips, np.broadcast_to(gesture.shaft, touched.shape).copy()
 

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
-from synth.errors import Caution, UserError, first_line
+from synth.errors import Caution, UserError, as_user_error, first_line
 from synth.geometry.triangles import Shape, side_areas
 from synth.geometry.vtk import read_vtk, read_vtp
 from synth.job import identity
@@ -28,9 +28,7 @@ _BRAIN_MM = 20.0, 400.0  # greatest extent: of a small phantom, of more than a h
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 _CLICKED_MM = 0.03  # a point read in a viewer is that close to the surface, or closer than its mirrors
 _STEEPEST = 0.5  # cosine of the angle between an opening's direction and the normal of the surface in it
-_STATED = re.compile(
-    rb"SPACE(?:=|\s+1\s+1\s+string\s+)([RL][AP][SI])\b"
-)  # in a header or comment of 3D Slicer's
+_STATED = rb"SPACE(?:=|\s+1\s+1\s+string\s+)([RL][AP][SI])\b"  # in a header or comment of 3D Slicer's
 _OPEN = 0.25  # missing share of a surface's area above which it counts as open: a hemisphere lacks a half
 
 
@@ -39,9 +37,7 @@ class Brain:
     """A surface in world axes: z out of the brain, origin at the craniotomy's centre. It may have holes."""
 
     shape: Shape
-    to_world: (
-        Floats  # (4, 4) rigid, mm: a point p of the file (RAS if it states its space) is to_world @ (p, 1)
-    )
+    to_world: Floats  # (4, 4) rigid, mm: a point p of the file (RAS if it states one) is to_world @ (p, 1)
     attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
 
 
@@ -67,18 +63,13 @@ def load_brain(
     _check_place(path, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
-    held = tuple(
-        a.model_copy(
-            update={
-                "point": tuple(turn @ (np.asarray(a.point) - origin)),
-                "normal": None if a.normal is None else tuple(turn @ np.asarray(a.normal)),
-            }
-        )
-        for a in attachments
-    )
+    held = []
+    for one in attachments:
+        normal = None if one.normal is None else tuple(turn @ np.asarray(one.normal))
+        held.append(one.model_copy(update={"point": tuple(turn @ (one.point - origin)), "normal": normal}))
     to_world = np.eye(4)
     to_world[:3] = np.column_stack([turn, -turn @ origin])
-    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, held)
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, tuple(held))
 
 
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
@@ -101,14 +92,14 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
     faces = _oriented(vertices, faces)
     if fill_holes:
         faces = _filled(vertices, faces, path.name)
-    if (
-        len(faces) < 4
-        or span.min() < 1e-3 * span.max()
-        or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod()
-    ):
+    flat = len(faces) < 4 or span.min() < 1e-3 * span.max()
+    if flat or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod():
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
         raise UserError(f"anatomy.mesh: {path.name} encloses no volume{hint}")
-    if (open_share := _open_share(vertices, faces)) > _OPEN:
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    areas = np.cross(b - a, c - a)  # doubled; their sum is that of the missing flat lid, 0 if closed
+    open_share = np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum()
+    if open_share > _OPEN:
         warnings.warn(
             f"anatomy.mesh: {path.name} is open, {100 * open_share:.0f}% of its area is missing; motion may "
             "be wrong by a third: anatomy.fill_holes=true closes flat holes",
@@ -177,13 +168,11 @@ def _read(path: Path) -> tuple[Floats, Ints]:
     if kind not in _KINDS:
         hint = "3D Slicer converts most others, mris_convert those of FreeSurfer and GIFTI"
         raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(_KINDS)}; {hint}")
-    try:
+    with as_user_error("anatomy.mesh"):
         data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
-    except UserError as error:
-        raise UserError(f"anatomy.mesh: {error}") from None
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
-    stated = _STATED.search(data[:4096])
+    stated = re.search(_STATED, data[:4096])
     space = stated[1].decode() if stated else ""
     try:
         if kind == "vtk":
@@ -231,10 +220,7 @@ def _oriented(vertices: Floats, faces: Ints) -> Ints:
     runs = [((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (one, other)]
     alike = runs[0] != runs[1]  # neighbours pass along their edge in opposite directions
     # Faces as they are and, from `count`, turned: each is linked to what its neighbours then are.
-    links = (
-        np.concatenate([one, one + count]),
-        np.concatenate([other + count * ~alike, other + count * alike]),
-    )
+    links = np.array([[one, one + count], [other + count * ~alike, other + count * alike]]).reshape(2, -1)
     graph = coo_array((np.ones(2 * len(one)), links), shape=(2 * count, 2 * count))
     label = connected_components(graph, directed=False)[1].reshape(2, count)
     turned, body = label[0] > label[1], label.min(axis=0)
@@ -268,13 +254,6 @@ def _filled(vertices: Floats, faces: Ints, name: str) -> Ints:
         why = f"{odd} edges stay open" if odd else "edges have more than two faces"
         raise UserError(f"anatomy.fill_holes: {name} can't be closed ({why}); repair it in a mesh editor")
     return np.asarray(mesh.faces, np.int64)
-
-
-def _open_share(vertices: Floats, faces: Ints) -> float:
-    """Area of the flat lid that would close the surface over the surface's area: 0 if closed, below 1."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    areas = np.cross(b - a, c - a)  # doubled; their sum is 0 for a closed surface
-    return float(np.linalg.norm(areas.sum(axis=0)) / np.linalg.norm(areas, axis=1).sum())
 
 
 def _volumes(vertices: Floats, faces: Ints) -> Floats:

@@ -6,6 +6,7 @@ Source: The VTK User's Guide, file formats; legacy up to 5.1, whose cells are of
 from __future__ import annotations
 
 import base64
+import io
 import re
 import zlib
 from collections.abc import Iterable
@@ -39,9 +40,8 @@ def read_vtk(data: bytes) -> tuple[Floats, Ints]:
             kind = {"POLYGONS": _POLYGON, "TRIANGLE_STRIPS": _STRIP}.get(key, 0)
             cells += [(cell, kind) for cell in file.cells(int(words[1]), int(words[2]))]
         elif key == "CELL_TYPES":
-            cells = [
-                (c, k) for (c, _), k in zip(cells, file.numbers(len(cells), "int").tolist(), strict=True)
-            ]
+            kinds = file.numbers(len(cells), "int").tolist()
+            cells = [(cell, kind) for (cell, _), kind in zip(cells, kinds, strict=True)]
     return points, _triangles(cells)
 
 
@@ -51,11 +51,8 @@ def read_vtp(data: bytes) -> tuple[Floats, Ints, str]:
     root = ElementTree.fromstring(head + b"</VTKFile>" if tail else data)
     coding, _, tail = tail.rpartition(b"</AppendedData")[0].partition(b"_")
     order: Literal["<", ">"] = ">" if root.get("byte_order") == "BigEndian" else "<"
-    word, packed = (
-        np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(order),
-        root.get("compressor"),
-    )
-    if packed not in (None, "vtkZLibDataCompressor"):
+    word = np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(order)
+    if (packed := root.get("compressor")) not in (None, "vtkZLibDataCompressor"):
         raise ValueError(f"its compressor {packed} is not supported")
 
     def array(node: ElementTree.Element | None) -> NDArray[np.number]:
@@ -80,9 +77,8 @@ def read_vtp(data: bytes) -> tuple[Floats, Ints, str]:
     points, cells = np.zeros((0, 3)), []
     for piece in root.iter("Piece"):
         for name, kind in (("Polys", _POLYGON), ("Strips", _STRIP)):
-            links, ends = (
-                array(piece.find(f"{name}/DataArray[@Name='{one}']")) for one in ("connectivity", "offsets")
-            )
+            parts = [piece.find(f"{name}/DataArray[@Name='{one}']") for one in ("connectivity", "offsets")]
+            links, ends = map(array, parts)
             found = np.split(links.astype(np.int64) + len(points), ends[:-1].astype(int)) if len(ends) else []
             cells += [(cell, kind) for cell in found]
         points = np.concatenate([points, array(piece.find("Points/DataArray")).reshape(-1, 3)])
@@ -103,9 +99,8 @@ def _triangles(cells: Iterable[tuple[Ints, int]]) -> Ints:
         volumes += kind > _QUAD
     faces = np.array(found, np.int64).reshape(-1, 3)
     if not len(faces):
-        raise ValueError(
-            "it contains volume cells, not a surface: extract it" if volumes else "it contains no polygons"
-        )
+        volume = "it contains volume cells, not a surface: extract it"
+        raise ValueError(volume if volumes else "it contains no polygons")
     return faces
 
 
@@ -113,20 +108,16 @@ class _Reader:
     """The bytes of a file and the current position."""
 
     def __init__(self, data: bytes) -> None:
-        head = data.split(b"\n", 3)
-        kind = head[2].strip().upper() if len(head) == 4 else b""  # head[1] is the title
-        if not head[0].startswith(b"# vtk DataFile") or kind not in (b"ASCII", b"BINARY"):
+        self._file = io.BytesIO(data)
+        version, _, kind = (self._file.readline().strip() for _ in range(3))  # the second line is the title
+        if not version.startswith(b"# vtk DataFile") or kind.upper() not in (b"ASCII", b"BINARY"):
             raise ValueError("not a legacy VTK file")
-        self._data, self._at, self._binary = data, len(data) - len(head[3]), kind == b"BINARY"
+        self._binary = kind.upper() == b"BINARY"
 
     def words(self) -> list[str]:
         """Words of the next non-empty line; none at the end."""
-        while self._at < len(self._data):
-            end = self._data.find(b"\n", self._at)
-            end = len(self._data) if end < 0 else end
-            found = self._data[self._at : end].decode("latin-1").split()
-            self._at = end + 1
-            if found:
+        while line := self._file.readline():
+            if found := line.decode("latin-1").split():
                 return found
         return []
 
@@ -136,8 +127,7 @@ class _Reader:
             raise ValueError(f"unknown type {kind!r}")
         dtype = np.dtype(_TYPES[kind.lower()])
         if self._binary:
-            found = np.frombuffer(self._data, dtype, count, self._at)
-            self._at += found.nbytes
+            found = np.frombuffer(self._file.read(count * dtype.itemsize), dtype, count)
             return found.astype(dtype.newbyteorder("="))
         words: list[str] = []
         while len(words) < count and (more := self.words()):
@@ -148,12 +138,12 @@ class _Reader:
 
     def cells(self, count: int, size: int) -> list[Ints]:
         """Point numbers of each cell."""
-        start = self._at
+        start = self._file.tell()
         words = self.words()
         if words[:1] == ["OFFSETS"]:  # since 5.1: `count` offsets, then `size` point numbers
             offsets = self.numbers(count, words[1])
             return np.split(self.numbers(size, self.words()[1]).astype(np.int64), offsets[1:-1])
-        self._at = start
+        self._file.seek(start)
         numbers, cells, at = self.numbers(size, "int").astype(np.int64), [], 0
         for _ in range(count):
             cells.append(numbers[at + 1 : at + 1 + int(numbers[at])])

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from synth.job.schema import Job
-from synth.system import checked_file
+from synth.system import camera_file, checked_file
 
 FILES: dict[tuple[str, str], int] = {
     ("anatomy", "mesh"): 1 << 30,
     ("appearance", "photo"): checked_file.LARGEST_PICTURE,
-    ("render", "calibration"): 1 << 20,
+    ("render", "calibration"): camera_file.LARGEST_FILE,
 }
 """Keys of a job that are paths, as (section, key), and the largest size of such a file in bytes."""
 

@@ -91,12 +91,10 @@ def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -
     load, radius = loads.largest(young_kpa), loads.footprint_mm[0]
     if loads.force_mn is None:
         check_load(law, load, f"{label}load {load:g} is")
-        return
-    what = (
-        f"{label}force_mn {loads.force_mn[1]:g} on the softest tissue ({young_kpa:g} kPa) under the smallest "
-        f"contact ({radius:g} mm) is a load of {load:.3g},"
-    )
-    check_load(law, load, what, young_kpa * radius**2)
+    else:
+        most = f"{label}force_mn {loads.force_mn[1]:g} on the softest tissue ({young_kpa:g} kPa)"
+        what = f"{most} under the smallest contact ({radius:g} mm) is a load of {load:.3g},"
+        check_load(law, load, what, young_kpa * radius**2)
 
 
 def check_load(law: str, load: float, what: str, per_load: float = 1.0) -> None:

@@ -192,13 +192,9 @@ class FemSection(Section):
     modulus."""
 
     @model_validator(mode="after")
-    def _some_stiffness_remains(self) -> FemSection:
+    def _law_bears_loads_and_relaxation(self, info: ValidationInfo) -> FemSection:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the lost shares add up to the whole stiffness or more")
-        return self
-
-    @model_validator(mode="after")
-    def _loads_are_in_the_laws_range(self, info: ValidationInfo) -> FemSection:
         for name, loads in () if info.context is STORED else self.load_ranges:
             check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
         return self

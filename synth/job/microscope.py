@@ -92,11 +92,9 @@ class RenderSection(Section):
         if self.calibration is None:
             return self
         found = round(camera_file.find_baseline_mm(self.calibration), 9)
-        fixed: dict[str, float | None] = {"field_mm": None, "distortion": None}
-        if found:
-            fixed["stereo_mm"] = found
-        for name, own in fixed.items():
-            if getattr(self, name) not in (type(self).model_fields[name].default, own):
+        for name in ("field_mm", "distortion", *(["stereo_mm"] if found else [])):
+            usual = type(self).model_fields[name].default, found  # a stored job has that of its calibration
+            if getattr(self, name) not in usual:
                 raise ValueError(f"{name}: render.calibration sets it; leave one of the two out")
         if found:
             object.__setattr__(self, "stereo_mm", found)

@@ -183,17 +183,13 @@ class Job(Section):
     card: CardSection = CardSection()
 
     @model_validator(mode="after")
-    def _surface_is_as_fine_as_the_picture(self) -> Job:
+    def _surface_and_fields_suit_the_picture(self) -> Job:
         if "vertices" not in self.anatomy.model_fields_set:
             width, height = self.render.size
             fine = min(max(width * height // 4, 6000), self.anatomy.vertices)
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
-        return self
-
-    @model_validator(mode="after")
-    def _right_camera_exists(self) -> Job:
         right = [name for name in self.store.extra if name.endswith("_right")]
         if right and self.render.stereo_mm == 0:
             raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")
@@ -226,12 +222,8 @@ class Job(Section):
         """Names of the fields in its sequences, in the order of the field table."""
         recovered, stereo = self.flow.backend != "ideal", self.render.stereo_mm > 0
         several = max(self.fem.instruments[1], len(self.fem.instrument_list)) > 1
-        conditions = {
-            "several": several,
-            "recovered": recovered,
-            "stereo": stereo,
-            "stereo recovered": stereo and recovered,
-        }
+        conditions = {"several": several, "recovered": recovered, "stereo": stereo}
         kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
+        kinds |= {"stereo recovered"} if stereo and recovered else set()
         found = [one for one in FIELDS.values() if one.stored in kinds or one.name in self.store.extra]
         return tuple(one.name for one in found if one.name not in self.store.without)

@@ -21,9 +21,7 @@ _AROUND = 40
 RING = _AROUND + 1  # vertices of each of a part's rings
 _LENGTH_MM = 110.0
 _COAT_MM = 11.0  # from the tip
-
 _CLIMB_MM, _REACH_MM = 0.30, 0.40  # height to which fluid climbs at a tip, and distance of its fall-off
-
 _COATED = 0.4  # share of instruments whose end is coated black, against sticking and glare
 
 
@@ -50,25 +48,19 @@ class SteelInstruments:
         return reflection.tint(self.coat)
 
     def pose(self, tips: Floats, shafts: Floats) -> Shape:
-        """The mesh with its tips (2n, 3) mm, two per instrument; a single-tipped one is in their middle.
-
-        Raises:
-            UserError: the number of tips is not two per instrument.
-        """
+        """The mesh with its tips (2n, 3) mm, two per instrument, else UserError; a single-tipped one is in
+        their middle."""
         if len(tips) != 2 * len(self.parts):
             raise UserError(f"{len(tips)} tips for {len(self.parts)} instruments; give two for each")
-        placed = []
-        for k, parts in enumerate(self.parts):
-            placed += place(parts, tips[2 * k : 2 * k + 2], shafts[2 * k : 2 * k + 2])
-        return Shape(np.concatenate(placed), self.faces)
+        each = zip(self.parts, tips.reshape(-1, 2, 3), shafts.reshape(-1, 2, 3), strict=True)
+        return Shape(np.concatenate([bar for one in each for bar in place(*one)]), self.faces)
 
     def glow(self, posed: Shape) -> Floats:
         return reflection.glow(posed, self.coat, self.theatre)
 
     def film(self, tips: Floats, surface: Floats) -> Floats:
         height = np.zeros(len(surface))
-        for k, (half, parts) in enumerate(zip(self.halves, self.parts, strict=True)):
-            ends = tips[2 * k : 2 * k + 2]
+        for half, parts, ends in zip(self.halves, self.parts, tips.reshape(-1, 2, 3), strict=True):
             for end in ends if len(parts) == 2 else ends.mean(axis=0, keepdims=True)[: len(parts)]:
                 away = lengths(surface - end) - half
                 height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
@@ -116,9 +108,8 @@ def build(
             bars.append(Shape(part.profile, grid_faces(rings, _AROUND + 1).reshape(-1, 3)))
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
-    return SteelInstruments(
-        halves, parts, joined(*bars).faces, np.concatenate(coat).astype(np.float32), theatre
-    )
+    whole = np.concatenate(coat).astype(np.float32)
+    return SteelInstruments(halves, parts, joined(*bars).faces, whole, theatre)
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:

@@ -48,10 +48,6 @@ class _Task:
     watch: Stopwatch
     report: StageCallback
 
-    @property
-    def job(self) -> Job:
-        return self.scene.job
-
 
 @dataclass(frozen=True)
 class _Video:
@@ -62,19 +58,10 @@ class _Video:
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:
-    """Computes sequence `index` and writes `folder/NNNNNN.zarr`.
+    """Computes sequence `index` and writes `folder/NNNNNN.zarr`, `.part` until sealed; returns its path.
 
-    Args:
-        job: the dataset's job, paths resolved.
-        index: which sequence, 0 <= index < job.sequences.
-        folder: the dataset; the store is `NNNNNN.zarr.part` until it is sealed.
-        report: called with progress, stage by stage.
-
-    Returns:
-        The sealed store's path.
-
-    Raises:
-        UserError: the job cannot be carried out (surface, load, inverted element).
+    `report` is called with progress, stage by stage. UserError: the job cannot be carried out (surface, load,
+    inverted element).
     """
     watch = Stopwatch()
     return write_scene(simulate(job, index, report, watch), folder, report, watch)
@@ -127,17 +114,15 @@ def _refuse_unseen(scene: Scene) -> None:
 
 def _render_frames(task: _Task) -> list[_Video]:
     """Renders every frame and writes its fields, except videos that a codec follows; a video per camera."""
-    job, scene, writer = task.job, task.scene, task.writer
+    scene, writer, job = task.scene, task.writer, task.scene.job
     width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
         rng = scenario.label_rng(job, scene.index)
         labels = Published.begin(job.labels, scene.tissue, job.frames, rng)
-    names = [
-        name
-        for name in dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
-        if FIELDS[name].framed and not (_coded(job) and name.startswith("rgb"))
-    ]
+    every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
+    later = ("rgb", "rgb_right") if _coded(job) else ()
+    names = [name for name in every if FIELDS[name].framed and name not in later]
     shape = (job.frames, height, width)
     cameras = _CAMERAS if writer.wants("rgb_right") else _CAMERAS[:1]
     videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in cameras]
@@ -164,8 +149,9 @@ def _render_frames(task: _Task) -> list[_Video]:
 
 def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
     """Writes and returns the videos after the job's codec."""
+    job = task.scene.job
     with task.watch.stage("store"):
-        coded = [video_link.recorded(video.rgb, task.job.sensor, task.job.fps) for video in videos]
+        coded = [video_link.recorded(video.rgb, job.sensor, job.fps) for video in videos]
         for rgb, (name, _) in zip(coded, _CAMERAS, strict=False):
             task.writer.put(name, rgb)
     return [replace(video, rgb=rgb) for video, rgb in zip(videos, coded, strict=True)]
@@ -181,7 +167,7 @@ def _recover_flow(task: _Task, video: _Video) -> Track:
 
     As in a real pipeline, its inputs are pictures and instrument masks; glare is detected in the pictures.
     """
-    job, writer = task.job, task.writer
+    job, writer = task.scene.job, task.writer
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
         tissue = task.scene.tissue
@@ -195,7 +181,7 @@ def _recover_flow(task: _Task, video: _Video) -> Track:
 
 def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> None:
     """Recovers motion in three dimensions from the left camera's flow and both videos, and writes it."""
-    job, writer, scene = task.job, task.writer, task.scene
+    scene, writer, job = task.scene, task.writer, task.scene.job
     lens = scene.renderer.right
     assert lens is not None
     blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
@@ -228,13 +214,13 @@ def _seal(task: _Task) -> Path:
     case, view = scene.scenario, scene.view
     extra: dict[str, Any] = {}
     if scene.brain is not None:
-        extra["opening_id"] = identity.identify_opening(task.job, case.index)
+        extra["opening_id"] = identity.identify_opening(scene.job, case.index)
         extra["mesh_to_world"] = scene.brain.to_world.tolist()
     if (right := scene.renderer.right) is not None:
-        extra["right"] = {"baseline_mm": task.job.render.stereo_mm, **_lens(right)}
+        extra["right"] = {"baseline_mm": scene.job.render.stereo_mm, **_lens(right)}
     return task.writer.seal(
         scenario=case.as_dict(),
-        anatomy_id=identity.identify_anatomy(task.job, case.relief.seed),
+        anatomy_id=identity.identify_anatomy(scene.job, case.relief.seed),
         **_lens(view),
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=case.tissue.young_kpa,

@@ -83,11 +83,8 @@ class Published:
     def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Floats) -> dict[str, Map]:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.
 
-        Args:
-            t: the frame; the rest frame, 0, has no noise, as all motion is measured from it.
-            flow: (H, W, 2) px, ground truth.
-            traction: (H, W, 3) kPa, ground truth.
-            force_mn: (3,) total force.
+        From the true flow, traction (H, W, 3) kPa and total force (3,). The rest frame has no noise, as all
+        motion is measured from it.
         """
         label = intensity(traction, float(np.linalg.norm(force_mn)))
         if t > 0:

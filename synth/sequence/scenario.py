@@ -88,10 +88,8 @@ def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
     view = draw_view(job.render, generator(_VIEW))
     motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
-    opening_mm = job.anatomy.craniotomy.radius_mm
-    lens = place(view, job.render)
-    rngs = generator(_GESTURE), generator(_FURTHER)
-    shown = visible_radius(lens), lens.centre
+    lens, opening_mm = place(view, job.render), job.anatomy.craniotomy.radius_mm
+    rngs, shown = (generator(_GESTURE), generator(_FURTHER)), (visible_radius(lens), lens.centre)
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
     appearance = draw_appearance(job, family, generator(_APPEARANCE))
     return Scenario(index, family, relief, tissue, gestures, appearance, view, motion, pulse)
@@ -120,9 +118,8 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
     young = _log_uniform(rng, fem.young_kpa)
     # Drawn even where unused, so that other numbers do not depend on whether there is a membrane.
     drawn, membrane = rng.uniform(), fem.membrane
-    pia = Pia(
-        _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm), _uniform(rng, _STRETCH)
-    )
+    stiff, thick = _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm)
+    pia = Pia(stiff, thick, _uniform(rng, _STRETCH))
     poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
     return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull)
 
@@ -148,20 +145,10 @@ def draw_gestures(
     """Draws the gestures of all instruments, each again until it fits next to the others.
 
     Those of `fem.instrument_list` have the values given there; those with a place are drawn first, so that no
-    other instrument occupies it.
+    other instrument occupies it. `rng`: of this sequence's first gesture, `others`: of its further ones;
+    `visible_mm`: see `draw_gesture`; `lens`: (3,) mm, world axes, no instrument is end-on before it.
 
-    Args:
-        fem: the job's section; their number is drawn from `fem.instruments`.
-        opening_mm: radius of the craniotomy.
-        young_kpa: E of the tissue.
-        rng: random numbers of this sequence's first gesture.
-        others: of its further ones.
-        visible_mm: radius around the opening's middle that the camera shows, see `draw_gesture`.
-        lens: (3,) mm, in world axes; no instrument is end-on before it.
-        frames: of the sequence.
-
-    Raises:
-        UserError: not all instruments fit into the opening, or not in their places.
+    Raises UserError if not all instruments fit into the opening, or not in their places.
     """
     given, (fewest, most) = fem.instrument_list, fem.instruments
     count = max(int(others.integers(fewest, most + 1)), len(given))
@@ -222,22 +209,25 @@ def draw_gesture(
     half = path if kind == "slide" else spread if kind == "grasp" else 0.0
     long = tool_gesture.form(kind, tool)
     reach = footprint * np.sqrt(max(long, 1 / long)) + 0.5 * half
-    point = _draw_point(opening_mm, visible_mm, reach, rng, given)
+    # The middle of the contacts; a circle of `reach` around it lies in opening and picture.
+    largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
+    radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    point = radius * np.array([np.cos(angle), np.sin(angle)])
+    if given.place is not None:
+        point = np.asarray(given.place, np.float64)
     along, direction = _draw_direction(fem, kind, rng, given)
     if kind == "retract":  # the hand is on the side that tissue is drawn to, in a quarter of them opposite
         turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (own.random() < 0.25)
         azimuth = float((turn + _uniform(own, (-30, 30))) % 360)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
+    each = zip(places.tolist(), load * unit_mn * directions, strict=True)
     drawn_timing = _draw_timing(kind, rng, frames)
     touch, full, fall, release = map(float, given.timing or drawn_timing)
     return Gesture(
         kind=kind,
         instrument=tool,
-        contacts=tuple(
-            ToolContact((float(p[0]), float(p[1])), _vector(f))
-            for p, f in zip(places, load * unit_mn * directions, strict=True)
-        ),
+        contacts=tuple(ToolContact((x, y), _vector(part)) for (x, y), part in each),
         footprint_mm=footprint,
         load=load,
         point_mm=(float(point[0]), float(point[1])),
@@ -274,17 +264,6 @@ def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
     rings = np.concatenate(found).reshape(-1, instrument.RING, 3)[::_RINGS]
     middles = rings.mean(axis=1)
     return middles, np.linalg.norm(rings - middles[:, None], axis=2).max(axis=1)
-
-
-def _draw_point(
-    opening_mm: float, visible_mm: float, reach: float, rng: Random, given: InstrumentSection
-) -> Floats:
-    """Middle of the contacts (2,) mm; a circle of `reach` mm around it lies in opening and picture."""
-    largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
-    radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-    if given.place is not None:
-        return np.asarray(given.place, np.float64)
-    return np.asarray(radius * np.array([np.cos(angle), np.sin(angle)]))
 
 
 def _draw_direction(

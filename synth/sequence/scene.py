@@ -198,8 +198,7 @@ class Scene(RestScene):
         if chosen == "ideal":
             raise UserError("flow.backend: `ideal` recovers no flow; name an estimator")
         rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
-        if self.job.sensor.bitrate_mbps is not None:
-            rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
+        rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
         return track.recover_flow(rgb, tools, self.tissue, chosen)
 
 
@@ -218,32 +217,23 @@ def at_rest(
 ) -> RestScene:
     """Draws sequence `index` of a job and builds its surface and renderer.
 
-    The renderer accepts any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`.
-
-    Args:
-        job: the job.
-        index: number of the sequence.
-        case: a scenario to use instead of the drawn one.
-        content: what is drawn around the surface and of it; `draw_craniotomy` if None.
-
-    Raises:
-        UserError: the job's surface or calibration cannot be used.
+    The renderer accepts any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`. `case`:
+    a scenario to use instead of the drawn one; `content`: what is drawn around the surface and of it,
+    `draw_craniotomy` if None. UserError: the job's surface or calibration cannot be used.
     """
     case = case or scenario.draw_scenario(job, index)
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:
         case = replace(case, view=camera.calibrated(case.view, view))
     mesh = job.anatomy.mesh
-    written = mesh.stat() if mesh and mesh.is_file() else None
-    surface, brain = _cortex(
-        job.anatomy.opened(case.index), case.relief, written and (written.st_mtime_ns, written.st_size)
-    )
+    about = mesh.stat() if mesh and mesh.is_file() else None
+    written = about and (about.st_mtime_ns, about.st_size)
+    surface, brain = _cortex(job.anatomy.opened(case.index), case.relief, written)
     return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy)
 
 
 def refuse_unfit(render: RenderSection) -> None:
-    """Raises UserError for a calibration that cannot be read, does not fit the picture, or whose right camera
-    does not show the opening."""
+    """Raises UserError for a calibration that can't be read, or whose cameras don't show the opening."""
     if render.calibration is not None:
         right_of(render, camera.place(scenario.draw_view(render, np.random.default_rng(0)), render))
 

@@ -36,9 +36,8 @@ class Timeline:
         after = min(before + 1, last)
 
         def between(values: np.ndarray) -> np.ndarray:
-            return np.asarray(
-                values[before] if part == 0 else (1 - part) * values[before] + part * values[after]
-            )
+            mixed = values[before] if part == 0 else (1 - part) * values[before] + part * values[after]
+            return np.asarray(mixed)
 
         return SceneState(
             vertices=self.rest + between(self.motion.displacement),

@@ -26,10 +26,8 @@ def folder(name: str) -> Path:
 
     It is in `SULCUS_CACHE`, else in the user's cache (`XDG_CACHE_HOME`, else ~/.cache); if neither is
     writable (no home, read-only), in the system's temporary folder. Cached code is executed: where others own
-    the folder or may write to it, it is `user-UID` inside.
-
-    Raises:
-        OSError: no folder is writable, or others own or may write to the user's own.
+    the folder or may write to it, it is `user-UID` inside. OSError: no folder is writable, or others own or
+    may write to the user's own.
     """
     user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
     places = [
@@ -67,14 +65,8 @@ def cached(
 ) -> T:
     """The result of `make`, from this user's cache if possible; concurrent calls of one key compute it once.
 
-    Args:
-        file: folder and suffix in the cache, `compliance/npy`.
-        key: identifies all inputs of `make`.
-        make: computes the result.
-        dump: encodes it as the bytes of a file.
-        load: decodes these.
-        faults: exceptions of `load` for a truncated or corrupted file.
-        most: number of files to store; older ones are deleted.
+    `file`: folder and suffix in the cache, `compliance/npy`; `key` identifies all inputs of `make`; `faults`:
+    exceptions of `load` for a corrupted file; `most`: number of files to store, older ones are deleted.
     """
     name, ending = file.split("/")
     word = hashlib.sha256(key).hexdigest()[:32]

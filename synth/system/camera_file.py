@@ -32,24 +32,22 @@ _KALIBR = "tcncnm1"  # 4 x 4, from the left camera to the right one
 _WIDTH, _HEIGHT = ("imagewidth", "width", "resx"), ("imageheight", "height", "resy")
 _SIZE = "resolution", "imagesize", "imgsize"
 _MODEL = re.compile(r"((distortion|camera|lens|projection)(model|type)|model)(name)?")
-_PINHOLE = re.compile(
-    "(distortion|pinhole|opencv|plumbbob|radtan|radialtangential|brown|conrady|rationalpolynomial|none)+"
-)
+_PINHOLE = "distortion|pinhole|opencv|plumbbob|rad(tan|ialtangential)|brown|conrady|rationalpolynomial|none"
 _OTHER = re.compile("fisheye|omnidir|thinprism|^xi$")  # keys of other models
 _SIDED = re.compile("(left|right)?(.*?)(left|right|[012])?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _LARGEST, _MOST_TANGENTIAL, _ORTHOGONAL = 1e6, 0.05, 1e-3
-_LARGEST_FILE = 1 << 20  # bytes
+LARGEST_FILE = 1 << 20  # bytes
 
 
-def read_lens(path: Path, size: tuple[int, int], largest: int = _LARGEST_FILE) -> tuple[Floats, Floats]:
+def read_lens(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """The only or the left camera, for pictures of a size (width, height) [px] with the same field of view.
 
     Returns K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (4, 5, 8, 12 or 14,)
-    k1, k2, p1, p2, k3, ... Raises UserError if the file has more than `largest` bytes, can't be read, is of
-    another camera model, or was made from pictures of another shape.
+    k1, k2, p1, p2, k3, ... Raises UserError if the file can't be read, is of another camera model, or was
+    made from pictures of another shape.
     """
-    return _load(path, largest)[0].lens(size)
+    return _load(path)[0].lens(size)
 
 
 def read_pair(
@@ -60,7 +58,7 @@ def read_pair(
     Also returns R (3, 3), T (3,), and the millimetres per unit of T if the format has a unit. Raises as
     `read_lens`, and UserError for an R or T that is missing or invalid.
     """
-    left, right = _load(path, _LARGEST_FILE)
+    left, right = _load(path)
     lenses = left.lens(size), right.lens(size, shifted=True)
     return *lenses, *_pose(left, right)
 
@@ -69,7 +67,7 @@ def find_baseline_mm(path: Path) -> float:
     """Distance of the two cameras of a pair, with T in mm if the format has no unit; 0 for a single camera,
     and for a file that can't be read."""
     try:
-        left, right = _load(path, _LARGEST_FILE)
+        left, right = _load(path)
         _, translation, unit = _pose(left, right)
     except UserError:
         return 0.0  # reported by those that read the cameras
@@ -123,9 +121,7 @@ class _Values(NamedTuple):
         if matrix.size != 9:
             raise self.error(f"no camera matrix (camera_matrix, K or fx, fy, cx, cy): {matrix.size} numbers")
         if lens.size not in (4, 5, 8, 12, 14) or not (np.abs(lens) < _LARGEST).all():
-            raise self.error(
-                f"{lens.size} distortion coefficients; needed are k1 k2 p1 p2 and perhaps k3 ..."
-            )
+            raise self.error(f"{lens.size} distortion coefficients, needed are k1 k2 p1 p2, perhaps k3 ...")
         K = matrix.reshape(3, 3)
         if not K[:2, 2].any() and K[2, :2].any():
             raise self.error(
@@ -145,9 +141,8 @@ class _Values(NamedTuple):
         if (made.size and not known) or abs(scale[0] / scale[1] - 1) > 0.01:
             of = " x ".join(f"{one:g}" for one in made)
             raise self.error(f"made from pictures of {of}, whose shape is not that of {size[0]} x {size[1]}")
-        K = np.array([[K[0, 0], K[0, 1], K[0, 2] + 0.5], [0, K[1, 1], K[1, 2] + 0.5], [0, 0, 1]])
-        # Pixel centres, not corners, are whole numbers.
-        K = np.diag([*scale, 1.0]) @ K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # centres, not corners, are whole
+        K = np.diag([*scale, 1.0]) @ (K + half) - half
         (fx, skew, x), (_, fy, y), _ = K
         if not (0.1 * size[0] < fx < 200 * size[0] and 1 / 3 < fx / fy < 3 and abs(skew) < 1e-6 * fx):
             raise self.error(f"focal lengths {fx:g}, {fy:g} px with skew {skew:g} don't fit {size} px")
@@ -159,10 +154,10 @@ class _Values(NamedTuple):
         return K, lens
 
 
-def _load(path: Path, largest: int) -> tuple[_Values, _Values]:
+def _load(path: Path) -> tuple[_Values, _Values]:
     """The values of the left and of the right camera, each with those that belong to none."""
-    text = checked_file.read_text(path, largest, "utf-8-sig").strip()
-    found: Any
+    text = checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip()
+    found: Any = None
     with as_user_error(f"{path}: is no calibration in XML, JSON or INI"):
         if text.startswith("<"):
             found = _tree(ElementTree.fromstring(text))
@@ -172,8 +167,6 @@ def _load(path: Path, largest: int) -> tuple[_Values, _Values]:
             parser = configparser.ConfigParser(interpolation=None, strict=False)
             parser.read_string(text)
             found = {name: dict(parser[name]) for name in parser.sections()}
-        else:
-            found = None
     if found is None:
         # Long matrices as text, which is read much faster; OpenCV's head and tags are not YAML.
         text = re.sub(r"\bdata:\s*\[([^][\"]*)\]", r'data: "\1"', text.removesuffix("\n---"))
@@ -192,9 +185,7 @@ def _tree(node: ElementTree.Element) -> Any:
     return {child.tag: _tree(child) for child in node} or node.text
 
 
-def _collected(
-    path: Path, found: dict[Any, Any], side: str = "", depth: int = 4
-) -> Iterator[tuple[str, str, Any]]:
+def _collected(path: Path, found: Any, side: str = "", depth: int = 4) -> Iterator[tuple[str, str, Any]]:
     """Side, name and value of each entry of nested maps. UserError for the name of another camera model."""
     rows: dict[str, list[Any]] = {}
     inner_first = sorted(found.items(), key=lambda one: not isinstance(one[1], dict))
@@ -207,7 +198,7 @@ def _collected(
         match = None if word == _KALIBR or (scalar and word in _TERMS) else _SIDED.fullmatch(word)
         name, own = (match[2], match[1] or match[3] or "") if match else (word, "")
         if isinstance(value, str) and _MODEL.fullmatch(name):
-            other = not _PINHOLE.fullmatch(re.sub("[^a-z0-9]", "", value.lower()))
+            other = not re.fullmatch(f"({_PINHOLE})+", re.sub("[^a-z0-9]", "", value.lower()))
         else:
             other = bool(_OTHER.search(word)) and str(value).lower() not in ("", "0", "0.0", "false", "none")
         if other:

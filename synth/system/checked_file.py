@@ -103,10 +103,7 @@ def read_tensors(path: Path) -> dict[str, Any]:
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
     """A still image read by OpenCV: (H, W, 3) uint8 BGR, upright, or as set by `flags` (cv2.IMREAD_...).
-
-    Raises:
-        UserError: not a regular file, not a picture, or larger than 40 megapixels.
-    """
+    UserError: not a regular file, not a picture, or larger than 40 megapixels."""
     data = read_bytes(path, LARGEST_PICTURE)
     with as_user_error(f"{path}: not a readable picture"):
         return decode_picture(data, flags)

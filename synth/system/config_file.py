@@ -67,11 +67,8 @@ class ConfigFile:
         return out.getvalue()
 
     def validate(self, model: type[Model], further: Iterable[Mistake] = ()) -> Model:
-        """The validated model of the values.
-
-        Raises:
-            UserError: a line for each error and each of the `further` ones, in the order of the file:
-                `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
+        """The validated model of the values. UserError: a line for each error and of the `further` ones, in
+        the order of the file: `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
         """
         mistakes, made = list(further), None
         try:

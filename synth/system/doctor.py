@@ -102,6 +102,5 @@ def _cuda() -> Diagnosis:
     capability = ".".join(map(str, here.capability))
     found = f"{here.devices} GPU, driver {here.driver or 'unknown'}, compute capability {capability}"
     why = gpu.obstacle(here)
-    return Diagnosis(
-        "CUDA", found if why else f"{found}; render.variant=cuda_ad_rgb uses it", why is None, why or ""
-    )
+    use = "" if why else "; render.variant=cuda_ad_rgb uses it"
+    return Diagnosis("CUDA", found + use, why is None, why or "")

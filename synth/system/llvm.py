@@ -10,14 +10,7 @@ import sys
 from pathlib import Path
 
 _OLDEST = 17  # drjit 1.5 aborts with 15 and 16 and refuses 14
-_FOLDERS = (
-    "/usr/lib/x86_64-linux-gnu",
-    "/usr/lib/aarch64-linux-gnu",
-    "/usr/lib64",
-    "/usr/lib",
-    "/usr/local/lib",
-    "/opt/homebrew/opt/llvm/lib",
-)
+_FOLDERS = "x86_64-linux-gnu", "aarch64-linux-gnu", ".", "../lib64", "../local/lib"  # from /usr/lib
 _PROBE = (
     "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr; "
     "x = dr.arange(mi.Float, 16); x += 1; dr.eval(x); assert dr.sum(x)[0] == 136"
@@ -42,10 +35,10 @@ def find() -> str | None:
 
 def candidates() -> list[str]:
     """LLVM libraries of a usable version on this machine, newest first."""
-    folders = [*map(Path, _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
+    folders = [*(Path("/usr/lib", one) for one in _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
     found: dict[Path, int] = {}
     for path in [*_linker(), *(path for folder in folders for path in folder.glob("libLLVM*"))]:
-        named = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+)|-(\d+)\.dylib)", path.name)
+        named = re.search(r"libLLVM(?:-(\d+)\.so|\.so\.(\d+))", path.name)
         version = int(next(filter(None, named.groups()))) if named else 0
         if version >= _OLDEST and path.exists():
             found.setdefault(path.resolve(), version)
@@ -57,13 +50,11 @@ def probe(path: str) -> bool:
     if not Path(path).exists():
         return False
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": path}
+    call = [sys.executable, "-c", _PROBE]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=120, check=False
-        )
+        return not subprocess.run(call, env=environment, capture_output=True, timeout=120).returncode
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0
 
 
 def _linker() -> list[Path]:

@@ -25,11 +25,10 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, str | int | float]:
     """Processor, cores, memory [GB], system and Python; nothing that identifies the machine."""
-    info = Path("/proc/cpuinfo")
-    model = re.search(r"model name\s*:\s*(.+)", info.read_text() if info.exists() else "")
+    model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
     return {
         "processor": model.group(1) if model else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "cores": len(os.sched_getaffinity(0)),
         "memory_gb": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1),
         "system": platform.system(),
         "python": platform.python_version(),

@@ -52,16 +52,12 @@ def number_files(paths: Collection[Path]) -> dict[int, Path]:
 def match_numbers(
     numbers: Collection[int], frames: Collection[int], name: str, notes: list[str]
 ) -> dict[int, int]:
-    """The frame of each number: the frame of the same number, unless the two are counted differently.
+    """The frame of each number, of files or rows called `name`: that of the same number, unless the two are
+    counted differently.
 
-    Args:
-        numbers: of files or rows.
-        frames: of the video; empty: unknown.
-        name: of the files or rows, for messages.
-        notes: receives a line if there are as many numbers as frames, equally spaced, but not equal.
-
-    Raises:
-        UserError: some numbers are not frames of the video, and neither the first nor the last ones agree.
+    `frames`: of the video, empty if unknown; `notes` receives a line if there are as many numbers as frames,
+    equally spaced, but not equal. UserError: some are not frames, and neither the first nor the last ones
+    agree.
     """
     own, video = np.unique(list(numbers)), np.unique(list(frames))
     same = dict(zip(own.tolist(), own.tolist(), strict=True))

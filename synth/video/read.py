@@ -31,7 +31,6 @@ SUFFIXES = (
 
 FPS = 25.0  # assumed if a video's times are unknown
 
-
 _LARGEST_BYTES = 1 << 40
 _WIDEST = 4.0  # largest aspect ratio of a pixel: a larger one is a damaged header
 _LABELS = 8  # most levels of a mask of class numbers; more are a soft edge
@@ -57,10 +56,8 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
     """Decodes frame by frame; times are the container's presentation times from its start, else of `fps`.
 
     The orientation stated in the file is applied, and pixels stated not to be square are resampled in width.
-    Of a truncated file the frames before the cut are returned.
-
-    Raises:
-        UserError: not a video, no video stream, or pictures larger than 40 megapixels.
+    Of a truncated file the frames before the cut are returned. UserError: not a video, no video stream, or
+    pictures larger than 40 megapixels.
     """
     with _open_video(path) as container:
         if not container.streams.video:
@@ -178,9 +175,8 @@ def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
             bits = count_bits(map(_read_colours, paths.values()))
         rgb = np.ascontiguousarray(as_8_bits(stored, bits or 16)[..., ::-1])
         if size is not None and rgb.shape != size:
-            raise UserError(
-                f"{path}: is {rgb.shape[1]} x {rgb.shape[0]}, but the frames before are {size[1]} x {size[0]}"
-            )
+            is_ = f"is {rgb.shape[1]} x {rgb.shape[0]}"
+            raise UserError(f"{path}: {is_}, but the frames before are {size[1]} x {size[0]}")
         size = rgb.shape
         yield Picture(index, None, rgb)
 
@@ -223,9 +219,8 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     few = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
     mask = brightest > (0 if few else brightest.max() / 2)
     if mask.shape != size:
-        raise UserError(
-            f"{path}: is {mask.shape[1]} x {mask.shape[0]}, but the video is {size[1]} x {size[0]}"
-        )
+        is_ = f"is {mask.shape[1]} x {mask.shape[0]}"
+        raise UserError(f"{path}: {is_}, but the video is {size[1]} x {size[0]}")
     return np.asarray(mask, bool)
 
 

@@ -26,9 +26,8 @@ _AGAIN, _ASIDE = 0.6, 1.0  # in turn: largest change to the next but one over th
 
 def find_layout(pictures: Sequence[Pixels]) -> str:
     """The layout, one of `LAYOUTS`, of a video with these first pictures (H, W, 3); empty: one camera."""
-    grey = [
-        cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.float32) for rgb in pictures
-    ]
+    stored = (cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY) for rgb in pictures)
+    grey = [one.astype(np.float32) for one in stored]
     height, width = grey[0].shape
     for axis, whole, squeezed in ((1, "side-by-side", "half-width"), (0, "top-bottom", "half-height")):
         half, (share, _) = grey[0].shape[axis] // 2, match(*split(grey[0], whole))
@@ -52,10 +51,8 @@ def split(rgb: Pixels, layout: str) -> tuple[Pixels, Pixels]:
     half = rgb.shape[axis] // 2
     one, other = np.split(rgb.take(range(2 * half), axis), 2, axis)
     if layout.startswith("half"):
-        height, width = one.shape[0] * (2 - axis), one.shape[1] * (1 + axis)
-        one, other = (
-            cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC) for part in (one, other)
-        )
+        size = one.shape[1] * (1 + axis), one.shape[0] * (2 - axis)
+        one, other = (cv2.resize(part, size, interpolation=cv2.INTER_CUBIC) for part in (one, other))
     return one, other
 
 
@@ -72,10 +69,8 @@ def match(one: Array, other: Array, columns: int = _COLUMNS) -> tuple[float, flo
             if block.std() < _DETAIL:
                 continue
             count += 1
-            own, there = (
-                cv2.matchTemplate(picture[rows], block, cv2.TM_CCOEFF_NORMED).max(axis=0)
-                for picture in (one, other)
-            )
+            scores = (cv2.matchTemplate(both[rows], block, cv2.TM_CCOEFF_NORMED) for both in (one, other))
+            own, there = (score.max(axis=0) for score in scores)
             own[max(0, x - _BLOCK // 2) : x + _BLOCK // 2] = 0
             if there.max() > max(_ALIKE, own.max() + _BETTER):
                 found.append(int(there.argmax()) - x)

@@ -25,12 +25,8 @@ def encode_video(
 ) -> Path:
     """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers can play.
 
-    Args:
-        target: the file.
-        frames: at least one, all of one size; an odd last row or column is cropped, as the codec requires.
-        fps: frames per second.
-        quality: x264's constant rate factor: smaller is better and larger.
-        group: distance of key frames.
+    An odd last row or column is cropped, as the codec requires. `quality`: x264's constant rate factor,
+    smaller is better and larger; `group`: distance of key frames.
     """
     import av
 
@@ -54,19 +50,11 @@ def encode(
     bits_per_s: int | None = None,
     times_s: Floats | None = None,
 ) -> None:
-    """Encodes frames with H.264 as the only stream of an open file.
+    """Encodes frames, (H, W, 3) uint8 sRGB, with H.264 as the only stream of an open file.
 
-    Args:
-        container: the file.
-        frames: (H, W, 3) uint8 sRGB each; H and W even where chroma is subsampled.
-        rate: frames per second.
-        pixels: FFmpeg's name of the pixel format.
-        options: x264's.
-        bits_per_s: target bitrate; None: set by `options`.
-        times_s: (T,) rising, of each frame; None: by the rate.
-
-    Raises:
-        UserError: frames of different sizes, or without pixels.
+    `pixels`: FFmpeg's name of the format; where it subsamples chroma, H and W are even. `options`: x264's,
+    which set the bitrate without `bits_per_s`; `times_s`: (T,) rising, by the rate if None. UserError: frames
+    of different sizes, or without pixels.
     """
     import av
 
@@ -81,9 +69,8 @@ def encode(
         if k == 0:
             stream.height, stream.width = rgb.shape[:2]
         if rgb.shape[:2] != (stream.height, stream.width) or not rgb.size:
-            raise UserError(
-                f"{container.name}: frame {k} has another size, {rgb.shape[1]} x {rgb.shape[0]} px"
-            )
+            other = f"{rgb.shape[1]} x {rgb.shape[0]} px"
+            raise UserError(f"{container.name}: frame {k} has another size, {other}")
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
         if time_s is not None:
             frame.pts, frame.time_base = round(float(time_s) * _TICKS), Fraction(1, _TICKS)

@@ -7,8 +7,8 @@ from pathlib import Path
 from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
 INSIDE = {
-    "synth": "arrays errors arguments fields formats plugins system job flow flow.stereo video recording_flow "
-    "geometry fem.mesh fem "
+    "synth": "arrays errors arguments fields formats plugins system job flow flow.stereo video "
+    "recording_flow geometry fem.mesh fem "
     "render.camera render.materials render.mitsuba render.appearance render.anatomy render "
     "dataset sequence checks publish publish.export engine tune fit cli __main__",
     "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "

@@ -106,10 +106,7 @@ def calibrated(view: CameraView, lens: Camera) -> CameraView:
 
 def visible_radius(camera: Camera) -> float:
     """Radius [mm] of the largest circle around the craniotomy's centre, in its plane, that is in the picture.
-
-    Raises:
-        UserError: as `rays`.
-    """
+    Raises as `rays`."""
     (width, height), side = camera.size, np.linspace(-0.5, 0.5, _BORDER)
     across = [(x, y) for x in side for y in (-0.5, 0.5)]
     edge = np.array(across + [(y, x) for x, y in across])
@@ -202,10 +199,7 @@ def to_pixels(camera: Camera, local: Floats) -> Floats:
 
 def rays(camera: Camera, pixels: Floats) -> Floats:
     """Centre rays (N, 3) of pixels (N, 2): camera axes, z = 1, so that distance along them is depth.
-
-    Raises:
-        UserError: the distortion folds the picture over itself, so that a pixel has no ray.
-    """
+    UserError: the distortion folds the picture over itself, so that a pixel has no ray."""
     flat = undistort((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2], camera.distortion)
     return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 

@@ -137,8 +137,6 @@ def _falloff(shape: tuple[int, int], vignette: float) -> Map:
 
 def _scatter(light: Map, share: float) -> Map:
     """Light with a narrow halo around bright spots, at the spots' expense."""
-    if share == 0:
-        return light
     sigma = light.shape[1] / 200
     small = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     halo = cv2.resize(cv2.GaussianBlur(small, (0, 0), max(sigma / 2, 0.5)), light.shape[1::-1])

@@ -18,10 +18,7 @@ _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 def recorded(pictures: Pixels, section: schema.SensorSection, fps: float) -> Pixels:
     """Pictures (T, H, W, 3) sRGB after the recorder's codec; the same pictures without a bitrate.
 
-    Deterministic, since it runs on one thread.
-
-    Raises:
-        UserError: the codec rejects pictures of this size or kind.
+    Deterministic, since it runs on one thread. UserError: the codec rejects this size or kind of picture.
     """
     if section.bitrate_mbps is None:
         return pictures

@@ -253,4 +253,3 @@ def test_a_sequence_too_large_for_a_worker_is_refused_before_it_begins(tmp_path:
     with pytest.raises(UserError, match=r"10000 frames needs about .* GB of memory .* --workers 1"):
         engine.run_job(job, tmp_path / "out", engine.Options(workers=2, memory_gb=4), Silent())
     assert not (tmp_path / "out").exists()
-    size_forecast.refuse_if_too_long(job, None, 1)  # memory is unknown: nothing is refused
