@@ -26,9 +26,9 @@ def load_job(source: str | Path, overrides: Sequence[str] = ()) -> Job:
     """The job in `source`, with overrides applied.
 
     Args:
-        source: path of a job file, or one of `names()`. A path wins when it exists.
-        overrides: `section.key=value`, the value in YAML. Paths in them are relative to the working
-            directory, those in a job file to the file.
+        source: path of a job file, or one of `names()`. A path wins when it exists. overrides:
+        `section.key=value`, the value in YAML. Paths in them are relative to the working directory, those in
+        a job file to the file.
 
     Raises:
         UserError: one line for each error, `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`

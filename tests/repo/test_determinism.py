@@ -9,7 +9,7 @@ MAY_READ_CLOCKS = {
     "synth/system/stopwatch.py",
     "synth/engine/child.py",
     "synth/engine/journal.py",
-    "synth/dataset/folder.py",
+    "synth/system/file_lock.py",
     # Flow of a user's recording: not part of any dataset.
     "synth/recording_flow/flow.py",
     "synth/recording_flow/passes.py",
