@@ -81,9 +81,9 @@ def open_source(
     source: Path | Array, model: Predictor | str | Path | None, options: VideoOptions, input: str | None
 ) -> tuple[Predictor, Iterator[Motion]]:
     """The model, by default the pretrained one that fits, and the motions of a source for it."""
-    if not isinstance(model, Predictor):
-        model = load_model(model or choose_model(has_right_camera(source)), quick=True)
-    return model, motions(source, model.stored(input), options)
+    named = model or choose_model(has_right_camera(source))
+    found = named if isinstance(named, Predictor) else load_model(named, quick=True)
+    return found, motions(source, found.stored(input), options)
 
 
 def apply(

@@ -23,7 +23,7 @@ ODD: tuple[Any, ...] = (
     int,
     b"x",
 )
-CALLS = {
+CALLS: dict[Any, tuple[Any, ...]] = {
     synth.simulate: ({"job": "tiny"}, "index", "case", "motions", "mechanics"),
     synth.load_job: ({"source": "tiny"}, "source", "overrides"),
     synth.render_job: ({"job": "tiny", "out": "out"}, "job", "out", "workers", "memory_gb"),

@@ -1,7 +1,9 @@
 """Files of `learn predict`: documented fields, equal in all files."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 from command import run
 from fake_model import write_model
 
+import learn
+from learn.checkpoint import read_card, write_card
 from learn.cli import app
 from learn.data.grid import GridView, to_image
 from learn.inference import prediction_file
@@ -17,6 +21,8 @@ from learn.inference.apply import apply
 from learn.inference.motion import motions
 from learn.inference.predict import load_model
 from synth.dataset.store import Dataset
+from synth.errors import UserError
+from synth.system.checked_file import write_picture
 
 FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]
 
@@ -55,6 +61,35 @@ def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path
     overlay = frames(tmp_path / "000000.force.mp4")
     assert len(overlay) == sequence.frames
     assert overlay[0].shape[0] > sequence.size[0], "the curve lies below the picture"
+
+
+@pytest.mark.slow
+def test_an_array_gives_what_its_pictures_give(data: Path, model: Path, tmp_path: Path) -> None:
+    sequence = Dataset(data)[0]
+    rgb, tissue = sequence["rgb"][:], sequence["tissue"][:]
+    (tmp_path / "frames").mkdir()
+    for t, picture in enumerate(rgb):
+        write_picture(tmp_path / "frames" / f"{t:03d}.png", picture)
+    write_picture(tmp_path / "tissue.png", np.uint8(255) * tissue)
+    how: dict[str, Any] = {"scale_mm_per_px": 0.3, "young_kpa": 1.5, "rate_hz": None, "flow": "dis"}
+    there = learn.predict(tmp_path / "frames", model, tissue=tmp_path / "tissue.png", masks="none", **how)
+    here = learn.predict(rgb, str(model), tissue=tissue, masks="none", fps=25, **how)
+    np.testing.assert_array_equal(here["force_mn"], there["force_mn"])
+    np.testing.assert_array_equal(here["time_s"], there["time_s"])
+    masked = learn.predict(rgb, model, tissue=tissue, masks=sequence["tool"][:], fps=25, **how)
+    assert masked["trusted"].all()
+    for wrong in ({"tissue": tissue[1:]}, {"masks": sequence["tool"][:2]}, {"membrane": "gone"}):
+        with pytest.raises(UserError, match=next(iter(wrong))):
+            learn.predict(rgb, model, **{"tissue": tissue, **how, **wrong})
+
+
+def test_motion_by_another_estimator_than_the_networks_own_is_noted(data: Path, tmp_path: Path) -> None:
+    trained = write_model(tmp_path / "model", "arch.output=vector")
+    write_card(trained, replace(read_card(trained), motion=["dis 1"]))
+    rgb, how = Dataset(data)[0]["rgb"][:], {"scale_mm_per_px": 0.3, "masks": "none"}
+    notes = {name: learn.predict(rgb, trained, flow=name, **how)["notes"] for name in ("dis", "tvl1")}
+    assert not any("dis 1" in note for note in notes["dis"])
+    assert any("dis 1" in note and "tvl1" in note for note in notes["tvl1"])
 
 
 def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, model: Path) -> None:
