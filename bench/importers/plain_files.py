@@ -58,7 +58,12 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         where, names = (other, None) if other.exists() else (source, use["right"])
         right, own, _ = _open(where, names, notes)
         at = {number: k for k, number in enumerate(numbers)}
-        second = SecondView("right", np.array([at.get(number, -1) for number in own]), right)
+        matched = file_numbers.match_numbers(own, numbers, "right", notes)
+        second = SecondView("right", np.array([at.get(matched[number], -1) for number in own]), right)
+        if (second.frame < 0).all():
+            raise UserError(
+                f"--use right={use['right']}: no picture has the number of one of the left camera"
+            )
     force = np.zeros(0), np.zeros((0, 3))
     if "force" in use:
         force = _read_forces(Path(use["force"]), notes)
@@ -68,7 +73,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 def _open(source: Path, names: str | None, notes: list[str]) -> tuple[_Pictures, list[int], Floats | None]:
     """Pictures, their numbers, and their times [s] if the source has them, NaN where it lacks one."""
     if names and not source.is_dir():
-        raise UserError(f"--use ...={names}: no such file")
+        raise UserError(f"{names}: no such file, and {source} is no folder to choose from")
     if source.suffix.lower() in video.SUFFIXES:
         times = np.array([one.time_s for one in video.read_video(source)], np.float64)
         return lambda: (one.rgb for one in video.read_video(source)), list(range(len(times))), times

@@ -28,8 +28,9 @@ from synth.video import stereo_layout
 from synth.video.file_numbers import find_stills
 
 ROLES = ("frames", "frame_time", "force", "force_time")
-"""Parts of a source; `--use ROLE=NAME` names one; `--use fps=RATE` gives pictures without times a rate."""
-PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")  # files, *.* in a folder
+"""Parts of a source; `--use ROLE=NAME` names one."""
+PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")
+"""Of loose files: `fps` is the rate of pictures without times; `frames` and `right` may be patterns."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
 STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
@@ -125,7 +126,9 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     found = replace(found, pictures=partial(decoded, found), second=second)
     if layout is not None:
         found = _split(found, layout)
-    elif second is None and (seems := stereo_layout.find_layout([*islice(found.pictures(), 9)])):
+    elif second is None and (
+        seems := stereo_layout.find_layout([*islice(found.pictures(), stereo_layout.PICTURES)])
+    ):
         notes.append(f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}")
     if calibration is not None:
         if found.second is None:

@@ -43,7 +43,7 @@ def predict(
     fps: float = FPS,
     input: str | None = None,
 ) -> dict[str, Any]:
-    """Force of every frame of one video, as `learn predict` estimates it, by the names of its NAME.npz.
+    """Forces of one video, as `learn predict` estimates them, by the names of its NAME.npz.
 
     Args:
         source: frames (T, H, W, 3) uint8 from the rest frame on, a video, a folder of PNGs, a sequence or an

@@ -18,7 +18,7 @@ from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 
 
 def picture(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """There is tissue in view, and it is neither black nor burnt out in either camera (share of pixels)."""
+    """There is tissue in view; neither it nor the right picture is black or burnt out (share of pixels)."""
     tissue = sequence["tissue"][:]
     yield truth(bool(tissue.any()), "no tissue in view")
     for t in frames:

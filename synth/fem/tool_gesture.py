@@ -199,7 +199,7 @@ def footprint(
     kernel = (1 - np.minimum(reach, 1) ** 2) ** 2
     total = float(kernel @ area)
     if np.count_nonzero(kernel) < 3 or total <= 0:
-        few = f"{radius_mm:g} mm covers fewer than 3 vertices of the surface"
+        few = f"{radius_mm / (_RING_SIZE if ring else 1):.3g} mm covers fewer than 3 vertices of the surface"
         raise UserError(f"fem.footprint_mm: {few}; raise it, or anatomy.vertices")
     return np.asarray(kernel / total)
 

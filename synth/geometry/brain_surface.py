@@ -179,6 +179,8 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             vertices, faces = read_vtk(data)
         elif kind == "vtp":
             vertices, faces, space = read_vtp(data)
+            if space and not re.fullmatch("[RL][AP][SI]", space := space.strip().upper()):
+                raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
             # From bytes, trimesh can't open further files that are named in this one.
             held = io.BytesIO(_whole(data) if kind == "stl" else data)

@@ -97,10 +97,12 @@ class InstrumentSection(Section):
         numbers, unit = _read_times(self.timing)
         end = (frames - 1) / fps * {"s": 1.0, "ms": 1000.0}[unit] if unit else 1.0
         if numbers[3] >= end:
-            hint = "release earlier, or raise frames" if unit else f"was {numbers[3]:g} s meant?"
-            raise ValueError(
-                f"timing ends at {numbers[3]:g} {unit}, the sequence at {end:.4g} {unit}: {hint}"
-            )
+            if not unit:
+                raise ValueError(
+                    f"timing: {numbers[3]:g} is not below 1, the sequence's end; for seconds add s"
+                )
+            ends = f"{numbers[3]:g} {unit}, the sequence at {end:.4g} {unit}"
+            raise ValueError(f"timing ends at {ends}: release earlier, or raise frames")
         return self.model_copy(update={"timing": tuple(one / end for one in numbers)})
 
 
@@ -206,11 +208,11 @@ class FemSection(Section):
         lacking = [("instrument", kind) for kind in self.gestures if kind not in self.choices()]
         for k, one in enumerate(self.instrument_list):
             kinds = self.gestures if one.gesture is None else (one.gesture,)
-            at = f"instrument_list[{k}].instrument"
+            at = "instrument" if one.instrument is None else f"instrument_list[{k}].instrument"
             lacking += [] if self.choices(one) else [(at, kind) for kind in kinds]
         if lacking:
-            takes = [f"a {kind} takes {' or '.join(INSTRUMENTS[kind])}" for _, kind in lacking]
-            raise ValueError(f"{lacking[0][0]}: {'; '.join(takes)}")
+            takes = [f"{at}: a {kind} takes {' or '.join(INSTRUMENTS[kind])}" for at, kind in lacking]
+            raise ValueError("; ".join(dict.fromkeys(takes)))
         return self
 
     def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Instrument, float]]:

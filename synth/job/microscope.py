@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, ValidationInfo, model_validator
 
 from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Section, Share, Weights
+from synth.plugins import STORED
 from synth.system import camera_file
 
 
@@ -88,8 +89,8 @@ class RenderSection(Section):
     over its edge, the bone's cut edge, drapes in the corners. They hide tissue and don't count as tissue."""
 
     @model_validator(mode="after")
-    def _calibration_replaces_keys(self) -> RenderSection:
-        if self.calibration is None:
+    def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:
+        if self.calibration is None or info.context is STORED:
             return self
         found = round(camera_file.find_baseline_mm(self.calibration), 9)
         for name in ("field_mm", "distortion", *(["stereo_mm"] if found else [])):

@@ -175,9 +175,9 @@ def draw_gestures(
     placed = f" next to {len(found)} others" if found else ""
     key = "instrument_list" if given else "instruments"
     raise UserError(
-        f"fem.{key}: instrument {k} of {count} does not fit{placed} "
+        f"fem.{key}: instrument {k + 1} of {count} does not fit{placed} "
         f"into an opening of {opening_mm:g} mm radius; lower fem.instruments or footprint_mm, change "
-        "its place, or widen anatomy.craniotomy.radius_mm or render.field_mm"
+        "its place or direction, or widen anatomy.craniotomy.radius_mm or render.field_mm"
     )
 
 

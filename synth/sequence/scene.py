@@ -10,7 +10,7 @@ import numpy as np
 
 from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
 from synth.fem.deformation import Deformation
 from synth.fem.surface_embedding import vertex_area
 from synth.flow import track
@@ -24,7 +24,7 @@ from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
 from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.camera import camera, video_link
-from synth.render.camera.calibration import scaled
+from synth.render.camera.calibration import rendered, scaled
 from synth.render.camera.camera import Camera
 from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
@@ -33,8 +33,6 @@ from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system import camera_file
-
-_LEAST_APART_MM = 0.5  # cameras of a pair
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,16 +244,13 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
     """
     if render.calibration is None or not camera_file.find_baseline_mm(render.calibration):
         return None
-    pair = read_rig(render.calibration, render.size)
-    if pair.baseline_mm < _LEAST_APART_MM:
-        raise UserError(f"render.calibration: cameras {pair.baseline_mm:.3g} mm apart; T must be in mm")
+    with as_user_error("render.calibration"):
+        pair = read_rig(render.calibration, render.size)
     scale = np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
     K = scaled(pair.right.K, scale)
-    lens = np.append(pair.right.distortion, np.zeros(4))
-    if lens[8:].any():
-        raise UserError("render.calibration: thin-prism distortion of the right camera is not supported")
+    lens = rendered(pair.right.distortion, render.calibration)
     turn, shift = pair.rotation, pair.translation
-    place = partial(camera.calibrated_right, K=K, distortion=lens[:8], rotation=turn, translation=shift)
+    place = partial(camera.calibrated_right, K=K, distortion=lens, rotation=turn, translation=shift)
     Rectified(pair)  # refuses a right camera that is not to the right
     right = place(view)
     at = camera.project(right, np.zeros((1, 3)))[0]

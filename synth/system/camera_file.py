@@ -10,7 +10,7 @@ import configparser
 import json
 import re
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -34,6 +34,7 @@ _SIZE = "resolution", "imagesize", "imgsize"
 _MODEL = re.compile(r"((distortion|camera|lens|projection)(model|type)|model)(name)?")
 _PINHOLE = "distortion|pinhole|opencv|plumbbob|rad(tan|ialtangential)|brown|conrady|rationalpolynomial|none"
 _OTHER = re.compile("fisheye|omnidir|thinprism|^xi$")  # keys of other models
+_INTRINSIC = {*_MATRIX, *_LENS, *chain.from_iterable(_SCALARS)}
 _SIDED = re.compile("(left|right)?(.*?)(left|right|[012])?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _LARGEST, _MOST_TANGENTIAL, _ORTHOGONAL = 1e6, 0.05, 1e-3
@@ -58,7 +59,7 @@ def read_pair(
     Also returns R (3, 3), T (3,), and the millimetres per unit of T if the format has a unit. Raises as
     `read_lens`, and UserError for an R or T that is missing or invalid.
     """
-    left, right = _load(path)
+    left, right, _ = _load(path)
     lenses = left.lens(size), right.lens(size, shifted=True)
     return *lenses, *_pose(left, right)
 
@@ -67,11 +68,11 @@ def find_baseline_mm(path: Path) -> float:
     """Distance of the two cameras of a pair, with T in mm if the format has no unit; 0 for a single camera,
     and for a file that can't be read."""
     try:
-        left, right = _load(path)
+        left, right, is_pair = _load(path)
         _, translation, unit = _pose(left, right)
     except UserError:
         return 0.0  # reported by those that read the cameras
-    if left.of == right.of:  # R and T are the pose of a single camera
+    if not is_pair:  # R and T are the pose of a single camera
         return 0.0
     return float(np.linalg.norm(translation)) * (unit or 1.0)
 
@@ -154,8 +155,9 @@ class _Values(NamedTuple):
         return K, lens
 
 
-def _load(path: Path) -> tuple[_Values, _Values]:
-    """The values of the left and of the right camera, each with those that belong to none."""
+def _load(path: Path) -> tuple[_Values, _Values, bool]:
+    """The values of the left and of the right camera, each with those of none, and whether there is a right
+    one. UserError for a camera that is described twice, as in two resolutions."""
     text = checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip()
     found: Any = None
     with as_user_error(f"{path}: is no calibration in XML, JSON or INI"):
@@ -177,8 +179,13 @@ def _load(path: Path) -> tuple[_Values, _Values]:
     held = sorted(_collected(path, found), key=lambda one: one[0] != "")  # a camera's own values come last
     first = 0 if any(side == "0" for side, _, _ in held) else 1
     sides = ("", "left", str(first)), ("", "right", str(first + 1))
+    given: dict[tuple[str, str], Any] = {}
+    for side, name, value in held:
+        if name in _INTRINSIC and given.setdefault((side, name), value) != value:
+            raise UserError(f"{path}: {name} of one camera is given twice; leave those of the video's size")
     left, right = ({name: value for side, name, value in held if side in one} for one in sides)
-    return _Values(path, left), _Values(path, right)
+    is_pair = any(side in sides[1][1:] for side, _, _ in held)
+    return _Values(path, left), _Values(path, right), is_pair
 
 
 def _tree(node: ElementTree.Element) -> Any:

@@ -26,7 +26,8 @@ def hold(path: Path) -> Iterator[int]:
 
     Processes that inherit the descriptor hold it too. Without locks of the file system a file next to it
     states this process and is refreshed: a dead process's is taken at once, that of another machine after
-    half a minute. If it is lost, as after a suspension, this process is interrupted.
+    half a minute. Where some machines have locks and others none, those with locks see the others' file, but
+    not the other way round. If it is lost, as after a suspension, this process is interrupted.
 
     Raises `Locked` after some seconds.
     """

@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.errors import UserError
 
-_SEVERAL = "{}: holds {}: keep one series of names, or import one by --use frames='{}'"
+_SEVERAL = "{}: holds {}: keep one series of names (bench import: --use frames='{}')"
 _SPARSE, _SPARE = 10, 1000  # n numbers that span more than 10 n + 1000 are not frame numbers but e.g. times
 
 

@@ -20,9 +20,14 @@ def read(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """
     with as_user_error("render.calibration"):
         K, lens = camera_file.read_lens(path, size)
+    return K, rendered(lens, path)
+
+
+def rendered(lens: Floats, path: Path) -> Floats:
+    """Distortion (5,) or (8,) of a calibration's (4 to 14,). UserError for one that can't be rendered."""
     if lens[_RATIONAL:].any():
         raise UserError(f"render.calibration: {path}: has thin-prism distortion, which is not rendered")
-    return K, np.append(lens, np.zeros(_RATIONAL))[: _RATIONAL if lens[5:].any() else 5]
+    return np.append(lens, np.zeros(_RATIONAL))[: _RATIONAL if lens[5:].any() else 5]
 
 
 def scaled(K: Floats, scale: Floats) -> Floats:

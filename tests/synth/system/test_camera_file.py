@@ -8,7 +8,7 @@ import pytest
 
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
-from synth.system.camera_file import read_lens
+from synth.system.camera_file import find_baseline_mm, read_lens
 
 K = [[800.0, 0.0, 320.5], [0.0, 801.0, 238.5], [0.0, 0.0, 1.0]]
 D = [-0.2, 0.05, 0.001, -0.002, 0.01]
@@ -94,3 +94,17 @@ def test_what_is_not_supported_is_named(text: str, named: str, tmp_path: Path) -
     with pytest.raises(UserError, match=named) as caught:
         read_rig(tmp_path / "a.yaml", (640, 480))
     assert "\n" not in str(caught.value)
+
+
+def test_the_baseline_is_that_of_a_pair_also_of_equal_cameras(tmp_path: Path) -> None:
+    alone = json.dumps({"K": K, "D": D, "R": TURN, "T": [-4.4, 0, 0]})
+    for text, baseline_mm in ((pair(), 4.4), (KALIBR, 4.4), (alone, 0.0), ("damaged", 0.0)):
+        file = tmp_path / "a.json"
+        file.write_text(text)
+        assert find_baseline_mm(file) == pytest.approx(baseline_mm)
+
+
+def test_one_camera_in_two_resolutions_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.ini").write_text("[LEFT_HD]\nfx=700\nfy=700\ncx=640\ncy=360\n[LEFT_VGA]\nfx=350\n")
+    with pytest.raises(UserError, match="fx"):
+        read_lens(tmp_path / "a.ini", (1280, 720))
