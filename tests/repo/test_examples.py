@@ -27,7 +27,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
     assert found["peak_force_mn"] == pytest.approx(4.5239, abs=1e-3)
     assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
-    assert found["largest_motion_px"] == pytest.approx(4.607, abs=0.01)
+    assert found["largest_motion_px"] == pytest.approx(4.9154, abs=0.01)
     assert found["median_flow_error_px"] < 0.2
 
 
@@ -96,8 +96,8 @@ def test_a_custom_law_stiffens() -> None:
     for name, b in (("example-stiff", 4.0), ("example-plain", 1e-4)):
         synth.add_law(name, own_law.Stiffening(b))
     soft, stiff = own_law.peak_mm("neo-hookean"), own_law.peak_mm("example-stiff")
-    assert soft == pytest.approx(0.6946, abs=0.002)
-    assert stiff == pytest.approx(0.6562, abs=0.002)
+    assert soft == pytest.approx(0.6874, abs=0.002)
+    assert stiff == pytest.approx(0.6518, abs=0.002)
     assert own_law.peak_mm("example-plain") == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
 
 
