@@ -154,7 +154,9 @@ def measure(
 
 def _rendered(frames: int, family: str, seed: int) -> tuple[list[Pixels], float]:
     """Crops of the tissue in frames without an instrument, and the median mm of a pixel."""
-    job = Job.model_validate({"seed": seed, "appearance": {"families": [family]}, "render": {"tool": False}})
+    job = Job.model_validate(
+        {"seed": seed, "appearance": {"families": [family]}, "fem": {"instrument": "none"}}
+    )
     crops, pixels = [], []
     for index in range(frames):
         picture, inside, mm_per_px = bare_picture(job, index)

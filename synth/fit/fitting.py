@@ -107,8 +107,10 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFr
     """A frame of a default job without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
     appearance = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
-    view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "tool": False}
-    job = Job.model_validate({**appearance, "appearance": {"families": [family]}, "render": view})
+    view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8]}
+    job = Job.model_validate(
+        {**appearance, "appearance": {"families": [family]}, "render": view, "fem": {"instrument": "none"}}
+    )
     scene = at_rest(job, index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
