@@ -122,11 +122,12 @@ def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
 
 def _read_forces(path: Path, notes: list[str]) -> tuple[Floats, Floats]:
     """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
-    names = [_columns(path, _FORCE.format(axis)) for axis in "xyz"]
+    header = csv_table.read_header(path)
+    names = [_columns(header, _FORCE.format(axis)) for axis in "xyz"]
     if any(len(one) != 1 for one in names):
         why = "several columns of force" if all(names) else "no columns of force"
-        raise UserError(f"{path}: {why}; the header has {', '.join(csv_table.read_header(path))}")
-    time = _seconds(path, notes)
+        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
+    time = _seconds(path, header, notes)
     force = np.column_stack(list(csv_table.read_csv(path, [name for (name,) in names]).values()))
     filled = np.isfinite(time) & np.isfinite(force).any(axis=1)
     if not filled.all():
@@ -136,8 +137,9 @@ def _read_forces(path: Path, notes: list[str]) -> tuple[Floats, Floats]:
 
 def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:
     """Times (T,) s of the pictures with these numbers: by the table's column `frame`, else in its order."""
-    time = _seconds(path, notes)
-    if _columns(path, "frame"):
+    header = csv_table.read_header(path)
+    time = _seconds(path, header, notes)
+    if _columns(header, "frame"):
         by_number = dict(zip(csv_table.read_csv(path, ("frame",))["frame"].tolist(), time, strict=True))
         if by_number.keys() >= set(numbers):
             return np.array([by_number[number] for number in numbers])
@@ -147,13 +149,13 @@ def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:
     return time
 
 
-def _seconds(path: Path, notes: list[str]) -> Floats:
+def _seconds(path: Path, header: list[str], notes: list[str]) -> Floats:
     """Times of a table's rows, (N,) s: the header's stamps if there are any, else the column of times."""
-    stamps, times = _columns(path, _STAMP), _columns(path, _TIME)
+    stamps, times = _columns(header, _STAMP), _columns(header, _TIME)
     if len(stamps) > 1 or not stamps + times:
         why = "several stamps" if stamps else "no column of times"
-        raise UserError(f"{path}: {why}; the header has {', '.join(csv_table.read_header(path))}")
-    found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(path, _NANOSECONDS))])
+        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
+    found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(header, _NANOSECONDS))])
     name = stamps[0] if stamps and (not times or np.nanmax(found[stamps[0]]) > 0) else times[0]
     if stamps and times:
         notes.append(f"{path}: times are those of {name}, not {times[0] if name in stamps else stamps[0]}")
@@ -166,8 +168,8 @@ def _seconds(path: Path, notes: list[str]) -> Floats:
     return np.asarray(values * next((u for u in units if least < largest * u < most), units[0]), np.float64)
 
 
-def _columns(path: Path, pattern: str) -> list[str]:
-    return [name for name in csv_table.read_header(path) if re.fullmatch(pattern, _plain(name))]
+def _columns(header: list[str], pattern: str) -> list[str]:
+    return [name for name in header if re.fullmatch(pattern, _plain(name))]
 
 
 def _plain(name: str) -> str:

@@ -131,16 +131,21 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     ):
         notes.append(f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}")
     if calibration is not None:
-        if found.second is None:
-            raise UserError("--use calibration=...: requires right=... or --stereo-layout")
-        height, width = next(found.pictures()).shape[:2]
-        rig = read_rig(Path(calibration), (width, height))
-        pair = {"K1": rig.left.K, "D1": rig.left.distortion, "K2": rig.right.K, "D2": rig.right.distortion}
-        pair |= {"R": rig.rotation, "T": rig.translation[:, None]}
-        found = replace(found, second=replace(found.second, pair=pair))
+        found = _calibrated(found, Path(calibration))
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
+
+
+def _calibrated(found: Intake, file: Path) -> Intake:
+    """The source with the calibration of its two cameras. UserError: there is one, or the file is of none."""
+    if found.second is None:
+        raise UserError("--use calibration=...: requires right=... or --stereo-layout")
+    height, width = next(found.pictures()).shape[:2]
+    rig = read_rig(file, (width, height))
+    pair = {"K1": rig.left.K, "D1": rig.left.distortion, "K2": rig.right.K, "D2": rig.right.distortion}
+    pair |= {"R": rig.rotation, "T": rig.translation[:, None]}
+    return replace(found, second=replace(found.second, pair=pair))
 
 
 def _split(found: Intake, layout: str) -> Intake:

@@ -74,14 +74,7 @@ def score(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(Path(recording))
-    if train is not None and (isinstance(model, Predictor) or (model is None and methods)):
-        raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
-    if taken := {FUSION, *([MAIN] if model is not None or not methods else [])} & set(methods or {}):
-        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
-    if model is None and not methods:
-        model = choose_model(recording.has_stereo)
-    elif isinstance(model, (str, Path)):
-        model = find_model(model)
+    model = _choose_model(model, methods or {}, train, recording.has_stereo)
     frames = len(recording.numbers()) or None
     bar: AbstractContextManager[Progress]
     bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
@@ -102,6 +95,19 @@ def score(
         if out is not None:
             write_result(result, Path(out), title)
     return result
+
+
+def _choose_model(
+    model: str | Path | Predictor | None, own: Mapping[str, Method], train: str | Path | None, stereo: bool
+) -> Path | Predictor | None:
+    """The model to score, None: only own methods. UserError if the arguments don't fit each other."""
+    if train is not None and (isinstance(model, Predictor) or (model is None and own)):
+        raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
+    if taken := {FUSION, *([MAIN] if model is not None or not own else [])} & set(own):
+        raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
+    if model is None and not own:
+        return choose_model(stereo)
+    return find_model(model) if isinstance(model, (str, Path)) else model
 
 
 def _choose_methods(

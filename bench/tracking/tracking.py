@@ -22,7 +22,7 @@ from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
-from synth.recording_flow.passes import passes
+from synth.recording_flow.passes import VideoPass, passes
 from synth.recording_flow.pulse import SurfaceMotion
 from synth.system.stopwatch import Stopwatch
 
@@ -116,11 +116,26 @@ def track_recording(
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
     forces.finish(recording)  # of the last pass
-    out, decoder = forces.out, video.decoder
+    out = forces.out
     out.stereo, out.turning = pictures.quality, turning if turning.time_s else None
+    out.scale_mm_per_px = scale_mm_per_px
+    _describe(out, video, recording, methods, pictured)
+    out.timings |= watch.report()  # of all passes
+    return out
+
+
+def _describe(
+    out: TrackedRecording,
+    video: VideoPass,
+    recording: Recording,
+    methods: Mapping[str, Method],
+    pictured: str,
+) -> None:
+    """Adds summary, findings and notes after the last frame."""
+    decoder = video.decoder
     out.summary, out.size, out.notes = video.summary, video.rest.size, video.notes
     out.findings, out.decoded, out.rest_s = [*video.findings], decoder.decoded, video.rest.time_s
-    out.scale_mm_per_px, out.repeats = scale_mm_per_px, decoder.faults.repeats()
+    out.repeats, mm_per_px = decoder.faults.repeats(), out.scale_mm_per_px * video.rest.shrink
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
     for name, method in methods.items():
@@ -138,8 +153,6 @@ def track_recording(
             {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}
             for rhythm, size in zip(removed.rhythms, removed.amplitudes_px, strict=True)
         ]
-    out.timings |= watch.report()  # of all passes
-    return out
 
 
 class _Forces:

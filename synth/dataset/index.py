@@ -116,7 +116,11 @@ def read_index(root: Path) -> pa.Table:
         names = [name for name in SCHEMA.names if name != "instrument" or name in file.metadata.schema.names]
         if file.metadata.num_rows > _MOST_ROWS or file.metadata.schema.names != names:
             raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
-        table = pa.Table.from_pylist(file.read(use_threads=False).to_pylist(), SCHEMA)
+        table = file.read(use_threads=False)
+        for place, field in enumerate(SCHEMA):
+            if field.name not in names:
+                table = table.add_column(place, field, pa.nulls(table.num_rows, field.type))
+        table = table.cast(SCHEMA)
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         raise UserError(f"{path}: is damaged ({first_line(error)}){_REMEDY}") from error

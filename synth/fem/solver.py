@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -66,14 +67,11 @@ def deform(
     if pulse is not None:
         height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
         loads += height[:, None, None] * raising
-    try:
+    with _naming(gestures, tissue.young_kpa):
         if fem.time == "dynamic" or fem.relaxation:
             path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
         else:
             path = solve_path(system, loads, load_parameter)
-    except UserError as error:
-        each = (f"{one.kind} {one.force_mn:.3g} mN, radius {one.footprint_mm:.3g} mm" for one in gestures)
-        raise type(error)(f"{error}: {', '.join(each)}, E {tissue.young_kpa:.3g} kPa") from None
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))
@@ -88,6 +86,16 @@ def deform(
         tool_work=work - pulse_work,
         pulse_work=pulse_work,
     )
+
+
+@contextmanager
+def _naming(gestures: Sequence[Gesture], young_kpa: float) -> Iterator[None]:
+    """Adds force, radius and stiffness to an error of the block, whose numbers are per stiffness."""
+    try:
+        yield
+    except UserError as error:
+        each = (f"{one.kind} {one.force_mn:.3g} mN, radius {one.footprint_mm:.3g} mm" for one in gestures)
+        raise type(error)(f"{error}: {', '.join(each)}, E {young_kpa:.3g} kPa") from None
 
 
 def clock(fem: schema.FemSection, fps: float, tets: Tets) -> Clock:

@@ -123,6 +123,6 @@ def _simulate(job: Job, index: int, count: int, watch: Stopwatch) -> Scene:
     motions = [ToolMotion(move.load[frames], move.away[frames], move.shift[frames]) for move in moves]
     short = job.model_copy(update={"frames": len(frames)})
     try:
-        return simulate(short, index, watch=watch, motions=motions)
+        return simulate(short, index, watch=watch, case=case, motions=motions)
     except UserError as error:
         raise UserError(f"sequence {index}, of which frames {frames.tolist()} were tried: {error}") from None

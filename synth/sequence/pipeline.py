@@ -26,7 +26,7 @@ from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
-from synth.sequence.scene import Scene
+from synth.sequence.scene import Frame, Scene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -112,6 +112,13 @@ def _refuse_unseen(scene: Scene) -> None:
         )
 
 
+def _refuse_blank(rest: Frame, tissue: Mask) -> None:
+    """Raises UserError if the rest frame's tissue (H, W) is black or burnt out."""
+    free = tissue & ~rest.tool
+    if blank_share(rest.rgb[free] if free.any() else rest.rgb) > MOST_BLANK:
+        raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
+
+
 def _render_frames(task: _Task) -> list[_Video]:
     """Renders every frame and writes its fields, except videos that a codec follows; a video per camera."""
     scene, writer, job = task.scene, task.writer, task.scene.job
@@ -131,9 +138,8 @@ def _render_frames(task: _Task) -> list[_Video]:
         task.report("render", t, job.frames)
         with task.watch.stage("render"):
             frame = scene.frame(t)
-        free = scene.tissue & ~frame.tool
-        if t == 0 and blank_share(frame.rgb[free] if free.any() else frame.rgb) > MOST_BLANK:
-            raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
+        if t == 0:
+            _refuse_blank(frame, scene.tissue)
         with task.watch.stage("store"):
             made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
             for name in names:

@@ -44,7 +44,7 @@ _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of t
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
-_FRAMES = Job().frames  # of a sequence, where no job states them
+_FRAMES: int = Job.model_fields["frames"].default  # of a sequence, where no job states them
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
@@ -154,6 +154,7 @@ def draw_gestures(
     count = max(int(others.integers(fewest, most + 1)), len(given))
     wanted = [*given, *[InstrumentSection()] * (count - len(given))]
     order = sorted(range(count), key=lambda k: wanted[k].place is None)
+    sight, least = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
     for _ in range(_ROUNDS):  # all anew: the shaft of one may be in the way of the next
         found: dict[int, Gesture] = {}
         for k in order:
@@ -163,8 +164,7 @@ def draw_gestures(
                 longest = np.linalg.norm(trial.axes, axis=1).max()
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
-                sight = lens / np.linalg.norm(lens)
-                hides = trial.shaft @ sight > np.cos(np.radians(_END_ON_DEG)) and trial.instrument != "none"
+                hides = trial.shaft @ sight > least and trial.instrument != "none"
                 if fits and not hides and all(_apart(trial, other) for other in found.values()):
                     found[k] = trial
                     break
@@ -196,9 +196,9 @@ def draw_gesture(
     wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
     drawn, wanted, own = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
-    kinds = list(fem.choices(given))
-    kind = drawn if drawn in kinds else kinds[int(own.integers(len(kinds)))]
-    tools = fem.choices(given)[kind]
+    choices = fem.choices(given)
+    kind = drawn if drawn in choices else list(choices)[int(own.integers(len(choices)))]
+    tools = choices[kind]
     tool = str(own.choice(list(tools), p=list(tools.values())))
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1

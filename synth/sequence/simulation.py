@@ -56,8 +56,9 @@ def simulate(
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
+    case = case or draw_scenario(job, index)
     if mechanics is None and not len(motions):
-        refuse_untouched(job, case or draw_scenario(job, index))
+        refuse_untouched(job, case)
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     with watch.stage("mesh"):

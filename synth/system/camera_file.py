@@ -10,6 +10,7 @@ import configparser
 import json
 import re
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -158,7 +159,11 @@ class _Values(NamedTuple):
 def _load(path: Path) -> tuple[_Values, _Values, bool]:
     """The values of the left and of the right camera, each with those of none, and whether there is a right
     one. UserError for a camera that is described twice, as in two resolutions."""
-    text = checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip()
+    return _parsed(path, checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip())
+
+
+@lru_cache(maxsize=4)  # every sequence of a job reads its calibration several times
+def _parsed(path: Path, text: str) -> tuple[_Values, _Values, bool]:
     found: Any = None
     with as_user_error(f"{path}: is no calibration in XML, JSON or INI"):
         if text.startswith("<"):

@@ -52,7 +52,7 @@ class Scalar:
     def __init__(self, camera: Camera, spp: int) -> None:
         self._fine = 2 if spp >= 4 else 1
         self.spp = max(1, spp // self._fine**2)
-        self._fitted: list[float] = []  # intrinsics that the film was fitted to
+        self._fitted: list[float] = []  # intrinsics at the last fit
         self.place(camera)
 
     def _fit(self, camera: Camera) -> None:
@@ -159,13 +159,14 @@ def _register(variant: str) -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.aperture = float(props["aperture"])
+            self.aperture, self.fitted = float(props["aperture"]), list[float]()
             size = self.film().size()
             self.width, self.height = int(size[0]), int(size[1])
 
         def place(self, camera: Camera) -> None:
             """Sets pose and intrinsics."""
-            self.rounds = _rounds(camera)
+            if (lens := [*camera.K.ravel(), *camera.distortion]) != self.fitted:  # not for every frame
+                self.rounds, self.fitted = _rounds(camera), lens
 
             # As data: a literal in the code would compile it anew for every scene.
             def data(values: Any) -> list[Any]:
