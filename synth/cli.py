@@ -91,12 +91,20 @@ def _refuse_to_replace(out: Path) -> None:
 
 
 @app.command(epilog="Example: synth new job.yaml")
-def new(path: Annotated[Path, Argument(help="The job file to write.")] = Path("job.yaml")) -> None:
-    """Writes a job file in which every key is explained."""
+def new(
+    path: Annotated[Path, Argument(help="The job file to write.")] = Path("job.yaml"),
+    series: Annotated[
+        Path | None,
+        Option("--from-series", help="Files of another program's simulation: see mechanics.source."),
+    ] = None,
+) -> None:
+    """Writes a job file in which every key is explained, or one for another program's simulation."""
     from synth.job import writer
+    from synth.publish import series_job
 
+    text = writer.commented() if series is None else series_job.as_job(series)
     with as_user_error(f"{path}: cannot be written"), path.open("x", encoding="utf-8") as file:
-        file.write(writer.commented())
+        file.write(text)
     print(f"wrote {path}; render it with: synth render {path} -o out")
 
 
@@ -125,6 +133,7 @@ def preview(
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
     from synth.dataset.size_forecast import amount, estimate
+    from synth.fem.external.read import read_job_series
     from synth.job import reader
     from synth.publish import contact_sheet, openings
     from synth.system.checked_file import write_picture
@@ -142,6 +151,8 @@ def preview(
         print(json_.dumps({"sheet": str(out), "openings": places}) if json else text)
         return
     read = reader.load_job(job, overrides or [])
+    if read.mechanics.source is not None and not json:
+        print(read_job_series(read, 0).summary)
     with counting("Compiling the first time, measuring the cost of a sequence, then drawing") as progress:
         picture, spent_s = contact_sheet.draw_sheet(read, count, progress)
     write_picture(out, picture)
@@ -268,7 +279,7 @@ def export(
     out: Out,
     target: Annotated[Path, Argument(help="The new folder.")],
     to: Annotated[
-        str, Option(help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz or video.")
+        str, Option(help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz, vtu or video.")
     ] = "folder",
     overlay: Annotated[
         list[str] | None, Option(help="Of a video: flow, recovered, force, none. [default: flow and force]")
@@ -280,7 +291,7 @@ def export(
 
     options = {}
     if to == "video":
-        drawn = [name for name in overlay or ("flow", "force") if name != "none"]
+        drawn = overlay and [name for name in overlay if name != "none"]
         options = {"overlays": drawn, "interval_s": _interval(interval)}
     elif overlay or interval:
         raise UserError("--overlay and --interval need --to video")

@@ -7,7 +7,7 @@ from typing import Literal
 
 TIME, ROW, COLUMN, INSTRUMENT = "frame", "row", "column", "instrument"
 MOST_INSTRUMENTS = 3  # at once
-Stored = Literal["always", "usually", "several", "recovered", "stereo", "stereo recovered", "extra"]
+Stored = Literal["always", "loaded", "usually", "several", "recovered", "stereo", "stereo recovered", "extra"]
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Field:
 
 STORED_WHEN = {
     "always": "always",
+    "loaded": "unless `mechanics.source` has no force",
     "usually": "unless in `store.without`",
     "several": "if the job has several instruments",
     "recovered": "with a flow estimator",
@@ -69,11 +70,11 @@ _TABLE = (
           "distance along the optical axis; 0 where nothing is hit", stored="usually", packed=0.44, low=0.0),
     Field("traction", (*_VIDEO, "xyz"), "float32", "kPa",
           "load on the tissue per rest area, camera axes, on the rest frame's pixels",
-          length=3, packed=0.025, low=-1e4, high=1e4),
+          length=3, stored="loaded", packed=0.025, low=-1e4, high=1e4),
     Field("area", _STILL, "float32", "mm^2",
           "surface area at rest that each pixel of the rest frame covers", packed=0.26, low=0.0),
     Field("force", (TIME, "xyz"), "float64", "mN",
-          "total load on the tissue, camera axes", length=3, packed=3.5, low=-1e6, high=1e6),
+          "total load on the tissue, camera axes", length=3, stored="loaded", packed=3.5, low=-1e6, high=1e6),
     Field("force_of", (TIME, INSTRUMENT, "xyz"), "float64", "mN",
           "load of each instrument on the tissue, camera axes, 0 beyond their number; force is their sum",
           length=3, stored="several", packed=2.0, low=-1e6, high=1e6),

@@ -12,10 +12,9 @@ import numpy as np
 from PIL import Image
 
 from bench.importers.registry import STILLS, Intake, SecondView
-from bench.recording import csv_table
 from synth.arrays import Array, Floats
 from synth.errors import UserError
-from synth.system import checked_file
+from synth.system import checked_file, csv_table
 from synth.video import file_numbers
 from synth.video import read as video
 

@@ -23,11 +23,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from bench.recording import csv_table, meta
+from bench.recording import meta
 from bench.recording.meta import Meta
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
 from synth.job.types import Section
+from synth.system import csv_table
 from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles

@@ -61,6 +61,9 @@ def contact(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing
     if len(instruments) != 1:
         yield Nothing(f"{len(instruments) or 'no'} instruments")
         return
+    if "force" not in sequence or not sequence.attrs["scenario"]["gestures"]:
+        yield Nothing("another program's instrument")
+        return
     at_rest, tips = camera_of(sequence), np.asarray(instruments[0]["tip_mm"], np.float64)
     footprint = float(sequence.attrs["scenario"]["gestures"][0]["footprint_mm"])
     poses = camera_poses(sequence)

@@ -26,6 +26,8 @@ def rest(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     if "flow_recovered" in sequence:
         most = float(np.abs(sequence["flow_recovered"][0]).max())
         yield Measure(most, 0.02, "recovered flow in frame 0", "px")
+    if "force" not in sequence:
+        return
     force = np.linalg.norm(sequence["force"][:], axis=1)
     yield Measure(float(force[0]), 1e-6 * max(float(force.max()), 1e-9), "force in frame 0", "mN")
     least, most = (float(np.abs(sequence["traction"][t]).max()) for t in (0, int(np.argmax(force))))
@@ -36,6 +38,9 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """Traction times area, summed over the pixels, equals the force (relative); half of it, if a part of the
     contact is outside the view. The instruments' forces add up to it."""
     area, inside = sequence["area"][:], inner(sequence["tissue"][:], 2)
+    if "force" not in sequence:
+        yield Nothing("another program's motion without a force")
+        return
     applied = sequence["force"][:]
     shown = np.zeros_like(applied)
     whole = np.ones(len(applied), bool)
@@ -88,6 +93,14 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
             step = float(np.exp(np.abs(np.log(now / before)))) - 1
             changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / least
             yield Measure(step, _COMPLIANCE_STEP + changed + 2 * unsure, f"frame {t}")
+
+
+def work(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
+    """Another program's load does no negative work on its motion (share of the largest work)."""
+    done = np.asarray((sequence.attrs.get("mechanics") or {}).get("work_mn_mm", []), np.float64)
+    if done.size and np.abs(done).max() > 0:
+        worst = int(done.argmin())
+        yield Measure(max(-float(done[worst] / np.abs(done).max()), 0.0), 0.02, f"frame {worst}")
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

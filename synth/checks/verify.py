@@ -30,6 +30,7 @@ INVARIANTS: dict[str, Invariant] = {
         physics.rest,
         physics.force,
         physics.compliance,
+        physics.work,
         physics.visibility,
         physics.warp,
         physics.forward_backward,
@@ -53,6 +54,7 @@ MEANINGS = {
 _NOTHING = {
     "contact": "no whole contact in view",
     "compliance": "no load in two frames in turn",
+    "work": "the package's own finite elements",
     "warp": "no 200 visible pixels move by over 3 px",
 }
 """The reason for which a check has measured nothing in any frame; else no tissue is visible."""
@@ -177,14 +179,14 @@ def check_sequence(
 
     try:
         sequence = open_sequence(path, sealed=False)
-        force = np.linalg.norm(sequence["force"][:], axis=1)
+        size = np.linalg.norm(sequence["force"][:], axis=1) if "force" in sequence else np.zeros(1)
     except UserError as error:
         yield "readable", truth(False, without_path(error))
         return
     yield "dataset", truth(sequence.attrs.get("job") == job, "belongs to another job")
     # Frames are that of the largest load, and some spread over the sequence.
     spread = np.linspace(0, sequence.frames - 1, _FAST_FRAMES if fast else _FRAMES).round().astype(int)
-    frames, broken = sorted({int(np.argmax(force)), *spread.tolist()}), ""
+    frames, broken = sorted({int(np.argmax(size)), *spread.tolist()}), ""
     try:
         yield from contents.check_values(sequence, frames, fast, watch)
     except UserError as error:

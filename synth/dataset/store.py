@@ -93,7 +93,8 @@ class Writer:
             if written is None or written.filled != written.shape[0]:
                 raise ValueError(f"{name}: only {written.filled if written else 0} frames were written")
         hashes = {name: self._writers[name].hash.hexdigest() for name in FIELDS if name in self._writers}
-        summary: dict[str, Any] = {key: self._writers[name].largest for name, key in _PEAKS.items()}
+        peaks = {key: self._writers[name].largest for name, key in _PEAKS.items() if name in self._writers}
+        summary: dict[str, Any] = peaks
         if self._half:
             rounded = {name: one.rounding for name, one in self._writers.items() if FIELDS[name].half}
             summary["rounding_px"] = rounded

@@ -13,6 +13,7 @@ from synth.geometry.triangles import Shape
 
 _ROUNDING = 1e-6
 """Part of a quantity's largest value that passes for 0: other engines may compute in single precision."""
+_LOADS = "traction", "force", "by_instrument"
 _OPTIONAL = ("min_jacobian", "energy", "residual", "tool_work", "pulse_work")
 
 
@@ -27,7 +28,8 @@ class Deformation:
     displacement: Floats
     """(T, V, 3) mm from rest."""
     traction: Floats
-    """(T, V, 3) kPa on the tissue, on the surface at rest and linear on its faces."""
+    """(T, V, 3) kPa on the tissue, on the surface at rest and linear on its faces. It and all forces are NaN
+    where `mechanics.source` states none: sequences then have no label."""
     force: Floats
     """(T, 3) mN on the tissue: the sum of traction times the area of each vertex, a third of its faces'."""
     by_instrument: Floats
@@ -49,11 +51,13 @@ class Deformation:
     """(T,) mN mm, half of traction times the motion by the pulse alone."""
 
 
-def check_deformation(found: Deformation, surface: Shape, frames: int, instruments: int) -> None:
+def check_deformation(
+    found: Deformation, surface: Shape, frames: int, instruments: int, labelled: bool = True
+) -> None:
     """Raises UserError unless a result is one of that surface, over those frames, with those instruments.
 
     Arrays must have the type and shape of `Deformation` and finite values; frame 0 is at rest; traction times
-    area adds up to the force.
+    area adds up to the force. Without a label (`labelled`) loads may be NaN.
     """
     if not isinstance(found, Deformation):
         raise UserError(f"mechanics: expected a Deformation, got {type(found).__name__}")
@@ -68,7 +72,7 @@ def check_deformation(found: Deformation, surface: Shape, frames: int, instrumen
         if not isinstance(value, np.ndarray) or value.dtype != np.float64 or value.shape != shape:
             given = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
             raise UserError(f"mechanics: {name} must be float64 {shape}, not {given}")
-        if not np.isfinite(value).all():
+        if not np.isfinite(value).all() and (labelled or name not in _LOADS):
             raise UserError(f"mechanics: {name} has values that are not finite")
     for name in ("displacement", "traction", "force", "by_instrument"):
         size = np.abs(getattr(found, name))

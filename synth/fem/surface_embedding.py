@@ -63,24 +63,24 @@ def embed(tets: Tets, vertices: Floats) -> Embedding:
     owner, off = outer_faces(tets.cells)
     faces = FACES[off]
     nodes = tets.cells[owner[:, None], faces]
-    face, on_face = _nearest(np.ascontiguousarray(tets.points[nodes]), np.ascontiguousarray(vertices))
+    face, on_face = nearest(np.ascontiguousarray(tets.points[nodes]), np.ascontiguousarray(vertices))
     bary = np.zeros((len(vertices), 4))
     np.put_along_axis(bary, faces[face], on_face, axis=1)
-    value = _sparse(shape(bary), tets.cells[owner[face]], len(tets.points))
+    value = sparse_rows(shape(bary), tets.cells[owner[face]], len(tets.points))
     used = np.unique(face)
     corners, local = np.unique(nodes[used], return_inverse=True)
     local = local.reshape(-1, 3)
     mean, lumped = _averaging(tets.points[nodes[used]], local, len(corners))
     return Embedding(
         value,
-        _sparse(on_face, local[np.searchsorted(used, face)], len(corners)),
+        sparse_rows(on_face, local[np.searchsorted(used, face)], len(corners)),
         mean,
         _half_curl(tets, owner[used], faces[used], local, lumped),
         vertices - value @ tets.points,
     )
 
 
-def _sparse(values: Floats, columns: Ints, width: int) -> sp.csr_array:
+def sparse_rows(values: Floats, columns: Ints, width: int) -> sp.csr_array:
     """Rows (V, n) of values at columns, as (V, width)."""
     rows = np.repeat(np.arange(len(values)), values.shape[1])
     whole = sp.coo_array((values.ravel(), (rows, columns.ravel())), shape=(len(values), width)).tocsr()
@@ -133,7 +133,7 @@ def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
 
 
 @compiled
-def _nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
+def nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
     """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the nearest point."""
     count = len(corner)
     low, high = np.empty((count, 3)), np.empty((count, 3))

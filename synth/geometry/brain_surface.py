@@ -16,13 +16,14 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
+from synth.geometry.mesh_file import SUFFIXES, read_mesh
+from synth.geometry.skin import skin
 from synth.geometry.triangles import Shape, side_areas
-from synth.geometry.vtk import read_vtk, read_vtp
 from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
-_KINDS = ("obj", "stl", "ply", "off", "vtk", "vtp")  # suffixes of the files that can be read
+_KINDS = ("obj", "stl", "ply", "off", *SUFFIXES)  # suffixes of the files that can be read
 
 _BRAIN_MM = 20.0, 400.0  # greatest extent: of a small phantom, of more than a head
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
@@ -52,15 +53,25 @@ def load_brain(
     `craniotomy` and `attachments` are in the file's axes; `fill_holes` as in `read_brain`. UserError: the
     file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
     """
+    return place_brain(*read_brain(path, fill_holes), path.name, craniotomy, attachments)
+
+
+def place_brain(
+    vertices: Floats,
+    faces: Ints,
+    name: str,
+    craniotomy: CraniotomySection,
+    attachments: Sequence[AttachmentSection] = (),
+) -> Brain:
+    """Places a surface of vertices (V, 3) mm and faces (F, 3) as `load_brain`; `name` is used in messages."""
     assert craniotomy.point is not None  # the job requires both with a mesh
     assert craniotomy.direction is not None
-    vertices, faces = read_brain(path, fill_holes)
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)
     placed = (vertices - origin) @ turn.T
     heights = _heights(placed, faces)
     heights = heights[np.abs(heights) <= craniotomy.radius_mm]
-    _check_place(path, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
+    _check_place(name, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
     held = []
@@ -109,7 +120,7 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
     return vertices, faces
 
 
-def _check_place(path: Path, corners: Floats, point: Floats, out: Floats, radius_mm: float) -> None:
+def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_mm: float) -> None:
     """Raises UserError for an opening off the surface, in other axes, or that doesn't face outwards.
 
     `corners`: (F, 3, 3) of the faces; `radius_mm`: 0 if nothing is met along the direction.
@@ -131,8 +142,8 @@ def _check_place(path: Path, corners: Floats, point: Floats, out: Floats, radius
     if gap > radius_mm or gap > _CLICKED_MM + 3 * left:
         hint = f"{hint}{left:.2g} mm off (other axes?)" if left < max(1.0, gap) / 3 else ""
         raise UserError(
-            f"anatomy.craniotomy.point: {text(point)} is {gap:.2g} mm off the surface of {path.name}{hint}. "
-            f"The nearest point is {text(foot)}; `synth preview {path.name}` finds places"
+            f"anatomy.craniotomy.point: {text(point)} is {gap:.2g} mm off the surface of {name}{hint}. "
+            f"The nearest point is {text(foot)}; `synth preview {name}` finds places"
         )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     middle = corners.mean(axis=1)
@@ -141,7 +152,7 @@ def _check_place(path: Path, corners: Floats, point: Floats, out: Floats, radius
     if near.any() and out @ near < _STEEPEST * np.linalg.norm(near):
         where = "into the tissue" if out @ near < 0 else "along the surface"
         raise UserError(
-            f"anatomy.craniotomy.direction: {text(out)} points {where} of {path.name} at "
+            f"anatomy.craniotomy.direction: {text(out)} points {where} of {name} at "
             f"{text(point)}; outwards is {text(near / np.linalg.norm(near))} (are both in the same axes?)"
         )
 
@@ -175,11 +186,10 @@ def _read(path: Path) -> tuple[Floats, Ints]:
     stated = re.search(_STATED, data[:4096])
     space = stated[1].decode() if stated else ""
     try:
-        if kind == "vtk":
-            vertices, faces = read_vtk(data)
-        elif kind == "vtp":
-            vertices, faces, space = read_vtp(data)
-            if space and not re.fullmatch("[RL][AP][SI]", space := space.strip().upper()):
+        if kind in SUFFIXES:
+            file = read_mesh(data)
+            vertices, faces, space = file.points, skin(file.points, file.cells), file.space or space
+            if space and not re.fullmatch("[RL][AP][SI]", space):
                 raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
             # From bytes, trimesh can't open further files that are named in this one.

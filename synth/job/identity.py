@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from synth.job.schema import Job
+from synth.errors import UserError
+from synth.job.schema import Job, MechanicsSection
 from synth.system import camera_file, checked_file
 
 FILES: dict[tuple[str, str], int] = {
@@ -15,7 +16,9 @@ FILES: dict[tuple[str, str], int] = {
     ("appearance", "photo"): checked_file.LARGEST_PICTURE,
     ("render", "calibration"): camera_file.LARGEST_FILE,
 }
-"""Keys of a job that are paths, as (section, key), and the largest size of such a file in bytes."""
+"""Keys of a job that are files, as (section, key), and the largest size of such a file in bytes."""
+_LARGEST_STATE = 2 << 30
+_COLLECTIONS = (".pvd", ".series")
 
 
 def canonical(value: Any) -> bytes:
@@ -38,24 +41,50 @@ def identify_job(job: Job) -> str:
     del described["sequences"], described["card"]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
+    if job.mechanics.source is not None:
+        files = list_files(job.mechanics)
+        described["mechanics"]["source"] = [_digest_file(file, _LARGEST_STATE) for file in files]
     return digest(described)
 
 
-def identify_anatomy(job: Job, seed: int) -> str:
+def list_sources(mechanics: MechanicsSection) -> list[Path]:
+    """Sources of the sequences: folders that a pattern such as `runs/*/` names, or the source itself."""
+    source = mechanics.source
+    assert source is not None
+    folders = sorted(one for one in source.parent.glob(source.name) if one.is_dir())
+    return folders if "*" in source.name and folders else [source]
+
+
+def list_files(mechanics: MechanicsSection) -> list[Path]:
+    """Files that series and tables of all sequences may consist of. UserError: there are none."""
+    found = list[Path]()
+    for source in list_sources(mechanics):
+        folder = source if source.is_dir() else source.parent
+        whole = folder == source or source.suffix in _COLLECTIONS  # which name files in folders below
+        tables = [mechanics.force, mechanics.instruments]
+        named = [folder / one for one in tables if one is not None and one.lower().endswith(".csv")]
+        found += [*named, *sorted(folder.rglob("*") if whole else folder.glob(source.name))]
+    if not (files := [file for file in dict.fromkeys(found) if file.is_file()]):
+        raise UserError(f"mechanics.source: no file is named by {mechanics.source}")
+    return files
+
+
+def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:
     """Name of a sequence's geometry, equal in all datasets: a user's brain, or the seed of a procedural one.
 
-    A brain is one anatomy for all its craniotomies and for all vessels drawn on it.
+    A brain is one anatomy for all its craniotomies and for all vessels drawn on it. `at_rest`: coordinates of
+    the surface of `mechanics.source`.
     """
     mesh = _digest_file(job.anatomy.mesh, FILES["anatomy", "mesh"])
+    if at_rest is not None:
+        mesh = hashlib.blake2b(at_rest, digest_size=16).hexdigest()
     return f"seed-{seed}" if mesh is None else f"mesh-{mesh[:16]}"
 
 
-def identify_opening(job: Job, index: int) -> str | None:
-    """Name of the craniotomy of a user's brain, equal in all datasets; None for a procedural brain."""
-    where = job.anatomy.opened(index).craniotomy
-    if job.anatomy.mesh is None or where.point is None:
-        return None
-    return f"{identify_anatomy(job, 0)} at " + ", ".join(f"{value:g}" for value in where.point)
+def identify_opening(job: Job, index: int, anatomy: str) -> str:
+    """Name of the craniotomy of a user's brain with the name `anatomy`, equal in all datasets."""
+    point = job.anatomy.opened(index).craniotomy.point or ()
+    return f"{anatomy} at " + ", ".join(f"{value:g}" for value in point)
 
 
 def _digest_file(path: Path | None, largest: int) -> str | None:

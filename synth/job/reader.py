@@ -65,14 +65,15 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
 
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
     """Makes the paths in a job absolute; yields the errors of those that can't be used."""
-    for at, largest in identity.FILES.items():
+    for at, largest in [*identity.FILES.items(), (("mechanics", "source"), None)]:
         block = config.values.get(at[0])
         name = block.get(at[1]) if isinstance(block, dict) else None
         if not isinstance(name, str):
             continue
         try:
             path = ((Path.cwd() if at in config.changes else folder) / Path(name).expanduser()).resolve()
-            checked_file.check_file(path, largest)
+            if largest is not None:  # else a pattern, or a folder
+                checked_file.check_file(path, largest)
             config.values[at[0]][at[1]] = str(path)
         except UserError as error:
             yield Mistake(at, str(error))

@@ -99,6 +99,29 @@ class AnatomySection(Section):
         return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
 
 
+class MechanicsSection(Section):
+    """Motion and load of another program's files, instead of our finite elements'."""
+
+    source: Path | None = None
+    """Files of a deforming surface or volume: numbered .vtu, .vtk or .vtp as a pattern with *, a collection
+    of them (.pvd, .series), a folder with either or with a run of the published recorder, or an .npz;
+    relative to the job file. A pattern that ends in */ names folders, used by sequences in turn. Its surface
+    at rest takes the place of `anatomy.mesh`. Empty: our own finite elements."""
+    unit_mm: Positive | None = None
+    """Millimetres in the files' unit of length: 1000 for m."""
+    unit_mn: Positive | None = None
+    """Millinewtons in the files' unit of force: 1000 for N. Needed with `force`."""
+    dt_s: Positive | None = None
+    """Seconds from one state to the next, where the files carry no time."""
+    force: str | None = None
+    """Force on the surface from outside: nodal:NAME, a field of forces on nodes; traction:NAME, of forces per
+    area; or a table (.csv, in the files' folder) of time, fx, fy, fz and x, y, z of the contact at rest,
+    spread over `fem.footprint_mm`. Empty: it is not known, and sequences have no label."""
+    instruments: str | None = None
+    """Instruments to draw, of the kinds in `fem.instrument`: a table (.csv, in the files' folder) of time,
+    and x0, y0, z0 of the first one's tip and u0, v0, w0 from it to the hand. Empty: none is drawn."""
+
+
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 
@@ -157,6 +180,16 @@ class CardSection(Section):
     """Authors of the dataset."""
 
 
+_WITH_SERIES = {"young_kpa", "poisson", "footprint_mm", "instrument", "gestures"}
+"""Keys of `fem` that mean something where another program's files hold the motion."""
+
+
+def _changed(section: Section) -> set[str]:
+    """Keys of a section with other values than by default."""
+    fields = type(section).model_fields.items()
+    return {key for key, field in fields if getattr(section, key) != field.default}
+
+
 class Job(Section):
     """One dataset."""
 
@@ -169,6 +202,7 @@ class Job(Section):
     fps: Annotated[FiniteFloat, Field(gt=0, le=100_000)] = 25.0
     """Frames per second of the recorded video."""
     anatomy: AnatomySection = AnatomySection()
+    mechanics: MechanicsSection = MechanicsSection()
     appearance: AppearanceSection = AppearanceSection()
     light: LightSection = LightSection()
     sensor: SensorSection = SensorSection()
@@ -190,6 +224,27 @@ class Job(Section):
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
+        return self
+
+    @model_validator(mode="after")
+    def _mechanics_are_ours_or_not(self) -> Job:
+        if self.mechanics.source is None:
+            if used := _changed(self.mechanics):
+                raise ValueError(f"mechanics.{min(used)} needs mechanics.source")
+            return self
+        where = self.anatomy.craniotomy
+        if where.point is None or where.direction is None or self.anatomy.mesh is not None:
+            raise ValueError("mechanics.source needs craniotomy.point and direction, and no anatomy.mesh")
+        if self.mechanics.force is None and (labels := {"intensity", "flow_noisy"} & set(self.store.extra)):
+            raise ValueError(f"store.extra: {min(labels)} needs mechanics.force")
+        if unused := _changed(self.fem) - _WITH_SERIES:
+            raise ValueError(f"fem.{min(unused)} is not used: the files of mechanics.source hold the motion")
+        if self.mechanics.force is not None and self.fem.young_kpa[0] != self.fem.young_kpa[1]:
+            raise ValueError("mechanics.force needs one value of fem.young_kpa, that of the files' tissue")
+        return self
+
+    @model_validator(mode="after")
+    def _right_camera_exists(self) -> Job:
         right = [name for name in self.store.extra if name.endswith("_right")]
         if right and self.render.stereo_mm == 0:
             raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")
@@ -222,7 +277,8 @@ class Job(Section):
         """Names of the fields in its sequences, in the order of the field table."""
         recovered, stereo = self.flow.backend != "ideal", self.render.stereo_mm > 0
         several = max(self.fem.instruments[1], len(self.fem.instrument_list)) > 1
-        conditions = {"several": several, "recovered": recovered, "stereo": stereo}
+        loaded = self.mechanics.source is None or self.mechanics.force is not None
+        conditions = {"loaded": loaded, "several": several, "recovered": recovered, "stereo": stereo}
         kinds = {"always", "usually", *(kind for kind, holds in conditions.items() if holds)}
         kinds |= {"stereo recovered"} if stereo and recovered else set()
         found = [one for one in FIELDS.values() if one.stored in kinds or one.name in self.store.extra]

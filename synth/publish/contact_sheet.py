@@ -37,8 +37,9 @@ def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dic
     """The picture (H, W, 3) of `count` scenarios spread over the job, and the job's CPU time by stage [s].
 
     Each is drawn just before its load: nothing is deformed, the sheet shows anatomy, appearance, light, view
-    and instrument. Wide pictures are drawn smaller, with fewer vertices. The cost is estimated from three
-    frames of one sequence in that size, and from its deformation alone. UserError: an impossible job.
+    and instrument; those of `mechanics.source` are drawn under their largest load. Wide pictures are drawn
+    smaller, with fewer vertices. The cost is estimated from three frames of one sequence in that size, and
+    from its deformation alone. UserError: an impossible job.
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
     width, height = job.render.size
@@ -57,14 +58,17 @@ def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dic
 def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     """A scenario's picture, (H, W, 3); for a stereo job those of the left and right camera side by side."""
     scene = at_rest(job, index)
+    if scene.series is None:
+        ready = [poised(gesture, scene.surface) for gesture in scene.scenario.gestures]
+        tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
+        state = SceneState(scene.surface.vertices, tips, shafts)
+    else:
+        deformed = simulate(job, index)
+        state = replace(deformed.state(deformed.strongest), camera=None)
     scene = replace(scene, view=resized(scene.view, size))
-    gestures = scene.scenario.gestures
-    ready = [poised(gesture, scene.surface) for gesture in gestures]
-    tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
-    state = SceneState(scene.surface.vertices, tips, shafts)
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
-    acting = " + ".join(f"{one.instrument} {one.kind}" for one in gestures)
+    acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments)
     return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
 
 
@@ -113,6 +117,8 @@ def _measure_cost(job: Job, index: int, size: tuple[int, int]) -> dict[str, floa
 def _simulate(job: Job, index: int, count: int, watch: Stopwatch) -> Scene:
     """`count` frames of the sequence, with the instruments' motion in the job's own frames: rest, largest
     load, last, and others between. UserError with the numbers of those frames."""
+    if job.mechanics.source is not None:
+        return simulate(job.model_copy(update={"frames": min(count, job.frames)}), index, watch=watch)
     case = scenario.draw_scenario(job, index)
     refuse_untouched(job, case)
     moves = [tool_gesture.trajectory(gesture, job.frames) for gesture in case.gestures]

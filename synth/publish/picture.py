@@ -98,29 +98,32 @@ def side_by_side(sequence: Sequence_, t: int) -> Rgb:
 def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     """Picture (h, w, 3) of some frames of a sequence on common scales, a row each.
 
-    A row is the frame, its flow from the rest frame, and the traction, both on the rest frame. UserError if a
-    frame is not in the sequence.
+    A row is the frame, its flow from the rest frame, and the traction if it is known, both on the rest frame.
+    UserError if a frame is not in the sequence.
     """
     for t in frames:
         if not 0 <= t < sequence.frames:
             raise UserError(f"frame {t}: the sequence has frames 0 to {sequence.frames - 1}")
     flows = [sequence["flow"][t] for t in frames]
-    loads = [np.linalg.norm(sequence["traction"][t], axis=-1) for t in frames]
+    known = "force" in sequence
+    loads = [np.linalg.norm(sequence["traction"][t], axis=-1) if known else np.zeros(1) for t in frames]
     largest_px = max(float(np.linalg.norm(flow, axis=-1).max()) for flow in flows)
     largest_kpa = max(float(load.max()) for load in loads)
-    force, time, tissue = sequence["force"][...], sequence["time"][...], sequence["tissue"][...]
+    time, tissue = sequence["time"][...], sequence["tissue"][...]
     grey = in_grey(sequence["rgb"][0])
     gain, rows = arrow_gain(sequence.size[1], largest_px), []
     for t, flow, load in zip(frames, flows, loads, strict=True):
         moved = arrows(overlay(grey, flow_colours(flow, largest_px), 0.65 * tissue), flow, tissue, gain)
-        weight = tissue * np.clip(0.15 + load / max(largest_kpa, 1e-12), 0, 0.9)
-        loaded = overlay((0.6 * grey).astype(np.uint8), heat(load, largest_kpa), weight)
-        most_px, total_mn = np.linalg.norm(flow, axis=-1).max(), np.linalg.norm(force[t])
+        most_px = np.linalg.norm(flow, axis=-1).max()
         panels = {
             f"frame {t}, {time[t]:.2f} s": sequence["rgb"][t],
             f"flow, {most_px:.1f} px at most (arrows x{gain})": moved,
-            f"traction, {total_mn:.1f} mN in total (yellow: {largest_kpa:.2g} kPa)": loaded,
         }
+        if known:
+            weight = tissue * np.clip(0.15 + load / max(largest_kpa, 1e-12), 0, 0.9)
+            loaded = overlay((0.6 * grey).astype(np.uint8), heat(load, largest_kpa), weight)
+            total_mn = np.linalg.norm(sequence["force"][t])
+            panels[f"traction, {total_mn:.1f} mN in total (yellow: {largest_kpa:.2g} kPa)"] = loaded
         rows.append(np.hstack([framed(panel, text) for text, panel in panels.items()]))
     return np.vstack(rows)[:, _GAP_PX:]
 
@@ -131,8 +134,10 @@ def in_grey(picture: Rgb) -> Rgb:
 
 
 def strongest(sequence: Sequence_) -> int:
-    """The frame with the largest force."""
-    return int(np.linalg.norm(sequence["force"][...], axis=-1).argmax())
+    """The frame with the largest force, or flow where no force is known."""
+    if "force" in sequence:
+        return int(np.linalg.norm(sequence["force"][...], axis=-1).argmax())
+    return int(np.argmax([np.abs(sequence["flow"][t]).max() for t in range(sequence.frames)]))
 
 
 def framed(panel: Rgb, text: str) -> Rgb:

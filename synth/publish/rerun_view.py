@@ -70,15 +70,17 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
 
     try:
         attrs, left = sequence.attrs, optics.camera_of(sequence)
-        longest, strongest = (float(attrs["summary"][name]) for name in ("peak_flow_px", "peak_traction_kpa"))
+        longest, strongest = attrs["summary"]["peak_flow_px"], attrs["summary"].get("peak_traction_kpa")
+        young = "unknown" if attrs["young_kpa"] is None else f"{attrs['young_kpa']:.3g} kPa"
+        bright = "" if strongest is None else f"\n\ntraction: brightest is {strongest:.3g} kPa\n"
         about = (
             f"# Sequence {sequence.index}\n\n{name_gestures(attrs.get('scenario') or {})}, "
-            f"E = {attrs['young_kpa']:.3g} kPa, {attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is "
-            f"direction; full colour is {longest:.3g} px\n\ntraction: brightest is {strongest:.3g} kPa\n"
+            f"E = {young}, {attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is direction; full colour is "
+            f"{longest:.3g} px{bright}"
         )
     except (KeyError, TypeError) as error:
         raise UserError(f"{sequence.path}: has no attribute {error}, which the viewer needs") from error
-    force, time, tissue = sequence["force"][:], sequence["time"][:], sequence["tissue"][:]
+    time, tissue = sequence["time"][:], sequence["tissue"][:]
     grey = picture.in_grey(sequence["rgb"][0])
     stream.log("/", rerun.ViewCoordinates.RDF, static=True)
     stream.log("camera", rerun.Pinhole(image_from_camera=left.K, resolution=left.size), static=True)
@@ -102,6 +104,7 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         for name in {"flow", "flow_recovered"} & set(sequence.fields):
             colours = picture.flow_colours(sequence[name][t], longest)
             image(name, picture.overlay(grey, colours, 0.65 * tissue))
-        load = np.linalg.norm(sequence["traction"][t], axis=-1)
-        image("traction", picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue))
-        stream.log("force", rerun.Scalars([*force[t], float(np.linalg.norm(force[t]))]))
+        if strongest is not None:
+            load, force = np.linalg.norm(sequence["traction"][t], axis=-1), sequence["force"][t]
+            image("traction", picture.overlay(grey, picture.heat(load, strongest), 0.8 * tissue))
+            stream.log("force", rerun.Scalars([*force, float(np.linalg.norm(force))]))

@@ -48,13 +48,17 @@ def write_preview(root: Path) -> None:
 def write_videos(
     dataset: Dataset,
     target: Path,
-    overlays: Several[str] = ("flow", "force"),
+    overlays: Several[str] | None = None,
     interval_s: tuple[float, float] | None = None,
 ) -> None:
     """Writes `NNNNNN.mp4` per sequence, with some of `OVERLAYS`; `interval_s`: first and last time [s].
 
+    `overlays`: flow, and force where it is known, if None.
+
     Raises UserError for an unknown overlay, no frame in the interval, or a sequence without the field.
     """
+    if overlays is None:
+        overlays = ["flow", "force"] if "force" in dataset[0] else ["flow"]
     unknown = [name for name in overlays if name not in OVERLAYS]
     if unknown:
         raise UserError(f"{unknown[0]}: is not one of {', '.join(OVERLAYS)}")
@@ -71,7 +75,7 @@ def draw_video(
     for name in overlays:
         if OVERLAYS[name] not in sequence:
             raise UserError(f"{sequence.path}: holds no {OVERLAYS[name]}")
-    time, force = sequence["time"][:], np.linalg.norm(sequence["force"][:], axis=1)
+    time = sequence["time"][:]
     first, last = interval_s or (-np.inf, np.inf)
     chosen = np.flatnonzero((time >= first) & (time <= last)).tolist()
     if not chosen:
@@ -84,7 +88,9 @@ def draw_video(
     for k, t in enumerate(chosen):
         picture = _overlaid(sequence, t, tissue, largest) if overlays else sequence["rgb"][t]
         if "force" in overlays:
-            curve = draw_curve(time[chosen], force[chosen], picture.shape[1]) if curve is None else curve
+            if curve is None:
+                force = np.linalg.norm(sequence["force"][:], axis=1)
+                curve = draw_curve(time[chosen], force[chosen], picture.shape[1])
             picture = np.vstack([picture, mark(curve, k, len(chosen))])
         yield picture
 

@@ -140,6 +140,8 @@ def _render_frames(task: _Task) -> list[_Video]:
             frame = scene.frame(t)
         if t == 0:
             _refuse_blank(frame, scene.tissue)
+        elif not frame.visible[scene.tissue].any():
+            raise UserError(f"frame {t}: none of the tissue is visible any more; widen render.field_mm")
         with task.watch.stage("store"):
             made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
             for name in names:
@@ -219,17 +221,19 @@ def _seal(task: _Task) -> Path:
     scene = task.scene
     case, view = scene.scenario, scene.view
     extra: dict[str, Any] = {}
+    series = None if scene.series is None else scene.series.points.tobytes()
+    anatomy = identity.identify_anatomy(scene.job, case.relief.seed, series)
     if scene.brain is not None:
-        extra["opening_id"] = identity.identify_opening(scene.job, case.index)
+        extra["opening_id"] = identity.identify_opening(scene.job, case.index, anatomy)
         extra["mesh_to_world"] = scene.brain.to_world.tolist()
     if (right := scene.renderer.right) is not None:
         extra["right"] = {"baseline_mm": scene.job.render.stereo_mm, **_lens(right)}
     return task.writer.seal(
         scenario=case.as_dict(),
-        anatomy_id=identity.identify_anatomy(scene.job, case.relief.seed),
+        anatomy_id=anatomy,
         **_lens(view),
         scale_mm_per_px=scene.scale_mm_per_px,
-        young_kpa=case.tissue.young_kpa,
+        young_kpa=scene.young_kpa,
         poisson=case.tissue.poisson,
         mechanics=_mechanics(scene),
         variant=scene.renderer.variant,
@@ -241,6 +245,7 @@ def _seal(task: _Task) -> Path:
 def _mechanics(scene: Scene) -> dict[str, Any]:
     """The attribute `mechanics` of a sequence; what its mechanics did not compute is absent."""
     case, motion, fem = scene.scenario, scene.motion, scene.job.fem
+    forces, known = motion.by_instrument, "force" in scene.job.stored_fields
     timeless = fem.time == "quasi-static" and not fem.relaxation
     law_from = LAWS.source(case.tissue.law)
     series = {"min_jacobian": motion.min_jacobian, "energy_mn_mm": motion.energy, "residual": motion.residual}
@@ -248,21 +253,23 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
         series["pulse_mm"] = case.pulse.height(scene.time)
         if timeless:
             series |= {"tool_work_mn_mm": motion.tool_work, "pulse_work_mn_mm": motion.pulse_work}
+    if scene.series is not None:
+        series["work_mn_mm"] = motion.tool_work
     return {
         "law": case.tissue.law,
         **({"law_from": law_from} if law_from else {}),
         # Whether the work of the instruments equals the stored energy.
-        "elastic": timeless and case.pulse is None,
+        "elastic": timeless and case.pulse is None and scene.series is None,
         **{name: values.tolist() for name, values in series.items() if values is not None},
         "instruments": [
             {
-                "kind": gesture.kind,
-                "instrument": gesture.instrument,
-                "force_mn": (motion.by_instrument[:, k] @ scene.view.rotation.T).tolist(),
+                "kind": kind,
+                "instrument": instrument,
+                **({"force_mn": (forces[:, k] @ scene.view.rotation.T).tolist()} if known else {}),
                 "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
                 "shaft": motion.shaft[:, 2 * k].tolist(),
             }
-            for k, gesture in enumerate(case.gestures)
+            for k, (kind, instrument, _) in enumerate(scene.instruments)
         ],
     }
 

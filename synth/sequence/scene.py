@@ -12,13 +12,15 @@ from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError, as_user_error
 from synth.fem.deformation import Deformation
+from synth.fem.external.read import read_job_series
+from synth.fem.external.series import MeshSeries
 from synth.fem.surface_embedding import vertex_area
 from synth.flow import track
 from synth.flow.estimator import Estimator
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.rig import Rectified
 from synth.flow.track import Track
-from synth.geometry.brain_surface import Brain, load_brain
+from synth.geometry.brain_surface import Brain, load_brain, place_brain
 from synth.geometry.triangles import Shape
 from synth.job.schema import AnatomySection, Job, RenderSection
 from synth.render.anatomy import surface as anatomy
@@ -28,7 +30,7 @@ from synth.render.camera.calibration import rendered, scaled
 from synth.render.camera.camera import Camera
 from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
-from synth.render.scene import RenderedFrame, Renderer
+from synth.render.scene import RenderedFrame, Renderer, SceneState
 from synth.sequence import scenario
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
@@ -47,9 +49,9 @@ class Frame(RenderedFrame):
     """Number of the frame; 0 is the rest frame."""
     time_s: float
     traction: Map
-    """(H, W, 3) kPa on the tissue, camera axes, at the rest frame's pixels: the label."""
+    """(H, W, 3) kPa on the tissue, camera axes, at the rest frame's pixels: the label. NaN: not known."""
     force: Floats
-    """(3,) mN on the tissue, camera axes: the sum of traction times `Scene.area`."""
+    """(3,) mN on the tissue, camera axes: the sum of traction times `Scene.area`. NaN: not known."""
     camera: Camera
     """The microscope at that time."""
 
@@ -71,6 +73,8 @@ class RestScene:
     """The user's brain that the surface is part of, if any, with its transform to world axes."""
     content: Callable[[RestScene], SceneContent]
     """What is drawn of it: `draw_craniotomy`, or content of your own around the same surface."""
+    series: MeshSeries | None
+    """Motion and load by another program, of `mechanics.source`."""
 
     @property
     def shape(self) -> Shape:
@@ -81,6 +85,14 @@ class RestScene:
     def vertex_area(self) -> Floats:
         """(V,) mm^2 of the surface: a third of the faces at each vertex. Traction times it is force."""
         return vertex_area(*self.shape)
+
+    @property
+    def instruments(self) -> list[tuple[str, str, float]]:
+        """Gesture, kind and radius of the contact in mm of each instrument."""
+        if self.series is None:
+            return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures]
+        kinds, radius = self.job.fem.instrument or ("probe",), self.job.fem.footprint_mm[0]
+        return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])]
 
     @property
     def time(self) -> Floats:
@@ -137,18 +149,24 @@ class Scene(RestScene):
 
     @property
     def force(self) -> Floats:
-        """(T, 3) mN on the tissue, camera axes."""
+        """(T, 3) mN on the tissue, camera axes; NaN where it isn't known."""
         return self.motion.force @ self.view.rotation.T
 
     @property
     def strongest(self) -> int:
-        """The frame of the largest force."""
-        return int(np.linalg.norm(self.motion.force, axis=1).argmax())
+        """The frame of the largest force, or of the largest motion where it isn't known."""
+        size = self.motion.displacement if np.isnan(self.motion.force).any() else self.motion.force
+        return int(np.linalg.norm(size.reshape(len(size), -1), axis=1).argmax())
 
     @property
-    def young_kpa(self) -> float:
-        """Young's modulus of the tissue."""
-        return self.scenario.tissue.young_kpa
+    def young_kpa(self) -> float | None:
+        """Young's modulus of the tissue; None where another program's is not stated."""
+        low, high = self.job.fem.young_kpa
+        return self.scenario.tissue.young_kpa if self.series is None or low == high else None
+
+    def state(self, t: int) -> SceneState:
+        """Surface, instruments and microscope in frame `t`."""
+        return self._timeline.at(t)
 
     @checked
     def frame(self, t: int) -> Frame:
@@ -202,7 +220,7 @@ class Scene(RestScene):
 
 def draw_craniotomy(rest: RestScene) -> SceneContent:
     """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
-    drawn = [(gesture.instrument, gesture.footprint_mm) for gesture in rest.scenario.gestures]
+    drawn = [one[1:] for one in rest.instruments]
     return craniotomy(rest.surface, rest.scenario.appearance, rest.view, rest.job, drawn)
 
 
@@ -223,11 +241,16 @@ def at_rest(
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:
         case = replace(case, view=camera.calibrated(case.view, view))
-    mesh = job.anatomy.mesh
+    mesh, series = job.anatomy.mesh, None
+    if job.mechanics.source is not None:
+        series = read_job_series(job, index)
+        tissue = replace(case.tissue, law="external", why="mechanics.source", membrane=None)
+        case = replace(case, gestures=(), pulse=None, tissue=tissue)
     about = mesh.stat() if mesh and mesh.is_file() else None
     written = about and (about.st_mtime_ns, about.st_size)
-    surface, brain = _cortex(job.anatomy.opened(case.index), case.relief, written)
-    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy)
+    bare = content is not None  # whoever draws another organ has no veins on it
+    surface, brain = _cortex(job.anatomy.opened(case.index), case.relief, written, series, bare)
+    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy, series)
 
 
 def refuse_unfit(render: RenderSection) -> None:
@@ -263,7 +286,9 @@ def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] 
 
 
 @lru_cache(maxsize=4)
-def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[CortexSurface, Brain | None]:
+def _cortex(
+    section: AnatomySection, relief: Relief, written: object, series: MeshSeries | None, bare: bool
+) -> tuple[CortexSurface, Brain | None]:
     """The fine surface, and the user's brain that it is part of, if any; cached, hence read-only.
 
     `written` (time and size of the brain's file) distinguishes a mesh from one that replaced it.
@@ -271,7 +296,9 @@ def _cortex(section: AnatomySection, relief: Relief, written: object) -> tuple[C
     brain = None
     if section.mesh is not None:
         brain = load_brain(section.mesh, section.craniotomy, section.attachments, section.fill_holes)
-    surface = anatomy.grow(relief, section, brain.shape if brain else None)
+    elif series is not None:
+        brain = place_brain(series.points, series.faces, "mechanics.source", section.craniotomy)
+    surface = anatomy.grow(relief, section, brain.shape if brain else None, series is None or not bare)
     for value in (*vars(surface).values(), *((*brain.shape, brain.to_world) if brain else ())):
         if isinstance(value, np.ndarray):
             value.flags.writeable = False

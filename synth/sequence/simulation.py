@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 from synth.arguments import checked
@@ -16,6 +17,7 @@ from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
 from synth.sequence.scenario import Scenario, draw_scenario
 from synth.sequence.scene import RestScene, Scene, at_rest
+from synth.sequence.series_mechanics import SeriesMechanics
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 
@@ -63,9 +65,10 @@ def simulate(
     report("mesh", 0, 1)
     with watch.stage("mesh"):
         rest = at_rest(job, index, case=case, content=content)
-    motion = (mechanics or FemMechanics(motions)).deform(rest, report, watch)
-    check_deformation(motion, rest.shape, job.frames, len(rest.scenario.gestures))
-    return Scene(job, index, rest.scenario, rest.surface, rest.view, rest.brain, rest.content, motion)
+    ours = FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics()
+    motion = (mechanics or ours).deform(rest, report, watch)
+    check_deformation(motion, rest.shape, job.frames, len(rest.instruments), "force" in job.stored_fields)
+    return Scene(**{one.name: getattr(rest, one.name) for one in fields(rest)}, motion=motion)
 
 
 def refuse_untouched(job: Job, case: Scenario) -> None:

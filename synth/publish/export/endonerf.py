@@ -62,7 +62,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             "unit_mm": UNIT_MM,
             "focal_px": focal,
             "fps": sequence.attrs["fps"],
-            "force_mn": sequence["force"][:].tolist(),
+            "force_mn": sequence["force"][:].tolist() if "force" in sequence else None,
             "young_kpa": sequence.attrs["young_kpa"],
         }
         if "rgb_right" in sequence:

@@ -10,7 +10,7 @@ from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.publish import sequence_video
-from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, tapvid, webdataset
+from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, tapvid, vtu, webdataset
 from synth.system import checked_file
 
 FORMATS: dict[str, Callable[..., None]] = {
@@ -22,6 +22,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     "tapvid": tapvid.write_tracks,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
+    "vtu": vtu.write_surfaces,
     "video": sequence_video.write_videos,
 }
 """All formats by their names in `synth export --to`."""

@@ -55,7 +55,9 @@ class CortexSurface:
     seed: int  # seed of everything else that belongs to this anatomy
 
 
-def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = None) -> CortexSurface:
+def grow(
+    relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = None, veined: bool = True
+) -> CortexSurface:
     """A cortex under the opening, with veins that stand out of it.
 
     Args:
@@ -63,6 +65,7 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
         anatomy: the job's section.
         brain: a user's, z outwards, origin at the craniotomy's centre; any winding, holes and duplicates
             allowed. None: random gyri on a dome.
+        veined: whether veins stand out of it.
 
     Raises:
         UserError: there is no surface under the opening.
@@ -92,7 +95,7 @@ def grow(relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = N
         **{name: replace(one, nodes=chart.at(one.nodes)) for name, one in vars(tree).items()}
     )
     laid = chart.at(xy)
-    z = pia + noise.sample(bulge(tree.veins, chart.extent_mm), laid, chart.extent_mm)
+    z = pia + veined * noise.sample(bulge(tree.veins, chart.extent_mm), laid, chart.extent_mm)
     return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=grid_faces(side, side).reshape(-1, 3),

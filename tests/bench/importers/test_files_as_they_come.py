@@ -11,8 +11,8 @@ import pytest
 from fake_recording import texture
 
 from bench.importers import registry, rosbag
-from bench.recording import csv_table
 from synth.errors import UserError
+from synth.system import csv_table
 from synth.video import read as video
 from synth.video.stereo_layout import find_layout
 

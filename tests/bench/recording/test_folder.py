@@ -11,9 +11,10 @@ from fake_recording import Maker, texture
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bench.recording import csv_table, meta, writer
+from bench.recording import meta, writer
 from bench.recording.folder import Recording, open_recording
 from synth.errors import UserError
+from synth.system import csv_table
 from synth.video import read as video
 
 

@@ -66,7 +66,7 @@ def test_sequences_use_the_openings_of_a_brain_in_turn(egg: Path, found: list[Op
         brain = at_rest(job, index).brain
         assert brain is not None
         assert np.linalg.norm(brain.to_world @ [*found[index % 3].point, 1.0] - [0, 0, 0, 1]) < 1.0
-    named = [identity.identify_opening(job, index) for index in range(6)]
+    named = [identity.identify_opening(job, index, identity.identify_anatomy(job, 0)) for index in range(6)]
     assert named[:3] == named[3:]
     assert len(set(named)) == 3
     assert parse_job(writer.commented(job), "job", Path()) == job

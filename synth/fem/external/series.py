@@ -1,0 +1,246 @@
+"""Motion and load of a surface as another program computed them: states over time, checked, in mm and mN."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from synth.arrays import Floats, Ints, Map
+from synth.errors import UserError, as_user_error
+from synth.fem.surface_embedding import vertex_area
+from synth.geometry.skin import skin
+from synth.system.csv_table import read_csv, read_header
+
+_LIKELY_MM, _POSSIBLE_MM = (20.0, 400.0), (1.0, 2000.0)  # largest extent of a specimen
+_ROUNDING = 1e-5  # relative to an extent or a largest force: files are in single precision
+_LEAST_LOAD = 0.01  # share of the largest load below which a surface counts as unloaded
+
+
+@dataclass(frozen=True)
+class Units:
+    """What files of this kind do not state; None: not stated by the user either."""
+
+    mm: float | None = None  # millimetres in the files' unit of length
+    mn: float | None = None  # millinewtons in their unit of force
+    dt_s: float | None = None  # seconds from state to state, where the files carry no time
+    guess: bool = False  # whether millimetres are taken from the size of the surface
+
+
+@dataclass(frozen=True, eq=False)
+class MeshSeries:
+    """Motion and load of an outer surface of N nodes over S states; axes are those of the files."""
+
+    points: Floats  # (N, 3) mm at rest
+    faces: Ints  # (F, 3)
+    time: Floats  # (S,) s, from 0
+    displacement: Map  # (S, N, 3) mm
+    tip: Floats  # (S, I, 3) mm of the instruments
+    shaft: Floats  # (S, I, 3) unit vectors from tip to hand
+    unit_mm: float  # millimetres in the files' unit of length
+    fields: tuple[str, ...]  # names of the vector fields at nodes
+    force: Map | None = None  # (S, N, 3) mN at nodes, on the surface from outside; None: not known
+
+    @property
+    def summary(self) -> str:
+        """What it is, in one line."""
+        size = " x ".join(f"{one:.3g}" for one in np.ptp(self.points, axis=0))
+        most = float(np.linalg.norm(self.displacement, axis=2).max())
+        load = "no force"
+        if self.force is not None:
+            load = f"force up to {np.linalg.norm(self.force.sum(axis=1), axis=1).max():.4g} mN"
+        count = f"{len(self.time)} states over {self.time[-1]:.4g} s, {len(self.points)} nodes on the surface"
+        return f"{count}, {size} mm, displacement up to {most:.3g} mm, {load}"
+
+    def at(self, time_s: float, name: str) -> Floats:
+        """An array at a time, linear between states: float64 of the shape of one state."""
+        values = getattr(self, name)
+        after = int(np.clip(np.searchsorted(self.time, time_s), 1, len(self.time) - 1))
+        before, span = self.time[after - 1], self.time[after] - self.time[after - 1]
+        part = float(np.clip((time_s - before) / span, 0, 1))
+        return np.asarray((1 - part) * values[after - 1] + part * values[after], np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class OuterSurface:
+    """The outer surface among M points of a mesh; coincident points count once."""
+
+    nodes: Ints  # (N,) numbers of its points
+    faces: Ints  # (F, 3) of the N
+    place: Ints  # (M,) for each point the first one at the same place
+
+    def pick(self, values: Floats, where: Path) -> Floats:
+        """Motion (N, 3) of points (M, 3). UserError: coincident points move apart."""
+        first = values[self.place]
+        if np.abs(values - first).max(initial=0) > _ROUNDING * max(float(np.abs(values).max()), 1e-9):
+            raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
+        return values[self.nodes]
+
+    def total(self, values: Floats) -> Floats:
+        """Loads (N, 3) of points (M, 3), those of coincident ones added up."""
+        whole = np.zeros((len(values), 3))
+        np.add.at(whole, self.place, values)
+        return whole[self.nodes]
+
+
+def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> OuterSurface:
+    """The outer surface of cells (see `skin`) of points (M, 3) at rest.
+
+    Raises:
+        UserError: no such surface, or points that are not finite or belong to several bodies.
+    """
+    if not np.isfinite(points).all():
+        raise UserError(f"{where}: has coordinates that are not finite")
+    step = _ROUNDING * max(float(np.ptp(points, axis=0).max(initial=0)), 1e-12)
+    _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
+    place = first[place.ravel()]
+    with as_user_error(str(where)):
+        cells = {kind: place[one] for kind, one in cells.items()}
+        nodes, faces = np.unique(skin(points, cells), return_inverse=True)
+    links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
+    graph = sp.coo_array((np.ones(sum(one.shape[1] for one in links)), np.hstack(links)), [len(points)] * 2)
+    bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
+    if len(bodies) > 1:
+        raise UserError(f"{where}: has {len(bodies)} separate bodies; write the tissue alone")
+    return OuterSurface(nodes, faces.reshape(-1, 3), place)
+
+
+def assemble(
+    source: Path,
+    points: Floats,
+    faces: Ints,
+    units: Units,
+    time: Floats,
+    displacement: Map,
+    fields: Sequence[str],
+    force: Map | None = None,
+    per_area: bool = False,
+) -> MeshSeries:
+    """A series of arrays in the files' units, checked, and converted in place.
+
+    Args:
+        source: named in messages.
+        points: (N, 3) at rest.
+        faces: (F, 3).
+        units: of the arrays.
+        time: (S,) s, rising.
+        displacement: (S, N, 3) float32.
+        fields: names of the vector fields at nodes.
+        force: (S, N, 3) float32, or none.
+        per_area: whether `force` is one per area at rest.
+
+    Raises:
+        UserError: a surface that is not at rest at first, values that are not finite, units that are missing
+            or can't be, a force that can't be one of contact.
+    """
+    scale = _length(points, units, source)
+    points = scale * points
+    displacement *= np.float32(scale)
+    extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(displacement).max())
+    if not np.isfinite(extent + largest) or not (force is None or np.isfinite(force.sum())):
+        raise UserError(f"{source}: has values that are not finite")
+    if (start := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
+        raise UserError(f"{source}: the first state is displaced by {start:.3g} mm; it has to be at rest")
+    displacement -= displacement[0].copy()
+    if largest < 1e-4 * extent:
+        has = ", ".join(fields) or "none"
+        hint = f"is unit_mm right, and which of its vectors ({has}) displacement?"
+        raise UserError(f"{source}: its surface of {extent:.3g} mm moves by {largest:.2g} mm only; {hint}")
+    none = np.zeros((len(time), 0, 3))
+    found = MeshSeries(points, faces, time - time[0], displacement, none, none, scale, tuple(fields))
+    if force is None:
+        return found
+    if units.mn is None:
+        raise UserError(f"{source}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
+    each = vertex_area(points, faces)[:, None] / scale**2 if per_area else 1.0
+    force *= np.asarray(units.mn * each, np.float32)
+    return bear(found, force, source)
+
+
+def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
+    """The series with forces (S, N, 3) mN on its nodes. UserError: they can't be those of a contact."""
+    size = np.linalg.norm(force, axis=2).sum(axis=1)
+    moved = int(np.abs(series.displacement).max(axis=(1, 2)).argmax())
+    if size[0] > 1e-3 * size.max():
+        raise UserError(f"{source}: the first state bears {size[0]:.3g} mN; it has to be at rest")
+    if size[moved] <= _LEAST_LOAD * size.max():
+        raise UserError(
+            f"{source}: where the surface is displaced most the force is {size[moved]:.2g} mN; a net force "
+            "is 0 wherever the tissue is held (as that of SOFA's Monitor): give the force of the contact"
+        )
+    force[0] = 0.0
+    return replace(series, force=force)
+
+
+def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> MeshSeries:
+    """The series with the total force of a table, spread over the nodes around its point as 1 - (r/a)^2.
+
+    Args:
+        series: without a force.
+        table: .csv with the columns time [s, that of the first state first], fx, fy, fz, and x, y, z of the
+            contact's centre at rest, in the files' units and axes.
+        units: of the table.
+        patch_mm: radius a.
+
+    Raises:
+        UserError: no such table, or no node around a point.
+    """
+    if units.mn is None:
+        raise UserError(f"{table}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
+    rows = _at_states(series, table, ("fx", "fy", "fz", "x", "y", "z"))
+    area, force = vertex_area(series.points, series.faces), np.zeros_like(series.displacement)
+    for k, row in enumerate(rows):
+        away = np.linalg.norm(series.points - (units.mm or 1.0) * row[3:], axis=1)
+        share = area * np.maximum(1 - np.square(away / patch_mm), 0)
+        if not share.any() and row[:3].any():
+            at = f"no node within {patch_mm:g} mm of the contact at {series.time[k]:g} s"
+            raise UserError(f"{table}: {at}; is its unit that of the files?")
+        force[k] = units.mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
+    return bear(series, force, table)
+
+
+def equip(series: MeshSeries, table: Path, units: Units) -> MeshSeries:
+    """The series with instruments: columns time, and for each I from 0 on xI, yI, zI of the tip and uI, vI,
+    wI from it to the hand. UserError: no such table."""
+    count = 1 if "x1" not in (header := read_header(table)) else 2 if "x2" not in header else 3
+    names = [f"{axis}{k}" for k in range(count) for axis in "xyzuvw"]
+    rows = _at_states(series, table, names).reshape(len(series.time), count, 6)
+    size = np.linalg.norm(rows[..., 3:], axis=2, keepdims=True)
+    if not size.all():
+        raise UserError(f"{table}: a direction to the hand, u v w, is 0")
+    return replace(series, tip=(units.mm or 1.0) * rows[..., :3], shaft=rows[..., 3:] / size)
+
+
+def _at_states(series: MeshSeries, table: Path, names: tuple[str, ...] | list[str]) -> Floats:
+    """Columns (S, len(names)) of a table, linear between rows. UserError: it does not cover the states."""
+    found = read_csv(table, ("time", *names))
+    time = found["time"] - found["time"][0]
+    rows = np.stack([found[name] for name in names], axis=1)
+    if not np.isfinite(rows).all() or not (np.diff(time) > 0).all():
+        raise UserError(f"{table}: times don't rise, or a value is missing")
+    if series.time[-1] > time[-1] + 1e-6:
+        raise UserError(f"{table}: lasts {time[-1]:g} s, the series {series.time[-1]:g} s")
+    return np.stack([np.interp(series.time, time, column) for column in rows.T], axis=1)
+
+
+def _length(points: Floats, units: Units, source: Path) -> float:
+    """Millimetres in the unit of length. UserError if it is not stated, or can't be that of a specimen."""
+    extent = float(np.ptp(points, axis=0).max())
+    (low, high), (least, most) = _LIKELY_MM, _POSSIBLE_MM
+    likely = [
+        (name, mm) for name, mm in (("mm", 1.0), ("m", 1000.0), ("cm", 10.0)) if low <= mm * extent <= high
+    ]
+    hint = " or ".join(f"{mm:g} for {name}" for name, mm in likely) or "1 for mm, 1000 for m"
+    if units.mm is None and units.guess and likely:
+        return likely[0][1]
+    if units.mm is None:
+        wide = f"its surface is {extent:.3g} units wide"
+        raise UserError(f"{source}: mechanics.unit_mm is needed; {wide}: {hint}?")
+    if not least <= units.mm * extent <= most:
+        wide = f"its surface is {units.mm * extent:.3g} mm wide"
+        raise UserError(f"{source}: with mechanics.unit_mm {units.mm:g} {wide}; {hint}?")
+    return units.mm

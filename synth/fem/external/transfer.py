@@ -1,0 +1,147 @@
+"""Motion and load carried over from one surface to another: from an engine's nodes to a scene's vertices.
+
+A vertex x belongs to a point p of the nearest triangle of the engine. It moves with p, and turns with it:
+
+    u(x) = u(p) + (R(p) - 1) (x - p).
+
+Position and displacement are quadratic on a triangle. Their value in the middle of an edge follows from
+values and gradients g at its ends, u_ij = (u_i + u_j) / 2 + (g_i - g_j) . (x_j - x_i) / 8 (Hermite): flat
+facets would have kinks at nodes, which a picture shows. R is the rotation of the triangles around a node,
+interpolated. Rigid motion is reproduced exactly.
+
+A nodal force is shared among the vertices of the node's triangles in proportion to their area, so each force
+keeps its size and direction; its place moves by less than a triangle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from synth.arrays import Floats, Ints, Mask
+from synth.fem.surface_embedding import nearest, sparse_rows, vertex_area
+from synth.geometry.triangles import Shape
+
+_TILES = 12  # along the longer side of a scene, in which nearest triangles are searched separately
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """V vertices of a scene on the surface of an engine's N nodes; made by `attach`."""
+
+    motion: sp.csr_array  # (V, N) weights of the nodes' displacement
+    corner: sp.csr_array  # (V, N) barycentrics of the nearest points
+    load: sp.csr_array  # (V, N) share of each node's force that a vertex bears
+    distance: Floats  # (V,) mm to the engine's surface
+    points: Floats  # (N, 3) mm of the nodes at rest
+    faces: Ints  # (F, 3) the triangles that vertices lie on, and their neighbours
+    arm: Floats  # (V, 3) mm from the nearest points
+
+    def move(self, u: Floats) -> Floats:
+        """Displacement (V, 3) mm of the vertices, from the nodes' (N, 3) mm."""
+        turn = _rotations(self.points, self.points + u, self.faces).reshape(len(u), 9)
+        turned = (self.corner @ turn).reshape(-1, 3, 3)
+        return np.asarray(self.motion @ u + np.einsum("vij,vj->vi", turned, self.arm) - self.arm)
+
+    def bear(self, force: Floats) -> Floats:
+        """Forces (V, 3) on the vertices, from nodal forces (N, 3); those of nodes elsewhere are left out."""
+        return np.asarray(self.load @ force)
+
+    @property
+    def borne(self) -> Mask:
+        """(N,) nodes whose force is borne by vertices."""
+        return np.asarray(self.load.sum(axis=0) > 0.5)
+
+
+def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
+    """Attaches the vertices of a scene to the nearest triangles (F, 3) of points (N, 3) mm."""
+    vertices = np.ascontiguousarray(scene.vertices)
+    face, bary = _nearest(points, faces, vertices)
+    nodes = faces[face]
+    corner = sparse_rows(bary, nodes, len(points))
+    close = faces[np.isin(faces, nodes).any(axis=1)]
+    motion = sp.csr_array(corner + _bend(points, close, nodes, bary))
+    arm = vertices - motion @ points  # from the curved triangles, so that rigid motion stays exact
+    area = vertex_area(*scene)
+    share = sp.csr_array(corner.multiply(area[:, None]))
+    whole = np.asarray(share.sum(axis=0)).ravel()
+    load = sp.csr_array(share.multiply(np.where(whole > 0, 1 / np.where(whole > 0, whole, 1), 0)[None, :]))
+    return Transfer(motion, corner, load, np.linalg.norm(arm, axis=1), points, close, arm)
+
+
+def _nearest(points: Floats, faces: Ints, vertices: Floats) -> tuple[Ints, Floats]:
+    """Nearest face (V,) of each vertex and the barycentrics (V, 3) there; tile by tile, among near ones."""
+    away = cKDTree(points[np.unique(faces)]).query(vertices)[0]
+    corner = np.ascontiguousarray(points[faces])
+    low, high = corner.min(axis=1), corner.max(axis=1)
+    index = np.floor((vertices - vertices.min(axis=0)) / np.ptp(vertices, axis=0).max() * _TILES)
+    tile = np.unique(index, axis=0, return_inverse=True)[1].ravel()
+    owner, bary = np.zeros(len(vertices), np.int64), np.zeros((len(vertices), 3))
+    for mine in np.split(np.argsort(tile, kind="stable"), np.cumsum(np.bincount(tile))[:-1]):
+        here, reach = vertices[mine], away[mine].max()
+        inside = (high >= here.min(axis=0) - reach) & (low <= here.max(axis=0) + reach)
+        near = np.flatnonzero(inside.all(axis=1))
+        found, bary[mine] = nearest(corner[near], here)
+        owner[mine] = near[found]
+    return owner, bary
+
+
+def _bend(points: Floats, close: Ints, nodes: Ints, bary: Floats) -> sp.csr_array:
+    """(V, N) what the quadratic motion adds to the linear one: 4 b_i b_j (g_i - g_j) . (x_j - x_i) / 8."""
+    gradient = _gradient(points, close)
+    rows = np.arange(len(nodes))
+    whole = sp.csr_array((len(nodes), len(points)))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        edge = points[nodes[:, j]] - points[nodes[:, i]]
+        weight = 0.5 * bary[:, i] * bary[:, j]
+        for d in range(3):
+            for end, sign in ((i, 1.0), (j, -1.0)):
+                pick = sp.csr_array((sign * weight * edge[:, d], (rows, nodes[:, end])), shape=whole.shape)
+                whole = whole + pick @ gradient[d]
+    return whole
+
+
+def _gradient(points: Floats, faces: Ints) -> list[sp.csr_array]:
+    """Three (N, N): x, y, z of the gradient along the surface at nodes, the area's mean over their faces."""
+    corner = points[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])  # twice the area long
+    double = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+    area = np.bincount(faces.ravel(), np.repeat(double, 3), len(points))
+    share = double[:, None] / np.maximum(area, 1e-300)[faces]  # (F, 3) of a face in the mean at its corners
+    parts = []
+    for k in range(3):
+        side = corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3]
+        parts.append(np.cross(normal, side) / (double**2)[:, None])  # gradient of the k-th barycentric
+    found = []
+    for d in range(3):
+        values = np.stack([share * part[:, d : d + 1] for part in parts], axis=2)  # (F, node, k)
+        rows = np.broadcast_to(faces[:, :, None], values.shape)
+        columns = np.broadcast_to(faces[:, None, :], values.shape)
+        size = (len(points), len(points))
+        found.append(sp.coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=size).tocsr())
+    return found
+
+
+def _rotations(rest: Floats, now: Floats, faces: Ints) -> Floats:
+    """Rotations (N, 3, 3) at nodes: nearest to the mean gradient of motion in the faces around them."""
+
+    def frames(points: Floats) -> Floats:
+        a, b, c = (points[faces[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        size = np.sqrt(np.maximum(np.linalg.norm(normal, axis=1), 1e-300))
+        return np.stack([b - a, c - a, normal / size[:, None]], axis=2)
+
+    gradient = frames(now) @ np.linalg.inv(frames(rest))
+    whole = np.zeros((len(rest), 3, 3))
+    used = np.unique(faces)
+    for k in range(3):
+        np.add.at(whole, faces[:, k], gradient)
+    left, _, right = np.linalg.svd(whole[used])
+    flip = np.linalg.det(left @ right) < 0
+    left[flip, :, 2] *= -1
+    found = np.broadcast_to(np.eye(3), whole.shape).copy()
+    found[used] = left @ right
+    return found

@@ -1,0 +1,152 @@
+"""Series of VTK files: numbered .vtu, .vtk or .vtp, and collections of them: .pvd, ParaView's .series."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from synth.arrays import Floats
+from synth.errors import UserError, as_user_error, did_you_mean
+from synth.fem.external.series import MeshSeries, Units, assemble, find_surface
+from synth.geometry.mesh_file import SUFFIXES, MeshFile, read_mesh
+from synth.system import checked_file
+
+LARGEST = 2 << 30  # bytes of a file
+COLLECTIONS = (".pvd", ".series")
+MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
+_OTHERS = {
+    ".frd": "ccx2paraview FILE vtu", ".xdmf": "pip install meshio; meshio convert FILE OUT.vtu per step",
+    ".exo": "save as PVD in ParaView", ".e": "save as PVD in ParaView", ".odb": "save as VTU by odb2vtk",
+    ".xplt": "plotfile type=\"vtk\" in FEBio", ".vtkhdf": "save as PVD in ParaView",
+}  # fmt: skip
+
+
+def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeries:
+    """The series of VTK files in `source`: a pattern with *, a collection, or a folder that holds either.
+
+    Args:
+        source: where.
+        units: what the files do not state.
+        force: the field of forces that act on the surface from outside, `nodal:NAME`, or of forces per area
+            at rest, `traction:NAME`. None: forces are not known.
+
+    Raises:
+        UserError: in one line, with the file's name: files that are missing, damaged or of other meshes,
+            times that do not rise, fields that are missing, and what `find_surface` and `assemble` refuse.
+    """
+    files, times = list_states(source)
+    first = _read(files[0])
+    surface = find_surface(first.points, first.cells, files[0])
+    named = [name for name in vectors_in(first) if name.lower() in MOVED]
+    field = named[0] if len(named) == 1 else None  # else the points themselves move
+    of = force_field(force, vectors_in(first), files[0])
+    stated: list[float | None] = []
+    moved, load = (np.empty((len(files), len(surface.nodes), 3), np.float32) for _ in range(2))
+    for k, file in enumerate(files):
+        state = first if k == 0 else _read(file)
+        same = state.cells.keys() == first.cells.keys() and len(state.points) == len(first.points)
+        if not same or not all(np.array_equal(state.cells[kind], first.cells[kind]) for kind in first.cells):
+            raise UserError(f"{file}: its mesh is not that of {files[0].name}; remeshing can't be followed")
+        stated.append(state.time)
+        moved[k] = surface.pick(_values(state, field, file) if field else state.points - first.points, file)
+        if of is not None:
+            load[k] = surface.total(_values(state, of[1], file))
+    per_area = of is not None and of[0] == "traction"
+    time, given = _rising(times or stated, files, units), None if of is None else load
+    states, points = (time, moved, vectors_in(first), given, per_area), first.points[surface.nodes]
+    return assemble(source, points, surface.faces, units, *states)
+
+
+def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
+    """Files of a series in order, two at least, and their times [s] if a collection states them."""
+    if (how := _OTHERS.get(source.suffix.lower())) is not None:
+        raise UserError(f"{source}: can't be read; convert it to VTU: {how}")
+    if source.suffix in COLLECTIONS:
+        files, times = zip(*_collection(source), strict=True)
+        return list(files), list(times)
+    if not source.is_dir():
+        found = [file for file in source.parent.glob(source.name) if file.suffix[1:] in SUFFIXES]
+    else:
+        lists = [file for file in source.iterdir() if file.suffix in COLLECTIONS]
+        if len(lists) == 1:
+            return list_states(lists[0])
+        found = [file for file in source.iterdir() if file.suffix[1:] in SUFFIXES]
+    stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in found})
+    if len(stems) > 1:
+        raise UserError(f"{source}: files of several series, {', '.join(stems[:3])}; choose one of these")
+    numbers = {file: re.search(r"\d+$", file.stem) for file in found}
+    order = sorted((int(number[0]), file) for file, number in numbers.items() if number)
+    if len(order) < 2:
+        raise UserError(f"{source}: no series; two numbered files at least ({', '.join(SUFFIXES)})")
+    steps = np.diff([number for number, _ in order])
+    if (odd := np.flatnonzero(steps != steps.min())).size:
+        before, after = (order[odd[0] + k][1].name for k in (0, 1))
+        raise UserError(f"{source}: a file between {before} and {after} is missing")
+    return [file for _, file in order], None
+
+
+def _collection(source: Path) -> list[tuple[Path, float]]:
+    """Files and times of a .pvd or .series file. UserError if it is neither, or lists fewer than two."""
+    text = checked_file.read_text(source, checked_file.LARGEST_JSON)
+    with as_user_error(f"{source}: is not a collection of files"):
+        if source.suffix == ".pvd":
+            sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
+            if len({one.get("part", "0") for one in sets}) > 1:
+                raise ValueError("it has several parts at a time; choose one by a pattern")
+            found = [(one["file"], float(one["timestep"])) for one in sets]
+        else:
+            found = [(one["name"], float(one["time"])) for one in json.loads(text)["files"]]
+        if len(found) < 2:
+            raise ValueError("it lists fewer than two files")
+        if outside := [name for name, _ in found if Path(name).is_absolute() or ".." in Path(name).parts]:
+            raise ValueError(f"{outside[0]} is not in its folder")
+        return [(source.parent / name, time) for name, time in found]
+
+
+def _read(file: Path) -> MeshFile:
+    data = checked_file.read_bytes(file, LARGEST)
+    with as_user_error(f"{file}: is not a readable mesh"):
+        return read_mesh(data)
+
+
+def vectors_in(state: MeshFile) -> list[str]:
+    """Names of its vector fields at points."""
+    return [name for name, values in state.point_data.items() if values.shape == state.points.shape]
+
+
+def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[str, str] | None:
+    """Kind and name of `mechanics.force`. UserError: it is not nodal:NAME or traction:NAME of a field."""
+    if force is None:
+        return None
+    kind, _, name = force.partition(":")
+    if kind not in ("nodal", "traction") or name not in fields:
+        has = f"{where.name} has {', '.join(fields) or 'no vectors'}{did_you_mean(name, fields)}"
+        raise UserError(f"mechanics.force {force}: nodal:NAME, traction:NAME or a table (.csv); {has}")
+    return kind, name
+
+
+def _values(state: MeshFile, name: str, file: Path) -> Floats:
+    values = state.point_data.get(name)
+    if values is None or values.shape != state.points.shape:
+        raise UserError(f"{file}: has no vectors {name} at its points")
+    return np.asarray(values, np.float64)
+
+
+def _rising(times: Sequence[float | None], files: list[Path], units: Units) -> Floats:
+    """Times (S,) s, as stated or by `dt_s`. UserError if there are none, or they don't rise."""
+    found = np.array([np.nan if time is None else time for time in times], np.float64)
+    if np.isnan(found).all():
+        if units.dt_s is None:
+            raise UserError(
+                f"{files[0]}: states no time; mechanics.dt_s is needed, seconds from file to file"
+            )
+        return np.arange(len(files), dtype=np.float64) * units.dt_s
+    if not (rises := np.diff(found) > 0).all():
+        at = int(np.argmin(rises))
+        raise UserError(f"{files[at + 1]}: its time {found[at + 1]:g} s does not follow {found[at]:g} s")
+    return found

@@ -1,0 +1,72 @@
+"""A first job for another program's series: what can be read from the files is stated, the rest is asked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from synth.errors import UserError
+from synth.fem.external.read import read_series
+from synth.fem.external.series import MeshSeries, Units
+from synth.fem.external.vtk_series import MOVED
+from synth.fem.surface_embedding import vertex_area
+from synth.job import writer
+
+_RADIUS_MM = 12.0
+_DT_S = 0.04  # written where files carry no time
+
+
+def as_job(source: Path) -> str:
+    """The text of a job for the series in `source`. UserError: it can't be read."""
+    dt_s = None
+    try:
+        series = read_series(source, Units(guess=True))
+    except UserError as error:
+        if "dt_s" not in str(error):
+            raise
+        series = read_series(source, Units(guess=True, dt_s=(dt_s := _DT_S)))
+    point, direction, radius = _opening(series)
+    frames = max(3, min(len(series.time), 250))
+    named = [f"nodal:{name}, traction:{name}" for name in series.fields if name.lower() not in MOVED]
+    lines = [
+        f"# {series.summary}.",
+        "# Look at it:  synth preview THIS_FILE      Render it:  synth render THIS_FILE -o OUT",
+        "# Every key:   synth new",
+        "sequences: 1  # more: the same motion, other vessels, lamps and instruments",
+        f"frames: {frames}",
+        f"fps: {(frames - 1) / series.time[-1]:.6g}  # frames are interpolated between the files' states",
+        "mechanics:",
+        f"  source: {writer.scalar(source.resolve())}",
+        f"  unit_mm: {series.unit_mm:g}  # from the size of the surface; is it right?",
+        *([f"  dt_s: {dt_s}  # PLEASE SET: the files state no time"] if dt_s else []),
+        "  # For a label, state the force on the surface from outside, its unit, and the tissue's stiffness:",
+        f"  # force: {', '.join([*named, 'or force.csv with time, fx, fy, fz, x, y, z'])}",
+        "  # unit_mn: 1000  # for N",
+        "# fem: {young_kpa: 1.0, poisson: 0.45}",
+        "anatomy:",
+        "  craniotomy:  # where the surface moves most, in the files' axes",
+        f"    point: {np.round(point, 3).tolist()}  # mm",
+        f"    direction: {np.round(direction, 4).tolist()}",
+        f"    radius_mm: {radius:.3g}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _opening(series: MeshSeries) -> tuple[np.ndarray, np.ndarray, float]:
+    """Point [mm], outward direction and radius [mm] of an opening where the surface moves most."""
+    points, faces = series.points, series.faces
+    most = np.linalg.norm(series.displacement, axis=2).max(axis=0)
+    area = vertex_area(points, faces)
+    weight = area * (most > 0.7 * most.max())
+    middle = (weight[:, None] * points).sum(axis=0) / weight.sum()
+    point = points[np.linalg.norm(points - middle, axis=1).argmin()]
+    corners = points[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centres = corners.mean(axis=1)
+    near = np.linalg.norm(centres - point, axis=1)
+    radius = min(_RADIUS_MM, 0.4 * float(np.sort(np.ptp(points, axis=0))[1]))
+    out = normal[near <= max(radius / 2, near.min() + 1e-9)].sum(axis=0)
+    # Faces of a sheet may be turned either way: away from the body's middle is outwards.
+    side = np.sign(out @ (point - points.mean(axis=0))) or 1.0
+    return point, side * out / np.linalg.norm(out), radius
