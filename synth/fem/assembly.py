@@ -12,13 +12,9 @@ from synth.system.jit import compiled
 
 @compiled
 def gradient(cells: Indices, slope: Floats, u: Floats, out: Floats) -> None:
-    """Displacement gradient at every quadrature point, in place.
+    """Displacement gradient at every quadrature point: writes `out[p, i, j]` = du_i/dx_j, (M * Q, 3, 3).
 
-    Args:
-        cells: (M, n) nodes.
-        slope: (M, Q, n, 3) 1/mm.
-        u: (N, 3) mm.
-        out: (M * Q, 3, 3), overwritten; `out[p, i, j]` = du_i/dx_j.
+    `cells`: (M, n) nodes; `slope`: (M, Q, n, 3) 1/mm; `u`: (N, 3) mm.
     """
     elements, points, nodes, _ = slope.shape
     for e in range(elements):
@@ -36,13 +32,9 @@ def gradient(cells: Indices, slope: Floats, u: Floats, out: Floats) -> None:
 
 @compiled
 def divergence(cells: Indices, slope: Floats, weight: Floats, stress: Floats, out: Floats) -> None:
-    """Nodal forces that balance a stress, in place: the transpose of `gradient`.
+    """Nodal forces `out` (N, 3) mN that balance a stress (M * Q, 3, 3) kPa: the transpose of `gradient`.
 
-    Args:
-        cells, slope: as in `gradient`.
-        weight: (M, Q) mm^3.
-        stress: (M * Q, 3, 3) kPa.
-        out: (N, 3) mN, overwritten.
+    `cells`, `slope`: as there; `weight`: (M, Q) mm^3.
     """
     elements, points, nodes, _ = slope.shape
     out[:] = 0.0

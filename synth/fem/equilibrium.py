@@ -47,17 +47,10 @@ the force out of balance as a part of the largest load."""
 
 
 def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPath:
-    """Equilibrium under each load in turn.
+    """Equilibrium under each of the loads (T, N, 3) mN for E = 1 kPa in turn.
 
-    Args:
-        system: the equations.
-        loads: (T, N, 3) mN for E = 1 kPa.
-        load_parameter: (T,) P = F/(E a^2) of each, for messages.
-
-    Raises:
-        InvertedElement: names frame, load and element.
-        NoEquilibrium: the iteration stalled; names frame and load.
-        NotFinite: a displacement or an energy is not finite.
+    `load_parameter`: (T,) P = F/(E a^2) of each, for messages. Raises, with frame and load: InvertedElement;
+    NoEquilibrium, where the iteration stalls; NotFinite.
     """
     linear = _LinearResponse(system)
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
@@ -75,29 +68,16 @@ def solve_path(system: System, loads: Floats, load_parameter: Floats) -> LoadPat
         extrapolation.add(load, u)
         return u, state, norm / scale
 
-    return follow_loads(system, loads, load_parameter, step)
+    return follow_loads(system, loads, load_parameter, step, TOLERANCE, substeps=1)
 
 
 def follow_loads(
-    system: System,
-    loads: Floats,
-    load_parameter: Floats,
-    step: Step,
-    tolerance: float = TOLERANCE,
-    substeps: int = 1,
+    system: System, loads: Floats, load_parameter: Floats, step: Step, tolerance: float, substeps: int
 ) -> LoadPath:
-    """States under each load in turn, from rest; rejects inverted, infinite and unbalanced ones.
+    """States that `step` finds under each load in turn, from rest; arguments and errors as of `solve_path`.
 
-    Args:
-        system: the equations.
-        loads: (S, N, 3) mN for E = 1 kPa.
-        load_parameter: (T,) P = F/(E a^2) of each frame, for messages.
-        step: finds the state under one load.
-        tolerance: force out of balance that is accepted, as a part of the largest load.
-        substeps: loads per frame; the first frame has one.
-
-    Raises:
-        As `solve_path`.
+    `tolerance`: accepted force out of balance, as a part of the largest load; `substeps`: loads per frame;
+    the first frame has one.
     """
     u = np.zeros_like(loads[0])
     path = []
@@ -107,10 +87,8 @@ def follow_loads(
         u, state, residual = step(load, u)
         least = check_state(system, u, state, frame, parameter)
         if residual > tolerance:
-            raise NoEquilibrium(
-                f"frame {frame}: no equilibrium at load {parameter:.3g} "
-                f"(out of balance by {residual:.1e}); lower the load"
-            )
+            stalled = f"no equilibrium at load {parameter:.3g} (out of balance by {residual:.1e})"
+            raise NoEquilibrium(f"frame {frame}: {stalled}; lower the load")
         path.append((u, least, state.energy, residual))
     displacement, least_jacobian, energy, residuals = zip(*path[::substeps], strict=True)
     return LoadPath(np.stack(displacement), np.array(least_jacobian), np.array(energy), np.array(residuals))
@@ -120,9 +98,7 @@ class _LinearResponse:
     """Linear displacement under loads that span few directions: one solve for each new direction."""
 
     def __init__(self, system: System) -> None:
-        self._system = system
-        self._directions: list[Floats] = []
-        self._responses: list[Floats] = []
+        self._system, self._directions, self._responses = system, list[Floats](), list[Floats]()
 
     def shares(self, load: Floats) -> Floats:
         """Components (K,) of a load along the directions so far."""
@@ -150,9 +126,7 @@ class _NonlinearExtrapolation:
     a polynomial of second and third degree in the loads' components, by least squares."""
 
     def __init__(self, linear: _LinearResponse) -> None:
-        self._linear = linear
-        self._shares: list[Floats] = []
-        self._added: list[Floats] = []
+        self._linear, self._shares, self._added = linear, list[Floats](), list[Floats]()
 
     def add(self, load: Floats, u: Floats) -> None:
         """Stores the state u (N, 3) mm under a load (N, 3) mN."""
@@ -183,10 +157,9 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
         raise NotFinite(f"frame {frame}: the deformation at load {load:.3g} is not finite")
     least, element = system.least_jacobian(u)
     if least <= LEAST_JACOBIAN:
-        raise InvertedElement(
-            f"frame {frame}: load {load:.3g} turns element {element} inside out or nearly so "
-            f"(det F {least:.2f}, more than {LEAST_JACOBIAN:g} is needed); lower the load"
-        )
+        turned = f"load {load:.3g} turns element {element} inside out or nearly so"
+        needed = f"(det F {least:.2f}, more than {LEAST_JACOBIAN:g} is needed)"
+        raise InvertedElement(f"frame {frame}: {turned} {needed}; lower the load")
     return least
 
 
@@ -198,15 +171,9 @@ def minimise_energy(
     Nocedal & Wright, Numerical Optimization, 7.4; Liu, Bouaziz & Kavan, "Quasi-Newton methods for real-time
     simulation of hyperelastic materials" (ACM Trans. Graph. 36, 2017).
 
-    Args:
-        system: the equations.
-        load: (N, 3) mN.
-        start: (N, 3) mm.
-        tolerance: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm).
-        safe: (N, 3) mm, a state of finite energy, used where `start` has none.
-
-    Returns:
-        Displacement, its state and the residual's norm, which may exceed the tolerance.
+    `load`: (N, 3) mN; `start`, `safe`: (N, 3) mm, and one of finite energy, used where `start` has none;
+    `tolerance`: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm). Returns displacement, its state and
+    the residual's norm, which may exceed the tolerance.
     """
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
@@ -229,10 +196,8 @@ def minimise_energy(
             trial = u + length * direction
             trial_state = system.state(trial)
             value = trial_state.energy - float(np.vdot(load, trial))
-            # The last term: rounding, near the minimum.
-            if np.isfinite(value) and value <= potential + _ARMIJO * length * derivative + 1e-14 * abs(
-                potential
-            ):
+            rounding = 1e-14 * abs(potential)  # near the minimum
+            if np.isfinite(value) and value <= potential + _ARMIJO * length * derivative + rounding:
                 break
             length *= 0.5
         else:

@@ -27,15 +27,8 @@ def lame(young: float, poisson: float) -> tuple[float, float]:
 
 @compiled
 def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy: Floats) -> None:
-    """Energy density and stress, in place.
-
-    Args:
-        law: one of `NUMBER`.
-        strain: (n, 3, 3) displacement gradient F - I.
-        mu, lam: kPa.
-        out: (n, 3, 3) kPa, overwritten by P = d(energy)/dF.
-        energy: (n,) kPa, overwritten; infinite where the law is undefined.
-    """
+    """Writes the energy density (n,) kPa, infinite where the law is undefined, and P = d(energy)/dF, `out`
+    (n, 3, 3) kPa, of a `law` of `NUMBER` at displacement gradients `strain` = F - I, (n, 3, 3)."""
     f, r = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(strain)):
         _deformation(strain[n], f)
@@ -49,17 +42,11 @@ def stress(law: int, strain: Floats, mu: float, lam: float, out: Floats, energy:
 
 @compiled
 def resist_swelling(law: int, strain: Floats, weight: Floats, lam: float, out: Floats) -> float:
-    """Addition of lam/2 times the square of each element's mean swelling to the stress, in place; its energy,
-    mN mm.
+    """Adds to `out` (M * Q, 3, 3) kPa the stress of lam/2 times the square of each element's mean swelling,
+    and returns its energy, mN mm, infinite where the law is undefined.
 
-    Swelling is the quantity that a law's lambda term squares: tr e, tr(R'F - I) or log J. The energy is
-    infinite where the law is undefined.
-
-    Args:
-        law, strain: as in `stress`, Q points an element in turn.
-        weight: (M, Q) mm^3.
-        lam: kPa.
-        out: (M * Q, 3, 3) kPa, added to.
+    Swelling is the quantity that a law's lambda term squares: tr e, tr(R'F - I) or log J. `law`, `strain`: as
+    in `stress`, Q points an element in turn; `weight`: (M, Q) mm^3; `lam`: kPa.
     """
     elements, points = weight.shape
     f, slope = np.empty((3, 3)), np.empty((points, 3, 3))

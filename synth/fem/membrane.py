@@ -72,10 +72,7 @@ class Membrane:
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
-    """A membrane over all of a volume's surface but the walls that it is cut out at.
-
-    `linear`: small strain, without the pre-stretch.
-    """
+    """A membrane over a volume's surface but its cut walls; `linear`: small strain, without pre-stretch."""
     faces = boundary(tets.cells)
     faces = faces[~tets.fixed[faces].all(axis=1)]
     local = shape_slope(_POINTS)

@@ -90,18 +90,8 @@ class _PronyHistory:
 def march_in_time(
     tets: Tets, tissue: Tissue, loads: Floats, load_parameter: Floats, clock: Clock
 ) -> LoadPath:
-    """Motion from rest under loads at equal time steps, interpolated linearly between them.
-
-    Args:
-        tets: the mesh.
-        tissue: its stiffness is that to a sudden load; a membrane relaxes as the tissue under it does.
-        loads: (T, N, 3) mN for E = 1 kPa.
-        load_parameter: (T,) P = F/(E a^2) of each, for messages.
-        clock: time steps, inertia and relaxation.
-
-    Raises:
-        As `equilibrium.solve_path`.
-    """
+    """Motion from rest under loads at equal time steps, interpolated linearly between them; otherwise as
+    `equilibrium.solve_path`. `tissue`: its stiffness to a sudden load; a membrane relaxes as it does."""
     firm, spring, substeps = clock.relative_stiffness, clock.inertia_spring, clock.substeps
     mass = nodal_mass(tets, clock.mass_kg) / tissue.young_kpa
     springs = (tets.hold + sp.diags_array(spring * mass)) / firm

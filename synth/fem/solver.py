@@ -41,19 +41,15 @@ def deform(
     """Deformation of a brain by the gestures of its instruments.
 
     Args:
-        fem: the job's section.
-        tissue: stiffness and law.
+        fem, tissue: the job's section; stiffness and law.
         gestures: one per instrument, all at the same time; none where only the pulse moves the tissue.
         tets, surface: the volume, and the fine surface on it, faces counter-clockwise from outside.
         frames, fps: T >= 2, and their rate in 1/s.
-        pulse: of heart and breath; no part of force and traction.
-        opening_mm: radius of the craniotomy, where the surface is exposed to the pulse.
+        pulse, opening_mm: no part of force and traction; radius of the craniotomy, which is exposed to it.
         motions: of the gestures, over T frames each; their own trajectories if there are none.
 
-    Raises:
-        UserError: the load is past the law's range, or the contact is not on the surface.
-        InvertedElement: names frame, load and element.
-        NotFinite: a displacement or an energy is not finite.
+    Raises UserError: the load is past the law's range, or the contact is not on the surface; and as
+    `equilibrium.solve_path`.
     """
     motions = motions or [tool_gesture.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))

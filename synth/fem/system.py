@@ -86,10 +86,7 @@ class System:
         return np.asarray(pull if self.slip is None else pull + (self.slip @ u.ravel()).reshape(u.shape))
 
     def least_jacobian(self, u: Floats) -> tuple[float, int]:
-        """Smallest det F at (N, 3) mm and its element, corners included.
-
-        Under a contact J is smallest on the surface, beyond any quadrature point.
-        """
+        """Smallest det F at (N, 3) mm and its element, corners included: under a contact it is there."""
         found = []
         for mesh in (self.mesh, self.corners):
             least, at = least_determinant(_strain(mesh, u))
@@ -98,22 +95,14 @@ class System:
 
 
 def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None) -> System:
-    """Builds and factors the equations.
+    """Builds and factors the equations; UserError: the mesh holds a tetrahedron that is flat or inside out.
 
-    Args:
-        tets: the mesh, its walls and springs.
-        law: a key of `laws.NUMBER`, or a plug-in's name.
-        poisson: below 0.5.
-        sheet: a membrane on the surface.
-
-    Raises:
-        UserError: the mesh holds a tetrahedron that is flat or inside out.
+    `law`: a key of `laws.NUMBER`, or a plug-in's name; `poisson`: below 0.5; `sheet`: on the surface.
     """
     shape = quality(tets.points[tets.cells[:, :4]])
     if shape.min() < _FLATTEST:
-        raise UserError(
-            f"the mesh's element {shape.argmin()} is flat or inside out (mean ratio {shape.min():.1e})"
-        )
+        flat = f"is flat or inside out (mean ratio {shape.min():.1e})"
+        raise UserError(f"the mesh's element {shape.argmin()} {flat}")
     mesh = quadrature(tets.points, tets.cells)
     mu, lam = lame(1.0, poisson)
     mean = max(lam - POINTWISE * mu, 0.0)
@@ -133,12 +122,8 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
         whole = (whole + membrane.rest_stiffness()).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
     # Symmetric and positive definite: no pivoting, an ordering of A + A'.
-    factor = splu(
-        whole[free][:, free].tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+    inner, symmetric = whole[free][:, free].tocsc(), {"SymmetricMode": True}
+    factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
     corners = quadrature(tets.points, tets.cells, np.eye(4))
     return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip)
 

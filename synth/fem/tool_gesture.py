@@ -181,8 +181,7 @@ def tractions(gesture: Gesture, motion: ToolMotion, vertices: Floats, area: Floa
 def footprint(
     centre: Floats, size: float | Floats, vertices: Floats, area: Floats, ring: bool = False
 ) -> Floats:
-    """Pressure (V,) 1/mm^2 of a unit force: the kernel (1 - (r/a)^2)^2 on the surface, sum(area * result) =
-    1.
+    """Pressure (V,) 1/mm^2 of a unit force: (1 - (r/a)^2)^2 on the surface, sum(area * result) = 1.
 
     `centre`: (2,) mm, world x, y; `size`: a [mm], or the half axes (2, 2) mm of an ellipse; `vertices`,
     `area`: (V, 3) mm at rest, (V,) mm^2; `ring`: the kernel is that of the distance from a ring in its outer
@@ -222,10 +221,7 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
 
 def pose(gesture: Gesture, motion: ToolMotion, surface: Shape, moved: Floats) -> tuple[Floats, Floats]:
     """Tips (T, 2, 3) mm of the instrument, which rest on the tissue while they load it, and unit vectors (T,
-    2, 3) from tip to hand.
-
-    `surface` is at rest; `moved` (T, V, 3) mm are its vertices over time. Raises UserError as `anchors`.
-    """
+    2, 3) from tip to hand, of a surface at rest whose vertices move (T, V, 3) mm. Raises as `anchors`."""
     corners, weights = anchors(gesture, motion, surface)
     each = zip(weights, corners, moved, strict=True)
     touched = np.stack([np.einsum("kc,kcd->kd", w, at[c]) for w, c, at in each])

@@ -1,15 +1,12 @@
 """Correction of a flow and its standard deviation by a small network trained on rendered scenes.
 
 A flow has systematic errors where an instrument hides or shades tissue, and where a dimple turns away from
-the lamps. The energy of an estimator cannot reveal them; ground truth of renders does. The network (a U-Net,
-Ronneberger et al., MICCAI 2015) works on cells of 4 x 4 px and does not see pictures. Its features are the
-masks, the flow and its agreement, changes of light and colour, and the remaining steps of Lucas and Kanade's
-equations (IJCAI 1981) over two windows, in brightness and in colour, each without the mean change of the
-window. All are in pixels or ratios, so that little of the renderer's appearance can be learnt. The outputs
-are the correction and the logarithm of its variance (Kendall and Gal, NeurIPS 2017, eq. 5, with Student's
-distribution).
-
-`evidence.flow.correction_training` trains the weights. They are stored next to this file with a card.
+the lamps. The network works on cells of 4 x 4 px and does not see pictures. Its features are the masks, the
+flow and its agreement, changes of light and colour, and the remaining steps of Lucas and Kanade's equations
+(IJCAI 1981) over two windows, in brightness and in colour, each without the mean change of the window. All
+are in pixels or ratios, so that little of the renderer's appearance can be learnt. The outputs are the
+correction and the logarithm of its variance (Kendall and Gal, NeurIPS 2017, eq. 5, with Student's
+distribution). `evidence.flow.correction_training` trains the weights, stored next to this file with a card.
 """
 
 from __future__ import annotations
@@ -130,13 +127,11 @@ def describe(
     """`FEATURES` (CHANNELS, h, w) float32 of a frame and its flow on cells of 4 x 4 px.
 
     Args:
-        rest: (H, W, 3) uint8.
-        now: (H, W, 3) uint8.
+        rest, now: (H, W, 3) uint8.
         rest_usable: (H, W), unmasked tissue in the rest frame.
         greys: (H, W) each, the contrast-normalised rest frame and frame now, the latter warped by the flow.
         visible: (H, W) 1 where the sampled pixels of the frame now are usable, else 0; see `image.warp`.
-        flow: (H, W, 2) px.
-        agreed: (H, W) in 0..1, agreement of the two greys.
+        flow, agreed: (H, W, 2) px, and (H, W) in 0..1, its agreement.
     """
     height, width = agreed.shape
     u, v = cv2.split(flow)

@@ -41,6 +41,12 @@ class Level:
     now_usable: Tensor
 
 
+def ends(flow: Map) -> tuple[Map, Map]:
+    """Columns and rows, (H, W) px each, to which a flow (H, W, 2) px leads."""
+    x, y = (np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])
+    return x + flow[..., 0], y[:, None] + flow[..., 1]
+
+
 def tensor(picture: Pixels) -> Tensor:
     """Luminance of (H, W, 3) or (B, H, W, 3) uint8 RGB in grey levels: (B, 1, H, W)."""
     rgb = torch.from_numpy(np.ascontiguousarray(picture)).float()

@@ -31,9 +31,8 @@ def glare(rgb: Pixels, dilate_px: int = 1) -> Mask:
     whiteness = np.minimum(least, blue)
     second = np.maximum(least, np.minimum(most, blue))
     height, width = whiteness.shape
-    small = cv2.resize(
-        whiteness, (max(1, width // _SHRINK), max(1, height // _SHRINK)), interpolation=cv2.INTER_AREA
-    )
+    size = max(1, width // _SHRINK), max(1, height // _SHRINK)
+    small = cv2.resize(whiteness, size, interpolation=cv2.INTER_AREA)
     window = max(3, (max(height, width) // (4 * _SHRINK)) | 1)
     median = cv2.resize(cv2.medianBlur(small, window), (width, height), interpolation=cv2.INTER_LINEAR)
     bright = (whiteness.astype(np.float32) > median + _ABOVE) | (second > _CLIPPED)
@@ -41,16 +40,12 @@ def glare(rgb: Pixels, dilate_px: int = 1) -> Mask:
 
 
 def tool(rgb: Pixels) -> Mask:
-    """Instrument mask (H, W) of `rgb` (H, W, 3) uint8, grown by 2 px.
-
-    It joins the output of the U-Net of `toolnet`, trained on rendered instruments, with grey bodies (steel)
-    that the network does not reject.
-    """
+    """Instrument mask (H, W) of `rgb` (H, W, 3) uint8, grown by 2 px."""
     return _grow(both(rgb, toolnet.load()), 2)
 
 
 def both(rgb: Pixels, net: toolnet.ToolNet) -> Mask:
-    """Instrument mask (H, W): pixels of high probability, and whole grey bodies of some probability."""
+    """Instruments (H, W): pixels of high probability, and whole grey bodies (steel) of some probability."""
     probable = toolnet.probability(net, rgb)
     count, label = cv2.connectedComponents(grey_bodies(rgb).astype(np.uint8))
     size = np.bincount(label.ravel(), minlength=count)

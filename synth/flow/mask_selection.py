@@ -9,7 +9,7 @@ of its neighbours). No proposal is masked if the unmasked flow has the higher co
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,8 +22,7 @@ from synth.flow.estimator import Estimator
 from synth.flow.track import Solution, Tracker
 
 
-@dataclass(frozen=True)
-class SelectionConstants:
+class Selection:
     """Thresholds of the selection, chosen on the foreign videos of docs/results/flow/recordings: masking all
     proposals costs 0.55 px there, masking selected ones 0.17. The unit of residuals is a local deviation."""
 
@@ -39,9 +38,6 @@ class SelectionConstants:
     every: int = 60  # frames for each further selection
 
 
-SELECTION = SelectionConstants()
-
-
 @dataclass(frozen=True, eq=False)
 class Proposal:
     """Masks (H, W) of what may not be tissue in a picture, and of what is certainly not."""
@@ -52,12 +48,9 @@ class Proposal:
 
     def within(self, tissue: Mask) -> Proposal:
         """The same without a kind that covers an implausible share of the tissue."""
-        most = SELECTION.largest * np.count_nonzero(tissue)
-        glare, tool = (
-            kind if np.count_nonzero(kind & tissue) <= most else np.zeros_like(kind)
-            for kind in (self.glare, self.tool)
-        )
-        return replace(self, glare=glare, tool=tool)
+        most = Selection.largest * np.count_nonzero(tissue)
+        glare, tool = (one & (np.count_nonzero(one & tissue) <= most) for one in (self.glare, self.tool))
+        return Proposal(glare, tool, self.known)
 
     @property
     def either(self) -> Mask:
@@ -67,7 +60,7 @@ class Proposal:
     def blocks(self) -> NDArray[np.int16]:
         """Block numbers (2, H, W) of glare and of tool, from 1; 0 where there is no proposal."""
         height, width = self.glare.shape
-        side = max(1, max(height, width) // SELECTION.cells)
+        side = max(1, max(height, width) // Selection.cells)
         row, column = np.arange(height, dtype=np.int16) // side, np.arange(width, dtype=np.int16) // side
         square = 1 + row[:, None] * (column[-1] + 1) + column
         return np.stack([self.glare * square, self.tool * (square + square[-1, -1])])
@@ -104,7 +97,7 @@ class SelectingTracker:
         found = found.within(tracker.tissue)
         verdict = self._verdict[found.blocks()]
         self.blocked = found.known | (verdict > 0).any(0)
-        new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= SELECTION.new_px
+        new = np.count_nonzero(found.either & (verdict == 0).all(0)) >= Selection.new_px
         # Near a proposal the confidence depends on the proposal too.
         tracker.unsure = _widened((found.either | self.rest_found.either).astype(np.int16)) > 0
         resets = tracker.resets
@@ -112,9 +105,9 @@ class SelectingTracker:
         first, low_confidence = tracker.last, not tracker.trusted
         assert first is not None
         self._frames += 1
-        due = new or low_confidence or self._motion(flow) > self._tested_px + SELECTION.grown_px
+        due = new or low_confidence or self._motion(flow) > self._tested_px + Selection.grown_px
         proposed = (found.either | self.rest_found.either).any()
-        if due and proposed and self._selections < SELECTION.first + self._frames / SELECTION.every:
+        if due and proposed and self._selections < Selection.first + self._frames / Selection.every:
             self._selections += 1
             better = self._select(frame, found, first)
             if better is not first:
@@ -191,10 +184,9 @@ class SelectingTracker:
                 covered, around = mean(residual, layer, inside), mean(residual, near, common)
                 gain = mean(residual - left, near, common)
                 usually = np.where(np.isfinite(around[1]) & local, around, [[usual], [0.0]])
-                margin = SELECTION.unexplained + SELECTION.sure * np.hypot(covered[1], usually[1])
-                chosen |= (covered[0] > usually[0] + margin) | (
-                    gain[0] > SELECTION.gain + SELECTION.sure * gain[1]
-                )
+                margin = Selection.unexplained + Selection.sure * np.hypot(covered[1], usually[1])
+                chosen |= covered[0] > usually[0] + margin
+                chosen |= gain[0] > Selection.gain + Selection.sure * gain[1]
             chosen[0] = False
             return chosen
 
@@ -211,16 +203,14 @@ def _residual(rest: torch.Tensor, now: torch.Tensor, flow: Map) -> Map:
 
 def _at_rest(blocks: NDArray[np.int16], flow: Map) -> NDArray[np.int16]:
     """Block numbers (2, H, W) of the frame now on the pixels of the rest frame; -1 outside the picture."""
-    height, width = flow.shape[:2]
-    x = np.arange(width, dtype=np.float32) + flow[..., 0]
-    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
-    moved = [cv2.remap(one.astype(np.float32), x, y, cv2.INTER_NEAREST, borderValue=-1) for one in blocks]
+    ends = image.ends(flow)
+    moved = [cv2.remap(one.astype(np.float32), *ends, cv2.INTER_NEAREST, borderValue=-1) for one in blocks]
     return np.stack(moved).astype(np.int16)
 
 
 def _widened(number: NDArray[np.int16]) -> NDArray[np.int16]:
     """Block numbers (H, W) grown by a ring; where rings overlap, the larger number."""
-    wide = 2 * SELECTION.ring_px + 1
+    wide = 2 * Selection.ring_px + 1
     return np.asarray(cv2.dilate(number, np.ones((wide, wide), np.uint8)), np.int16)
 
 

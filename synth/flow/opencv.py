@@ -18,8 +18,7 @@ _cv2: Any = cv2  # the type stubs of OpenCV lack the contributed modules
 class OpenCvTvl1:
     """TV-L1 of Zach, Pock and Bischof (2007) in OpenCV, with settings chosen for cortex.
 
-    OpenCV's default pyramid (step 0.8, 5 levels) is too shallow for motion of 10 px, and an initial flow is
-    ignored unless `useInitialFlow` is set.
+    OpenCV's default pyramid (step 0.8, 5 levels) is too shallow for motion of 10 px.
     """
 
     def __init__(self, weight: float = 0.1, warps: int = 3) -> None:
@@ -83,11 +82,9 @@ def _prepare(picture: Pixels, usable: Mask) -> Pixels:
 
 def _confidence(flow: Map, before: Pixels, after: Pixels, rest_usable: Mask, now_usable: Mask) -> Map:
     """(H, W) in 0..1: agreement of the aligned pictures; 0 where a point is masked in either."""
-    height, width = rest_usable.shape
-    x = np.arange(width, dtype=np.float32) + flow[..., 0]
-    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
-    visible = cv2.remap(now_usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) * rest_usable
-    aligned = cv2.remap(after.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at = *image.ends(flow), cv2.INTER_LINEAR
+    visible = cv2.remap(now_usable.astype(np.float32), *at, borderValue=0) * rest_usable
+    aligned = cv2.remap(after.astype(np.float32), *at, borderMode=cv2.BORDER_REPLICATE)
     difference = cv2.GaussianBlur(((aligned - before) * visible / image.GREY_PER_DEVIATION) ** 2, (0, 0), 2.0)
     share = cv2.GaussianBlur(visible, (0, 0), 2.0)
     residual = difference / np.maximum(share, 1e-3)

@@ -14,8 +14,7 @@ from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Estimator, create
 
 
-@dataclass(frozen=True)
-class TrackingConstants:
+class Tracking:
     """When a frame is solved again or counts as lost; chosen by hand where no source is given."""
 
     low: float = 0.5  # mean confidence over visible tissue below which a frame is solved again from zero
@@ -24,9 +23,6 @@ class TrackingConstants:
     free: float = 0.02  # unmasked share of the tissue; a frame with less is lost
     wider: float = 0.2  # gain in confidence for which surroundings are used; they cost 10% error (design.md)
     tries: int = 3  # frames in which surroundings are tried, to limit the time
-
-
-TRACKING = TrackingConstants()
 
 
 @dataclass(frozen=True)
@@ -61,17 +57,8 @@ class Tracker:
     """
 
     def __init__(self, backend: str | Estimator, rest: Pixels, rest_blocked: Mask, tissue: Mask) -> None:
-        """Starts at the rest frame.
-
-        Args:
-            backend: an estimator or its name.
-            rest: the rest frame, (H, W, 3) uint8.
-            rest_blocked: (H, W), its instrument and glare masks.
-            tissue: (H, W), where tissue is tracked.
-
-        Raises:
-            UserError: no such estimator.
-        """
+        """Starts at the rest frame (H, W, 3) uint8 with its mask of instruments and glare and that of tissue
+        to be tracked, (H, W) each. UserError: no such estimator."""
         self.estimator = create(backend)
         self.rest, self.tissue = rest, tissue
         self.usable = tissue & ~rest_blocked
@@ -87,8 +74,7 @@ class Tracker:
     def step(self, frame: Pixels, blocked: Mask) -> tuple[Map, Map]:
         """Flow (H, W, 2) px and confidence (H, W) of the next frame (H, W, 3) uint8; sets `trusted`.
 
-        `blocked`: (H, W), its instrument and glare masks. Raises UserError if shapes differ from the rest
-        frame's.
+        `blocked`: (H, W), its instruments and glare. UserError: shapes differ from the rest frame's.
         """
         if frame.shape != self.rest.shape or blocked.shape != self.tissue.shape:
             raise UserError(f"flow: frame {frame.shape} does not fit the rest frame {self.rest.shape}")
@@ -106,11 +92,11 @@ class Tracker:
 
         Still surroundings stabilise the flow of tissue with little texture; otherwise they bias its rim.
         """
-        if self.widened or self._tries >= TRACKING.tries:
+        if self.widened or self._tries >= Tracking.tries:
             return found
         self.widened, self._tries = True, self._tries + 1
         wider = self.solve(frame, blocked, None)
-        self.widened = wider.level > found.level + TRACKING.wider
+        self.widened = wider.level > found.level + Tracking.wider
         return wider if self.widened else found
 
     def solve(self, frame: Pixels, blocked: Mask, initial: Map | None) -> Solution:
@@ -120,20 +106,20 @@ class Tracker:
         confidence = confidence * self.tissue
         visible = self.usable & ~blocked
         where, tissue = visible & ~self.unsure, int(np.count_nonzero(self.tissue))
-        if np.count_nonzero(where) < TRACKING.free * tissue:
+        if np.count_nonzero(where) < Tracking.free * tissue:
             where = visible
         inside = confidence[where] if where.any() else np.zeros(1, np.float32)
         return Solution(
             flow,
             confidence,
             level=float(inside.mean(dtype=np.float64)),
-            is_matched=float(np.mean(inside >= LOW_CONFIDENCE)) >= TRACKING.matched,
-            is_visible=int(np.count_nonzero(visible)) / max(1, tissue) >= TRACKING.free,
+            is_matched=float(np.mean(inside >= LOW_CONFIDENCE)) >= Tracking.matched,
+            is_visible=int(np.count_nonzero(visible)) / max(1, tissue) >= Tracking.free,
         )
 
     def needs_retry(self, found: Solution) -> bool:
         """Whether the confidence of a flow is low, alone or relative to the last trusted frame."""
-        return found.level < max(TRACKING.low, TRACKING.drop * self._level)
+        return found.level < max(Tracking.low, Tracking.drop * self._level)
 
     def accept(self, found: Solution) -> tuple[Map, Map]:
         """Makes a solution that of the frame; the next frame starts from it if it is trusted."""

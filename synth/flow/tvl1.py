@@ -70,20 +70,12 @@ class TVL1Settings:
 
 
 class Tvl1:
-    """The estimator `tvl1`: masked TV-L1 with two stages for a cold start and one for a warm start.
+    """The estimator `tvl1`: masked TV-L1 with two stages for a cold start and one for a warm start."""
 
-    Both use the same number of warps: half as many smooth less and give 1.12 times the error in warm frames.
-    """
-
-    def __init__(self, settings: TVL1Settings | None = None, *, corrected: bool = True) -> None:
-        """Loads the network.
-
-        Args:
-            settings: energy and solver; None: the defaults.
-            corrected: whether a network corrects the flow and gives its confidence, which otherwise is the
-                local correlation of the rest and the warped frame; see `synth.flow.correction`.
-        """
-        self.settings = settings or TVL1Settings()
+    def __init__(self, settings: TVL1Settings = TVL1Settings(), *, corrected: bool = True) -> None:
+        """`corrected`: a network corrects the flow and gives its confidence, which otherwise is the local
+        correlation of the rest and the warped frame; see `synth.flow.correction`."""
+        self.settings = settings
         self.correction = correction.load() if corrected else None
         # The last rest frame, its mask and its pyramid, which are the same for all frames of a video.
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
@@ -98,11 +90,9 @@ class Tvl1:
                 # Planes: sums over neighbours take five times as long on interleaved components.
                 planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
                 start = torch.from_numpy(planes)[None]
-            found, agreed, aligned = self.tensors(
-                *(image.tensor(rest), image.tensor(now)),
-                *(image.flags(rest_usable), image.flags(now_usable)),
-                start,
-            )
+            pictures = image.tensor(rest), image.tensor(now)
+            usable = image.flags(rest_usable), image.flags(now_usable)
+            found, agreed, aligned = self.tensors(*pictures, *usable, start)
             flow, sure = found[0].movedim(0, -1).numpy(), agreed[0, 0].numpy()
             if self.correction is None:
                 return flow, sure
@@ -113,12 +103,7 @@ class Tvl1:
             return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
     def tensors(
-        self,
-        rest: Tensor,
-        now: Tensor,
-        rest_usable: Tensor,
-        now_usable: Tensor,
-        initial: Tensor | None = None,
+        self, rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, initial: Tensor | None
     ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
         """Uncorrected flow on tensors: greys and masks (1, 1, H, W), initial flow (1, 2, H, W).
 
@@ -175,8 +160,7 @@ def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
 
 
 def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tensor:
-    """Flow (B, 2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result, or
-    None."""
+    """Flow (B, 2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
     coarsest = levels[-1].now
     flow = coarsest.new_zeros(coarsest.shape[0], 2, *coarsest.shape[-2:])
     weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
@@ -260,8 +244,7 @@ def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, number
 
     Args:
         before, after: (6, H, W), I, d_x, d_y, d_xx, d_xy, d_yy of the rest frame and of the warped frame.
-        mask, weight: (H, W).
-        flow: (2, H, W) px, the point of linearisation.
+        mask, weight, flow: (H, W), and (2, H, W) px, the point of linearisation.
         numbers: tau, gamma, epsilon, h, and its increase where nothing is visible.
         state: see `new_state`; its last six planes are written.
     """

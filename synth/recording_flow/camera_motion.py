@@ -1,9 +1,8 @@
 """Camera motion in a video: a similarity of the picture, estimated on rigid surroundings and removed.
 
-A microscope that is bumped, drifts, zooms or rotates moves the whole picture, which would otherwise count as
-motion of the tissue. Corners (Shi & Tomasi, CVPR 1994) of the surroundings in the rest frame (rim, drape and
-bone) are tracked into each frame (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is
-fitted to them robustly. Where the surroundings are too small, `shared_motion` estimates it from the tissue.
+Corners (Shi & Tomasi, CVPR 1994) of the surroundings in the rest frame (rim, drape and bone) are tracked into
+each frame (Lucas & Kanade, IJCAI 1981, in Bouguet's pyramid), and a similarity is fitted to them robustly.
+Where the surroundings are too small, `shared_motion` estimates it from the tissue.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from synth.flow import image
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
 
 
-@dataclass(frozen=True)
-class CornerConstants:
+class Corner:
     """Constants of the fit, chosen by hand on textures (tests/synth/recording_flow/test_camera_motion.py)."""
 
     corners: int = 200  # most corners
@@ -41,9 +39,6 @@ class CornerConstants:
     sure: float = 4.0  # least shift in standard deviations
 
 
-CORNERS = CornerConstants()
-
-
 @dataclass(frozen=True, eq=False)
 class Similarity:
     """Shift, rotation and scale of a picture relative to the rest frame."""
@@ -55,9 +50,8 @@ class Similarity:
     def undo(self, picture: Pixels) -> Pixels:
         """Resamples a picture (H, W[, C]) uint8 to the view of the camera at rest."""
         x, y = map(_unbiased, self._places(picture.shape))
-        return np.asarray(
-            cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8
-        )
+        found = cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found, np.uint8)
 
     def outside(self, size: tuple[int, ...]) -> Mask:
         """Mask (H, W) of the pixels of the rest frame that are outside the moved picture."""
@@ -139,10 +133,13 @@ class CameraTracker:
         """Starts at the rest frame (H, W, 3); masks (H, W): `tissue` may deform; `blocked`: tool, glare."""
         self._basis = SimilarityBasis(tissue.shape)
         self._rest = _contrast(rest)
-        element = np.ones((2 * CORNERS.rim_px + 1,) * 2, np.uint8)
+        element = np.ones((2 * Corner.rim_px + 1,) * 2, np.uint8)
         near, hidden = (cv2.dilate(one.astype(np.uint8), element) > 0 for one in (tissue, blocked))
-        self._points = _corners(self._rest, ~near & ~hidden)
-        self.is_blind = len(self._points) < CORNERS.points  # too little surroundings in the rest frame
+        free = (~near & ~hidden).astype(np.uint8)
+        how = Corner.corners, 0.01, Corner.apart_px
+        found = cv2.goodFeaturesToTrack(self._rest, *how, mask=free, blockSize=7)
+        self._points = np.zeros((0, 2), np.float32) if found is None else found[:, 0]  # (N, 2) px
+        self.is_blind = len(self._points) < Corner.points  # too little surroundings in the rest frame
         rows, columns = np.nonzero(tissue)
         some = slice(None, None, max(1, len(rows) // 100))
         self._tissue = np.column_stack([columns, rows])[some].astype(np.float64)
@@ -151,25 +148,22 @@ class CameraTracker:
         self._course: Course = []
 
     def find(self, rgb: Pixels, time_s: float | None) -> Similarity | None:
-        """Camera motion in a frame (H, W, 3) uint8; None: none since the rest frame.
-
-        Where it cannot be estimated, that of the previous frame.
-        """
+        """Camera motion in a frame (H, W, 3) uint8, else in the previous one; None: none since rest."""
         now = _contrast(rgb)
         last = self._last
         before = last or Similarity(np.eye(2, 3))
         found = self._find(now, before)
-        if found is None and self._length((jump := self._jump(now)) - before.matrix) > CORNERS.far_px:
+        if found is None and self._length((jump := self._jump(now)) - before.matrix) > Corner.far_px:
             found = self._find(now, Similarity(jump))
         if found is None:
             self._unknown_s.append(time_s or 0.0)
             if last is not None:
                 self._last = replace(last, deviation_px=float(np.hypot(last.deviation_px, self._usual_px())))
         # The threshold holds only for the first motion.
-        elif last is not None or found.length_px > max(CORNERS.still_px, CORNERS.sure * found.deviation_px):
+        elif last is not None or found.length_px > max(Corner.still_px, Corner.sure * found.deviation_px):
             step = self._length(found.matrix - before.matrix)
             self._course.append((time_s or 0.0, found, step))
-            if last is not None and step < CORNERS.sure * found.deviation_px:
+            if last is not None and step < Corner.sure * found.deviation_px:
                 # A step within the error, as during a large contact, is shrunk towards the usual step.
                 share = 1 / (1 + (found.deviation_px / max(self._usual_px(), 1e-3)) ** 2)
                 found = replace(found, matrix=last.matrix + share * (found.matrix - last.matrix))
@@ -201,10 +195,10 @@ class CameraTracker:
         if self.is_blind:
             return None
         start = (points @ near.matrix[:, :2].T + near.matrix[:, 2]).astype(np.float32)
-        how = None, None, CORNERS.window, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
+        how = None, None, Corner.window, 3, _STOP, cv2.OPTFLOW_USE_INITIAL_FLOW
         there, status, _ = cv2.calcOpticalFlowPyrLK(self._rest, now, points, start, *how)
         known = (status[:, 0] > 0) & ((there > 3) & (there < np.array(now.shape[::-1]) - 4)).all(axis=1)
-        if known.sum() < CORNERS.points:
+        if known.sum() < Corner.points:
             return None
         at, shift = points[known].astype(np.float64), (there - points)[known].astype(np.float64)
         guess, _ = cv2.estimateAffinePartial2D(at, at + shift, ransacReprojThreshold=0.5)
@@ -212,18 +206,18 @@ class CameraTracker:
             return None
         design, parameters = self._basis.design(at), np.zeros(4)
         left = at + shift - (at @ guess[:, :2].T + guess[:, 2])
-        for _ in range(CORNERS.rounds):
+        for _ in range(Corner.rounds):
             off = np.linalg.norm(left, axis=1)
             weight, spread = weigh_outliers(off, off)
             weighed = np.repeat(weight, 2)[:, None] * design
             normal = weighed.T @ design
-            if weight.sum() < CORNERS.points / 2 or np.linalg.cond(normal) > CORNERS.singular:
+            if weight.sum() < Corner.points / 2 or np.linalg.cond(normal) > Corner.singular:
                 return None
             parameters = np.linalg.solve(normal, weighed.T @ shift.ravel())
             left = shift - (design @ parameters).reshape(-1, 2)
         tissue = self._basis.design(self._tissue)
         leverage = ((tissue @ np.linalg.inv(normal)) * tissue).sum(axis=1).mean()
-        variance = CORNERS.correlated * spread**2 * 2 * leverage
+        variance = Corner.correlated * spread**2 * 2 * leverage
         matrix = self._basis.matrix(parameters)
         length = self._length(matrix - np.eye(2, 3))
         # Surroundings that move more near the tissue than far from it are tissue outside the mask.
@@ -232,8 +226,8 @@ class CameraTracker:
             (weight[:, None] * left)[half].sum(axis=0) / weight[half].sum()
             for half in (away < np.median(away), away >= np.median(away))
         )
-        deforms = np.linalg.norm(close - far) > max(CORNERS.unlike * length, CORNERS.still_px)
-        if deforms or variance > CORNERS.uncertain_px**2:
+        deforms = np.linalg.norm(close - far) > max(Corner.unlike * length, Corner.still_px)
+        if deforms or variance > Corner.uncertain_px**2:
             return None
         return Similarity(matrix, float(np.sqrt(variance)), length)
 
@@ -244,21 +238,14 @@ class CameraTracker:
 
 def weigh_outliers(off: Floats, typical: Floats) -> tuple[Floats, float]:
     """Tukey's biweight (N,) of distances [px], and a component's standard deviation from `typical` ones."""
-    spread = max(float(np.median(typical)) / 1.18, CORNERS.spread_px)  # Rayleigh's median
-    return np.maximum(1 - (off / (CORNERS.outlier * spread)) ** 2, 0) ** 2, spread
+    spread = max(float(np.median(typical)) / 1.18, Corner.spread_px)  # Rayleigh's median
+    return np.maximum(1 - (off / (Corner.outlier * spread)) ** 2, 0) ** 2, spread
 
 
 def _contrast(rgb: Pixels) -> Pixels:
     """Local contrast (H, W) of a frame."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return image.local_contrast(cv2.GaussianBlur(grey, (0, 0), CORNERS.smooth_px), CORNERS.window)
-
-
-def _corners(picture: Pixels, where: Mask) -> Map:
-    """Corners (N, 2) px of a picture inside a mask."""
-    mask = where.astype(np.uint8) * 255
-    found = cv2.goodFeaturesToTrack(picture, CORNERS.corners, 0.01, CORNERS.apart_px, mask=mask, blockSize=7)
-    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found[:, 0], np.float32)
+    return image.local_contrast(cv2.GaussianBlur(grey, (0, 0), Corner.smooth_px), Corner.window)
 
 
 def _unbiased(place: Map) -> Map:

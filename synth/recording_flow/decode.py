@@ -72,7 +72,7 @@ class Decoder:
         footage: Footage,
         settings: RecordingFlowSettings,
         watch: Stopwatch,
-        progress: Callable[[int], None] = lambda done: None,
+        progress: Callable[[int], None],
     ) -> None:
         """Decodes the video up to its rest frame; arguments as for `passes`.
 
@@ -109,8 +109,8 @@ class Decoder:
         rgb = shrink_picture(picture.rgb, self.rest.shrink)
         if picture.time_s is not None:
             self.faults.add_tracked(picture.time_s, picture.rgb, rgb)
-        size = self.rest.tissue.shape
-        none, trusted = (np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)), not self.rest.fault
+        size, trusted = self.rest.tissue.shape, not self.rest.fault
+        none = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
         return FrameMotion(*none, trusted, index=picture.index, time_s=picture.time_s, rgb=rgb)
 
     def _decode(self) -> Iterator[Picture]:

@@ -37,10 +37,7 @@ class GatherMotion:
         return frame
 
     def search(self, free_s: Sequence[Span], fills_picture: bool) -> PulseSearch:
-        """Pulsation of the tissue, and the camera's motion if tissue `fills_picture`, after the last frame.
-
-        `free_s`: spans known to be without contact [s].
-        """
+        """Pulsation of the tissue, and the camera's motion if tissue `fills_picture`; see `find_pulse`."""
         surface = self._surface
         if self._depth_weights:
             surface.depth_weight = min(1.0, float(np.median(self._depth_weights)))

@@ -8,8 +8,6 @@ without one would visibly move, and if what is still has other colours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -20,8 +18,7 @@ from synth.recording_flow.finding import Finding, Severity
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame
 
 
-@dataclass(frozen=True)
-class TissueConstants:
+class Limits:
     """Constants of the search, chosen by hand on renders and on photographs that were warped in a part."""
 
     frames: int = 16  # tracked: in each part of the video the one that differs most from the rest frame
@@ -37,32 +34,26 @@ class TissueConstants:
     visible: float = 0.7  # share of frames in which a pixel has to be tracked
     rounds: int = 5  # of GrabCut
     small: float = 0.05  # share of the picture below which what is found is doubtful
-    solid: float = (
-        0.93  # share of its convex hull below which the result is doubtful: right ones 0.95 and more
-    )
-
-
-CONSTANTS = TissueConstants()
+    solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
 
 
 def choose_frames(footage: Footage) -> frozenset[int]:
-    """Numbers of the rest frame and of some later ones, as `TissueConstants.frames` says."""
+    """Numbers of the rest frame and of some later ones, as `Limits.frames` says."""
     rest: Map | None = None
     number, change = list[int](), list[float]()
     for picture in footage.pictures():
         wanted = footage.only is None or picture.index in footage.only
         if picture.index < footage.rest_frame or not wanted or (number and picture.time_s is None):
             continue
-        some = picture.rgb[:: CONSTANTS.step_px, :: CONSTANTS.step_px].astype(np.float32)
+        some = picture.rgb[:: Limits.step_px, :: Limits.step_px].astype(np.float32)
         rest = some if rest is None else rest
         number.append(picture.index)
         change.append(float(np.abs(some - rest).mean()) if some.shape == rest.shape else 0.0)
     if not number:  # `Decoder` reports it
         return frozenset()
-    parts = np.array_split(np.arange(1, len(number)), CONSTANTS.frames)
-    return frozenset(
-        number[k] for k in [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
-    )
+    parts = np.array_split(np.arange(1, len(number)), Limits.frames)
+    chosen = [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
+    return frozenset(number[k] for k in chosen)
 
 
 class TissueSearch:
@@ -70,9 +61,8 @@ class TissueSearch:
 
     def __init__(self, rest: RestFrame) -> None:
         self._rest, self._frames = rest, 0
-        self._square, self._variance, self._count, self._hidden = np.zeros(
-            (4, *rest.tissue.shape), np.float32
-        )
+        sums = np.zeros((4, *rest.tissue.shape), np.float32)
+        self._square, self._variance, self._count, self._hidden = sums
 
     def add(self, frame: FrameMotion) -> None:
         """Adds a frame."""
@@ -80,7 +70,7 @@ class TissueSearch:
             found = frame.proposal.within(self._rest.tissue)
             self._tool = found.tool | found.known
         elif frame.trusted:
-            known = frame.confidence > CONSTANTS.sure
+            known = frame.confidence > Limits.sure
             self._square += known * np.square(frame.flow).sum(axis=-1)
             self._variance += known * 2 * deviation(frame.confidence) ** 2
             self._count += known
@@ -90,23 +80,22 @@ class TissueSearch:
     def find(self) -> tuple[Mask, Finding]:
         """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
         whole = self._rest.tissue
-        near, wide = (max(1, round(share * len(whole))) for share in (CONSTANTS.near, CONSTANTS.wide))
-        hidden = self._tool | (self._hidden > (1 - CONSTANTS.visible) * self._frames)
-        visible = (
-            whole & (self._count > CONSTANTS.visible * self._frames) & ~_morph(hidden, cv2.MORPH_DILATE, near)
-        )
+        near, wide = (max(1, round(share * len(whole))) for share in (Limits.near, Limits.wide))
+        hidden = self._tool | (self._hidden > (1 - Limits.visible) * self._frames)
+        visible = whole & (self._count > Limits.visible * self._frames)
+        visible &= ~_morph(hidden, cv2.MORPH_DILATE, near)
         motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
-        moves = visible & (motion > CONSTANTS.moves * noise)
+        moves = visible & (motion > Limits.moves * noise)
         if moves.any():
-            moves &= motion > CONSTANTS.well * np.median(motion[moves])
+            moves &= motion > Limits.well * np.median(motion[moves])
         moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
         core = _morph(moves, cv2.MORPH_ERODE, near)
         if not core.any():
             return whole, _state("nothing moves by which to find it: the whole picture is assumed")
-        expected = _expected(motion, moves) > CONSTANTS.moves * noise
+        expected = _expected(motion, moves) > Limits.moves * noise
         colours, still = _colours(self._rest.rgb), visible & (motion < noise)
-        is_bounded = np.mean(expected & still) > CONSTANTS.rim * np.mean(visible)
-        if not is_bounded or _overlap(colours, core, still) > CONSTANTS.alike:
+        is_bounded = np.mean(expected & still) > Limits.rim * np.mean(visible)
+        if not is_bounded or np.minimum(*_histograms(colours, core, still)).sum() > Limits.alike:
             if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
                 return whole, _state("it moves as tissue that fills the picture")
             text = "too little moves to find its rim: what moves is taken for it"
@@ -114,21 +103,19 @@ class TissueSearch:
         guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
         # From either guess tissue may be lost that instruments cut off: the rounder result is right.
         guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))
-        tissue, solid = max(
-            (self._region(colours, one, core, hidden) for one in guesses), key=lambda one: one[1]
-        )
+        found = [self._region(colours, one, core, hidden) for one in guesses]
+        tissue, solid = max(found, key=lambda one: one[1])
         text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
-        if tissue.mean() < CONSTANTS.small:
+        if tissue.mean() < Limits.small:
             return tissue, _state(f"{text}: is it an instrument that moves?", "warning")
-        if solid < CONSTANTS.solid:
-            return tissue, _state(
-                f"{text}, but with an uneven outline: see the picture of the masks", "warning"
-            )
+        if solid < Limits.solid:
+            text += ", but with an uneven outline: see the picture of the masks"
+            return tissue, _state(text, "warning")
         return tissue, _state(text)
 
     def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
         """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
-        near, wide = (max(1, round(share * len(core))) for share in (CONSTANTS.near, CONSTANTS.wide))
+        near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
         tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
         tissue = _largest(_with_hidden(tissue, core, hidden), core)
         tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
@@ -164,25 +151,20 @@ def _colours(rgb: Pixels) -> Pixels:
     return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
 
 
-def _histograms(colours: Pixels, first: Mask, second: Mask) -> list[Map]:
-    """Histograms of the colours (h, w, 3) in two masks, each of sum 1."""
-    bins, every = [CONSTANTS.bins] * 3, [0, 256] * 3
-    both = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in (first, second)]
-    return [np.asarray(one / max(one.sum(), 1), np.float32) for one in both]
-
-
-def _overlap(colours: Pixels, first: Mask, second: Mask) -> float:
-    """Overlap in 0..1 of the histograms of the colours (h, w, 3) in two masks."""
-    return float(np.minimum(*_histograms(colours, first, second)).sum())
+def _histograms(colours: Pixels, *masks: Mask) -> list[Map]:
+    """Histograms of the colours (h, w, 3) in masks, each of sum 1."""
+    bins, every = [Limits.bins] * 3, [0, 256] * 3
+    found = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in masks]
+    return [np.asarray(one / max(one.sum(), 1), np.float32) for one in found]
 
 
 def _by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pixels:
     """A guess that adds what has the colours (h, w, 3) of the core rather than of what is outside."""
     core_share, outside_share = (
-        cv2.GaussianBlur(one.reshape(CONSTANTS.bins, -1), (0, 0), 0.5).reshape(one.shape) + 1e-5
+        cv2.GaussianBlur(one.reshape(Limits.bins, -1), (0, 0), 0.5).reshape(one.shape) + 1e-5
         for one in _histograms(colours, core, outside)
     )
-    at = tuple((colours // (256 // CONSTANTS.bins)).transpose(2, 0, 1))
+    at = tuple((colours // (256 // Limits.bins)).transpose(2, 0, 1))
     odds = cv2.GaussianBlur(np.log(core_share[at] / outside_share[at]), (0, 0), 2)
     added = np.where((guess == cv2.GC_PR_BGD) & (odds > 0), cv2.GC_PR_FGD, guess)
     return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, added).astype(np.uint8)
@@ -190,7 +172,7 @@ def _by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pix
 
 def _inner(whole: Mask) -> Mask:
     """The picture without a band along its border."""
-    inside, band = np.zeros_like(whole), max(1, round(2 * CONSTANTS.wide * len(whole)))
+    inside, band = np.zeros_like(whole), max(1, round(2 * Limits.wide * len(whole)))
     inside[band:-band, band:-band] = True
     return inside
 
@@ -200,7 +182,7 @@ def _grow(colours: Pixels, guess: Pixels) -> Mask:
     label = guess.copy()
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((2, 1, 65))
-    cv2.grabCut(colours, label, None, background, foreground, CONSTANTS.rounds, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(colours, label, None, background, foreground, Limits.rounds, cv2.GC_INIT_WITH_MASK)
     return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
 
 

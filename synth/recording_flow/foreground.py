@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -13,9 +11,8 @@ from synth.recording_flow.finding import Finding
 from synth.recording_flow.frame_motion import FrameMotion
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Thresholds for foreground, chosen by hand on videos with foreign objects and without."""
+class Limits:
+    """Limits for foreground, chosen by hand on videos with foreign objects and without."""
 
     front_mm: float = 2.5  # least height above the surface of the tissue: more than its relief
     sigmas: float = 5.0  # least height in standard deviations of the depth
@@ -32,7 +29,6 @@ class Thresholds:
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
 
 
-LIMITS = Thresholds()
 _WIDE = "is wider than an instrument"
 
 
@@ -40,14 +36,8 @@ class ForegroundSearch:
     """Searches frames of a video, in order from the rest frame on."""
 
     def __init__(self, tissue: Mask, shrink: int, *, is_stated: bool, has_masks: bool) -> None:
-        """Starts before the rest frame.
-
-        Args:
-            tissue: (h, w) on the pixels of the frames, stated or found.
-            shrink: factor of downsampling of the frames.
-            is_stated: whether the tissue is stated.
-            has_masks: whether instruments' masks are given: without, narrow objects are instruments.
-        """
+        """Starts before the rest frame, with tissue (h, w) that `is_stated` or found, in frames downsampled
+        by `shrink`. `has_masks`: instruments' masks are given: without, narrow objects are instruments."""
         self._tissue, self._shrink = tissue, shrink
         self._is_stated, self._has_masks = is_stated, has_masks
         self._surface: tuple[Map, float] | None = None
@@ -67,28 +57,28 @@ class ForegroundSearch:
         masked = masked | tool
         self._masked |= masked
         self._find_wide(tool, frame)
-        free = cv2.erode((~masked).astype(np.uint8), _square(LIMITS.near_px), borderValue=1) > 0
+        free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)
             surface, deviation = self._surface
             with np.errstate(invalid="ignore"):
-                high = surface - depth_mm > max(LIMITS.front_mm, LIMITS.sigmas * deviation)
+                high = surface - depth_mm > max(Limits.front_mm, Limits.sigmas * deviation)
             if frame.is_rest and not self._is_stated:
-                self._surroundings = cv2.dilate(high.astype(np.uint8), _square(LIMITS.near_px)) > 0
+                self._surroundings = cv2.dilate(high.astype(np.uint8), _square(Limits.near_px)) > 0
             high &= free & ~self._surroundings
-            self._note("stands in front of the tissue", high, frame, LIMITS.front)
+            self._note("stands in front of the tissue", high, frame, Limits.front)
         if frame.is_rest or not frame.trusted:
             return
         lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
         # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
-        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(LIMITS.near_px)) > 0
-        self._note("hides tissue that is visible at rest", lost, frame, LIMITS.lost)
+        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0
+        self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
-        if motion > LIMITS.least_px and self._has_masks:  # else it would be that of an instrument
-            inner = cv2.erode(free.astype(np.uint8), _square(2 * LIMITS.across_px), borderValue=0) > 0
-            jump = flow_jump(frame.flow) > max(LIMITS.step_px, LIMITS.step * motion)
+        if motion > Limits.least_px and self._has_masks:  # else it would be that of an instrument
+            inner = cv2.erode(free.astype(np.uint8), _square(2 * Limits.across_px), borderValue=0) > 0
+            jump = flow_jump(frame.flow) > max(Limits.step_px, Limits.step * motion)
             edge = jump & inner & (frame.confidence > LOW_CONFIDENCE)
-            self._note("moves unlike tissue", edge, frame, 0.0, LIMITS.long)
+            self._note("moves unlike tissue", edge, frame, 0.0, Limits.long)
 
     @property
     def findings(self) -> list[Finding]:
@@ -106,7 +96,7 @@ class ForegroundSearch:
         width_px = _width(tool)
         if frame.is_rest:
             self._width_px = float(width_px.max())
-        least = max(LIMITS.wide * tool.shape[1], LIMITS.wider * self._width_px)
+        least = max(Limits.wide * tool.shape[1], Limits.wider * self._width_px)
         self._note(_WIDE, width_px > least, frame, 0.0)
 
     def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
@@ -119,7 +109,7 @@ class ForegroundSearch:
         if len(stats) < 2:
             return
         if not self._has_masks and why != _WIDE:
-            wide = np.unique(label[_width(whole > 0) > LIMITS.wide * where.shape[1]])
+            wide = np.unique(label[_width(whole > 0) > Limits.wide * where.shape[1]])
             stats[np.setdiff1d(np.arange(len(stats)), wide)] = 0
         k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
         found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
@@ -131,18 +121,16 @@ class ForegroundSearch:
 
 
 def fit_surface(depth_mm: Map, tissue: Mask) -> tuple[Map, float]:
-    """A smooth surface (h, w) mm fitted to the tissue, a mask (h, w), and the tissue's deviation from it
-    [mm].
+    """A smooth surface (h, w) mm fitted to the tissue (h, w), and the tissue's deviation from it [mm].
 
-    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front. `depth_mm`:
-    (h, w) along the optical axis; NaN: unknown.
+    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front.
     """
     height, width = depth_mm.shape
     y, x = np.mgrid[:height, :width] / max(height, width) - 0.5
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     known = tissue & np.isfinite(depth_mm)
     used, surface, deviation = known, np.full(depth_mm.shape, np.nan), 0.0
-    for _ in range(LIMITS.rounds):
+    for _ in range(Limits.rounds):
         if np.count_nonzero(used) < 10 * terms.shape[-1]:
             break
         surface = terms @ np.linalg.lstsq(terms[used], depth_mm[used], rcond=None)[0]
@@ -163,7 +151,7 @@ def flow_jump(flow: Map) -> Map:
         shift, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), (flow.shape[1], flow.shape[0])
         return np.asarray(cv2.warpAffine(flow, shift, size, borderMode=cv2.BORDER_REPLICATE))
 
-    most, near, far = np.zeros(flow.shape[:2], np.float32), LIMITS.across_px, 2.5 * LIMITS.across_px
+    most, near, far = np.zeros(flow.shape[:2], np.float32), Limits.across_px, 2.5 * Limits.across_px
     for dx, dy in ((1, 0), (0, 1), (0.7, 0.7), (0.7, -0.7)):
         a, b, c, d = (shifted(k * dx, k * dy) for k in (near, -near, far, -far))
         # The distance is 2 widths across the place and 1.5 widths on either side.

@@ -13,8 +13,7 @@ from synth.arrays import Floats
 Span = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class RhythmConstants:
+class Fit:
     """Constants of rhythms, chosen by hand on the videos of tests/synth/recording_flow/test_pulse.py."""
 
     harmonics: int = 3  # most harmonics of a phase
@@ -34,9 +33,6 @@ class RhythmConstants:
     alike: float = 0.03  # relative distance below which a rate equals a harmonic of another
 
 
-RHYTHM = RhythmConstants()
-
-
 @dataclass(frozen=True, eq=False)
 class Rhythm:
     """Motion of the whole surface as harmonics of one phase."""
@@ -50,9 +46,7 @@ class Rhythm:
 
     def phase(self, time_s: Floats) -> Floats:
         """Phase (T,) [rad]."""
-        return np.asarray(
-            2 * np.pi * self.rate_hz * time_s + np.interp(time_s, self.knots_s, self.lead), np.float64
-        )
+        return np.asarray(2 * np.pi * self.rate_hz * time_s + np.interp(time_s, self.knots_s, self.lead))
 
     def waves(self, time_s: Floats) -> Floats:
         """Cosine and sine (T, 2 H) of each harmonic."""
@@ -72,25 +66,18 @@ class Rhythm:
 def find_rhythms(
     t: Floats, coefficients: Floats, basis: Floats
 ) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...]]:
-    """Accepted and rejected rhythms of a motion, the strongest first, each in the residual of the previous
-    ones.
+    """Accepted and rejected rhythms, the strongest first, of a motion's coefficients (T, B, C) at (T,) s.
 
-    Accepted ones are periodic, predict held-out frames and move the surface evenly; rejected ones are
-    stronger than the last accepted one and must be fitted with it.
-
-    Args:
-        t: (T,) s.
-        coefficients: (T, B, C) of the motion.
-        basis: (P, B) polynomials at places of the surface.
+    Each is found in the residual of the previous ones. Accepted ones are periodic, predict held-out frames
+    and move the surface evenly; rejected ones are stronger than the last accepted one and must be fitted with
+    it. `basis`: (P, B) polynomials at places of the surface.
     """
     # In these coordinates the norm is the root mean square of the motion over the places.
     metric = np.linalg.cholesky(basis.T @ basis / len(basis) + 1e-12 * np.eye(basis.shape[1])).T
     y = np.einsum("ab,tbc->tac", metric, coefficients).reshape(len(t), -1)
     back = np.linalg.inv(metric)
-    found: list[Rhythm] = []
-    best: list[Rhythm] = []
-    accepted: list[bool] = []
-    while accepted.count(True) < RHYTHM.most and accepted.count(False) < RHYTHM.most:
+    found, best, accepted = list[Rhythm](), list[Rhythm](), list[bool]()
+    while accepted.count(True) < Fit.most and accepted.count(False) < Fit.most:
         rate = _strongest_rate(t, y, found)
         if rate is None:
             break
@@ -98,9 +85,9 @@ def find_rhythms(
         if _is_harmonic(found):
             break
         size = fit(t, y, found, back)[-1].amplitude(basis)
-        if np.median(size) < RHYTHM.least_px:
+        if np.median(size) < Fit.least_px:
             break
-        accepted.append(periodic and bool(np.percentile(size, 95) <= RHYTHM.even * np.median(size)))
+        accepted.append(periodic and bool(np.percentile(size, 95) <= Fit.even * np.median(size)))
         # Rejected rhythms after the last accepted one are noise and are not fitted.
         best = found if accepted[-1] else best
     fitted = list(zip(fit(t, y, best, back), accepted, strict=False))
@@ -108,11 +95,8 @@ def find_rhythms(
 
 
 def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[Rhythm]:
-    """Rhythms of known phase with their modes, fitted together with a constant and a drift by least squares.
-
-    `t`: (T,) s; `y`: (T, B C) coefficients of the motion, possibly in other coordinates, from which `back`
-    (B, B) transforms.
-    """
+    """Rhythms of known phase with their modes, fitted with a constant and a drift to coefficients `y`
+    (T, B C) at times (T,) s by least squares; `back` (B, B) transforms from the coordinates of `y`."""
     weights = np.linalg.lstsq(_design(t, rhythms), y, rcond=None)[0]
     modes = np.einsum("ab,kbc->kac", back, weights.reshape(len(weights), len(back), -1))
     ends = np.cumsum([2, *(2 * one.harmonics for one in rhythms)])
@@ -121,8 +105,8 @@ def fit(t: Floats, y: Floats, rhythms: Sequence[Rhythm], back: Floats) -> list[R
 
 def visible_rates(t: Floats) -> Span | None:
     """Lowest and highest rate [Hz] that frames at times (T,) s can resolve; None: there is none."""
-    low = max(RHYTHM.rates_hz[0], RHYTHM.periods / max(float(np.ptp(t)), 1e-9))
-    high = min(RHYTHM.rates_hz[1], 0.45 / float(np.median(np.diff(t))))
+    low = max(Fit.rates_hz[0], Fit.periods / max(float(np.ptp(t)), 1e-9))
+    high = min(Fit.rates_hz[1], 0.45 / float(np.median(np.diff(t))))
     return (low, high) if low < high else None
 
 
@@ -141,7 +125,7 @@ def _design(t: Floats, rhythms: Sequence[Rhythm]) -> Floats:
 
 def _harmonics(t: Floats, rate_hz: float) -> int:
     """Number of harmonics that the frames can resolve."""
-    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, RHYTHM.harmonics))
+    return int(np.clip(0.4 / float(np.median(np.diff(t))) // rate_hz, 1, Fit.harmonics))
 
 
 def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | None:
@@ -154,7 +138,7 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
     if not left.any():  # tissue that never moves has no rate
         return None
     u, s, _ = np.linalg.svd(left, full_matrices=False)
-    main = u[:, : RHYTHM.main] * s[: RHYTHM.main]
+    main = u[:, : Fit.main] * s[: Fit.main]
 
     def loss(rate: float) -> float:
         columns = np.concatenate([known, _waves(2 * np.pi * rate * t, _harmonics(t, rate))], axis=1)
@@ -169,32 +153,30 @@ def _strongest_rate(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> float | 
         if order * best < rates_hz[1]:
             around = np.linspace(order * best - 2 * step, order * best + 2 * step, 17)
             faster: float = min(around.tolist(), key=loss)
-            if loss(faster) < RHYTHM.faster * loss(best):
+            if loss(faster) < Fit.faster * loss(best):
                 best = faster
                 break
     return float(minimize_scalar(loss, bounds=(best - step, best + step), method="bounded").x)
 
 
 def _add_rhythm(t: Floats, y: Floats, rhythms: Sequence[Rhythm], rate: float) -> tuple[list[Rhythm], bool]:
-    """Refines the rhythms together with a new one of this rate; also returns whether the new one is periodic.
-
-    The new rhythm has the largest number of harmonics that predicts held-out frames.
-    """
-    count = max(2, round(float(np.ptp(t)) / max(RHYTHM.knot_s, 3 / rate)) + 1)
+    """The rhythms refined with a new one of this rate, of the largest number of harmonics that predicts
+    held-out frames, and whether the new one is periodic."""
+    count = max(2, round(float(np.ptp(t)) / max(Fit.knot_s, 3 / rate)) + 1)
     knots = np.linspace(t[0], t[-1], count)
     refined: list[Rhythm] = []
     for harmonics in range(_harmonics(t, rate), 0, -1):
         refined = _refine(t, y, [*rhythms, Rhythm(rate, knots, np.zeros(count), harmonics)])
         if _predicts(t, y, refined):
             # The correction of the phase may have made it too slow to repeat in the frames.
-            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= RHYTHM.periods - 0.5
+            return refined, float(np.ptp(refined[-1].phase(t))) / (2 * np.pi) >= Fit.periods - 0.5
     return refined, False
 
 
 def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
     """Refines the corrections of the phases by Gauss-Newton with a smoothness prior."""
     now = list(rhythms)
-    for _ in range(RHYTHM.rounds):
+    for _ in range(Fit.rounds):
         design = _design(t, now)
         weights = np.linalg.lstsq(design, y, rcond=None)[0]
         left, at = y - design @ weights, 2
@@ -209,28 +191,28 @@ def _refine(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> list[Rhythm]:
             normal = (hats * np.square(change).sum(axis=1)[:, None]).T @ hats
             bend = np.diff(np.eye(count), 2, axis=0) if count > 2 else np.zeros((1, count))
             weight = float(np.trace(normal)) / count
-            normal += weight * (RHYTHM.bend * bend.T @ bend + RHYTHM.small * np.eye(count))
-            pull = hats.T @ (change * left).sum(axis=1) - weight * RHYTHM.bend * bend.T @ (bend @ one.lead)
+            normal += weight * (Fit.bend * bend.T @ bend + Fit.small * np.eye(count))
+            pull = hats.T @ (change * left).sum(axis=1) - weight * Fit.bend * bend.T @ (bend @ one.lead)
             now[k] = replace(one, lead=one.lead + np.linalg.solve(normal, pull))
     return now
 
 
 def _predicts(t: Floats, y: Floats, rhythms: Sequence[Rhythm]) -> bool:
     """Whether the last rhythm predicts frames in cross-validation over six parts of the time."""
-    fold = np.arange(len(t)) * RHYTHM.folds // len(t)
+    fold = np.arange(len(t)) * Fit.folds // len(t)
 
     def error(design: Floats) -> float:
         total = 0.0
-        for k in range(RHYTHM.folds):
+        for k in range(Fit.folds):
             out = fold == k
             predicted = design[out] @ np.linalg.lstsq(design[~out], y[~out], rcond=None)[0]
             total += float(np.square(y[out] - predicted).sum())
         return total
 
-    return error(_design(t, rhythms)) < (1 - RHYTHM.predicted) * error(_design(t, rhythms[:-1]))
+    return error(_design(t, rhythms)) < (1 - Fit.predicted) * error(_design(t, rhythms[:-1]))
 
 
 def _is_harmonic(rhythms: Sequence[Rhythm]) -> bool:
     """Whether the last rate equals another rate, its half, or a harmonic of it."""
     *others, last = (one.rate_hz for one in rhythms)
-    return any(abs(last - order * rate) < RHYTHM.alike * last for rate in others for order in (0.5, 1, 2, 3))
+    return any(abs(last - order * rate) < Fit.alike * last for rate in others for order in (0.5, 1, 2, 3))

@@ -47,10 +47,7 @@ class ProposeMasks:
 
 
 def mask_right(rgb: Pixels, kind: str, left: Mask) -> Mask:
-    """Mask (H, W) of tool and specular highlights, detected in the right picture.
-
-    `kind`: one of `MASKS`; with `auto` nothing is masked unless something is masked in the left picture.
-    """
+    """Mask (H, W) of tool and highlights in the right picture; `auto`: none if the left picture has none."""
     if kind == "auto" and not left.any():
         return np.zeros(rgb.shape[:2], bool)
     return _glare(rgb, kind) | _tool(rgb, kind)

@@ -48,15 +48,12 @@ class Pace(Protocol):
 
     def start(self, time_s: float) -> None:
         """Starts the clock when the rest frame, at this time of the video, has been processed."""
-        ...
 
     def is_due(self, index: int, time_s: float) -> bool:
         """Waits until a frame arrives and returns whether it is processed."""
-        ...
 
     def spare_s(self, time_s: float) -> float:
         """Time until a frame arrives [s]."""
-        ...
 
 
 class Stage(Protocol):
@@ -64,7 +61,6 @@ class Stage(Protocol):
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """The frame with this stage's part filled in."""
-        ...
 
 
 def passes(
@@ -78,9 +74,8 @@ def passes(
 ) -> Iterator[VideoPass]:
     """The passes over a video; a second one follows if the first found pulsation or camera motion in it.
 
-    Tissue that is not given is found before them, in a few frames.
-
-    The caller takes all `frames` of a pass before the next one.
+    Tissue that is not given is found before them, in a few frames. The caller takes all `frames` of a pass
+    before the next one.
 
     Args:
         footage: the video.
@@ -137,12 +132,10 @@ class VideoPass:
         watch: Stopwatch | None = None,
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
-        """Decodes the rest frame, with which all stages start; arguments and errors as for `passes`, and:
+        """Decodes the rest frame, with which all stages start; other arguments and errors as for `passes`.
 
-        Args:
-            known: pulsation and camera motion from a first pass, removed from every frame.
-            pace: of a stream; None: every frame is processed. Flow runs once before the stream starts, so
-                that compilation does not add to the latency.
+        `known`: pulsation and camera motion from a first pass, removed from every frame; `pace`: of a stream;
+        None: every frame is processed.
         """
         self.watch, self.known, self.summary = watch or Stopwatch(), known, TrackingSummary()
         self.decoder = Decoder(footage, settings, self.watch, progress)
@@ -218,7 +211,7 @@ class VideoPass:
         if self.rest.fault:
             return first
         self._flow.begin(self._backend, first.rgb, proposal, self.rest.tissue)
-        if self._pace is not None:
+        if self._pace is not None:  # so that compilation does not add to the stream's latency
             self._flow.submit(first.rgb, proposal).result()
         return replace(first, confidence=(self.rest.tissue & ~proposal.known).astype(np.float32))
 
@@ -267,10 +260,7 @@ class VideoPass:
                 self._foreground.add(frame, depth)
 
     def search(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
-        """What a second pass is to remove, searched after the last frame; None: this pass did not gather it.
-
-        `free_s`: spans known to be without contact [s].
-        """
+        """What a second pass is to remove, after the last frame; None: this pass did not gather it."""
         if self._gather is not None:
             with self.watch.stage("pulse"):
                 self.found = self._gather.search(free_s, self._fills_picture)

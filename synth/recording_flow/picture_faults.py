@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -14,9 +13,8 @@ from synth.recording_flow.finding import Finding
 from synth.video import stereo_layout
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Thresholds between 50 clean rendered videos, whose values are given, and corrupted ones; the rates of
+class Limits:
+    """Limits between 50 clean rendered videos, whose values are given, and corrupted ones; the rates of
     detection are in docs/results/scoring/stability."""
 
     side: int = 24  # px, least side of a picture: windows of the estimators need it
@@ -39,7 +37,6 @@ class Thresholds:
     leapt: float = 3.0  # change over those before and after that shows a jump
 
 
-LIMITS = Thresholds()
 _SOME = 5  # most times that a message lists
 _AROUND = 25  # pictures before and after one in which the usual noise is measured
 _STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise distinguishes two pictures
@@ -48,16 +45,16 @@ _STRIDE = 4  # px of the subsampling for comparison, without smoothing: noise di
 def find_fault(rgb: Pixels, tissue: Mask) -> str:
     """Reason why a picture (H, W, 3) uint8 with a tissue mask (H, W) cannot be tracked; empty if it can."""
     height, width = tissue.shape
-    if min(height, width) < LIMITS.side:
+    if min(height, width) < Limits.side:
         return f"only {width} x {height} px"
     count = int(tissue.sum())
-    if count < LIMITS.tissue:
+    if count < Limits.tissue:
         return f"showing only {count} px of tissue"
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    if float(np.percentile(grey[tissue], 95)) < LIMITS.dark:
+    if float(np.percentile(grey[tissue], 95)) < Limits.dark:
         return "black"
     detail = grey - cv2.GaussianBlur(grey, (0, 0), 3)
-    if float(detail[tissue].std()) < LIMITS.flat:
+    if float(detail[tissue].std()) < Limits.flat:
         return "of one colour, without detail"
     return ""
 
@@ -65,9 +62,9 @@ def find_fault(rgb: Pixels, tissue: Mask) -> str:
 def find_bars(rgb: Pixels) -> Mask:
     """Mask (H, W) of black bars along the borders of a picture (H, W, 3)."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    bars, least = np.zeros(grey.shape, bool), LIMITS.bar * float(np.percentile(grey, 95))
+    bars, least = np.zeros(grey.shape, bool), Limits.bar * float(np.percentile(grey, 95))
     for lines, across in ((grey, bars), (grey.T, bars.T)):
-        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < LIMITS.even)
+        dark = (np.percentile(lines, 98, axis=1) < least) & (lines.std(axis=1) < Limits.even)
         across |= (np.minimum.accumulate(dark) | np.minimum.accumulate(dark[::-1])[::-1])[:, None]
     return bars & ~bars.all()
 
@@ -104,10 +101,10 @@ class VideoFaults:
         dim = f"the video is dim: 95% of the tissue is below grey level {level:.0f} of 255"
         no_detail = "the rest frame has no fine detail: is it out of focus or strongly compressed?"
         rest = (
-            (level < LIMITS.dim, dim),
-            (noise > LIMITS.noisy, f"the video is noisy: {noise:.0f} grey levels"),
-            (soft < LIMITS.soft, no_detail),
-            (min(steps) > LIMITS.grid, "the pictures have blocks of 8 px: they are strongly compressed"),
+            (level < Limits.dim, dim),
+            (noise > Limits.noisy, f"the video is noisy: {noise:.0f} grey levels"),
+            (soft < Limits.soft, no_detail),
+            (min(steps) > Limits.grid, "the pictures have blocks of 8 px: they are strongly compressed"),
         )
         self._rest = [message for wrong, message in rest if wrong]
 
@@ -127,13 +124,13 @@ class VideoFaults:
         """Adds a picture that is tracked, and the same downsampled."""
         self.changes = self.changes or not np.array_equal(small, self._rest_rgb)
         fine = _detail(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32), 0, 1)[self._tissue].std()
-        if fine < LIMITS.blurred * self._fine:
+        if fine < Limits.blurred * self._fine:
             self._blurred.append(time_s)
         green = rgb[:, ::2, 1].astype(np.float32)
         near, far = (cv2.blur((green[:-2] - green[k : len(green) - 2 + k]) ** 2, (8, 16)) for k in (1, 2))
         # The blocks of largest ratio: elsewhere the picture may be at rest.
         torn = (near / (far + 1))[8::16, 4::8]
-        if torn.size and np.percentile(torn, 98) > LIMITS.combed:
+        if torn.size and np.percentile(torn, 98) > Limits.combed:
             self._combed.append(time_s)
 
     def repeats(self) -> tuple[dict[int, int], dict[int, int]]:
@@ -144,7 +141,7 @@ class VideoFaults:
         if not change.any():
             return surely, maybe
         usual = float(np.median(change[change > 0]))
-        noisy = float(np.median(quiet[change > 0])) > LIMITS.still
+        noisy = float(np.median(quiet[change > 0])) > Limits.still
         # Noise on copies of a picture hides that they are equal, but each new exposure has noise of its own.
         # It must be usual before and after: a change of light or gain changes it for good.
         levels = np.column_stack([quiet, median])
@@ -152,10 +149,10 @@ class VideoFaults:
         before = np.nanmedian(sliding_window_view(padded, _AROUND + 1, axis=0)[: len(levels)], axis=-1)
         after = np.nanmedian(sliding_window_view(padded, _AROUND, axis=0)[_AROUND:], axis=-1)
         floor = np.minimum(before, after)
-        stale = ((floor > LIMITS.noise) & (levels < LIMITS.stale * floor)).all(axis=1)
-        same = np.concatenate([[False], stale | (change < LIMITS.same * usual), [False]]).astype(int)
+        stale = ((floor > Limits.noise) & (levels < Limits.stale * floor)).all(axis=1)
+        same = np.concatenate([[False], stale | (change < Limits.same * usual), [False]]).astype(int)
         for first, stop in zip(*(np.flatnonzero(np.diff(same) == k) for k in (1, -1)), strict=True):
-            caught_up = stop < len(change) and change[stop] > LIMITS.caught_up * usual
+            caught_up = stop < len(change) and change[stop] > Limits.caught_up * usual
             shown = self._numbers[first - 1] if first else -1
             (surely if noisy or caught_up else maybe).update(dict.fromkeys(self._numbers[first:stop], shown))
         return surely, maybe
@@ -169,7 +166,7 @@ class VideoFaults:
         # The median over parts ignores an instrument that enters; a cut or bump changes most of the picture.
         again, change = self.repeats()[0], [median for *_, median in self._changes]
         around = [max(pair) for pair in zip(change[:-2], change[2:], strict=True)]
-        leaps = [k for k, other in enumerate(around, 1) if change[k] > LIMITS.leapt * other]
+        leaps = [k for k, other in enumerate(around, 1) if change[k] > Limits.leapt * other]
         cuts = [self._times[k] for k in leaps if not again.keys() & set(self._numbers[k - 1 : k + 2])]
         at = dict(zip(self._numbers, self._times, strict=True))
         found = [Finding("warning", "pictures", message) for message in self._rest]

@@ -1,13 +1,10 @@
 """Pulsation of the tissue by heart and breath, estimated over a recording so that it can be removed.
 
-It is as large as the motion by a gentle contact and would be taken for force. Unlike contacts, heart and
-breath are periodic, move the whole surface, and continue without contact. A rhythm is therefore a smooth
-motion of the surface (polynomials in x and y) times harmonics of one phase, whose rate may vary. It is fitted
-to frames without contact and must predict held-out frames. If these frames are not given, they are found by
-iterative trimming (compare least trimmed squares: Rousseeuw, J. Amer. Stat. Assoc. 79, 1984). A phase that
-varies by more than a radian is not found.
-
-Measured by `evidence.scoring.pulse` and `tests/synth/recording_flow/test_pulse.py`.
+Unlike contacts, heart and breath are periodic, move the whole surface, and continue without contact. A rhythm
+is therefore a smooth motion of the surface (polynomials in x and y) times harmonics of one phase, whose rate
+may vary. It is fitted to frames without contact and must predict held-out frames. If these frames are not
+given, they are found by iterative trimming (compare least trimmed squares: Rousseeuw, J. Amer. Stat. Assoc.
+79, 1984). A phase that varies by more than a radian is not found.
 """
 
 from __future__ import annotations
@@ -24,8 +21,7 @@ from synth.recording_flow.camera_motion import CameraPath
 from synth.recording_flow.harmonic_fit import Rhythm, Span, find_rhythms, fit, visible_rates
 
 
-@dataclass(frozen=True)
-class CellConstants:
+class Cell:
     """Constants of the cells and of frames without contact, chosen by hand on `evidence.scoring.pulse`."""
 
     columns: int = 20  # cells across the picture
@@ -37,9 +33,6 @@ class CellConstants:
     smooth: float = 2.0  # a frame is smooth if its misfit is below this times their largest
     explained: float = 2.5  # explained by rhythms: below this times the smooth frames' median
     noise_px: float = 1e-3  # added to both limits
-
-
-CELLS = CellConstants()
 
 
 @dataclass
@@ -67,7 +60,7 @@ class SurfaceMotion:
 def in_cells(motion: Map, weight: Map) -> tuple[Map, Map]:
     """Weighted mean (r, c, C) over cells of a motion (h, w, C), and mean (r, c) of the weight (h, w)."""
     height, width = weight.shape
-    size = (CELLS.columns, max(2, round(CELLS.columns * height / width)))
+    size = (Cell.columns, max(2, round(Cell.columns * height / width)))
     share = cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
     parts = [motion[..., k : k + 3] for k in range(0, motion.shape[2], 3)]  # cv2: 4 channels at most
     total = np.dstack([cv2.resize(p * weight[..., None], size, interpolation=cv2.INTER_AREA) for p in parts])
@@ -112,44 +105,36 @@ class PulseSearch:
     def describe(self) -> str:
         """A sentence on pulsation that the search may have missed; empty if it covers heart and breath."""
         if self.rates_hz is None:
-            return (
-                f"heart and breath were not searched: {self.reason}. "
-                "Pulsation of the tissue, if any, is not removed"
-            )
+            missed = "Pulsation of the tissue, if any, is not removed"
+            return f"heart and breath were not searched: {self.reason}. {missed}"
         low, high = self.rates_hz
         if low <= 0.21 and high >= 1.5:  # breath under anaesthesia, 12 a minute, and a fast heart, 90
             return ""
         none = "no heart or breath was found, but " if self.pulse is None else "of heart and breath, "
-        return (
-            f"{none}only rates from {low:.2g} to {high:.2g} Hz show in {_count(self.free_s)}. "
-            "Slower or faster pulsation is not removed"
-        )
+        shown = f"only rates from {low:.2g} to {high:.2g} Hz show in {_count(self.free_s)}"
+        return f"{none}{shown}. Slower or faster pulsation is not removed"
 
 
 def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = ()) -> PulseSearch:
-    """Searches the frames without contact for rhythms of the surface.
+    """Searches frames without contact for rhythms of the surface; the rest frame is at `rest_s` [s].
 
-    Args:
-        surface: motion over the whole recording.
-        rest_s: time of the rest frame [s].
-        free_s: spans known to be without contact [s]; if empty, frames of smooth and periodic motion are
-            used.
+    `free_s`: spans known to be without contact [s]; if empty, frames of smooth and periodic motion are used.
     """
     time_s = np.array(surface.time_s)
-    if len(time_s) < CELLS.frames:
+    if len(time_s) < Cell.frames:
         return _too_few(time_s)
     cells = _Cells(surface, np.array([1.0, 1.0, surface.depth_weight])[: surface.motion[0].shape[2]])
     usable = (cells.weight > 0).mean(axis=1) > 0.5 if cells.used.any() else np.zeros(len(time_s), bool)
-    if len(cells.basis) < 2 * cells.basis.shape[1] or usable.sum() < CELLS.frames:
+    if len(cells.basis) < 2 * cells.basis.shape[1] or usable.sum() < Cell.frames:
         return PulseSearch(None, time_s[usable], None, "too little of the picture is tracked tissue")
     if free_s:
         smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
     else:
         # Frames about as smooth as the smoothest fifth: motion by a contact is less smooth.
         misfit = cells.misfit(cells.coefficients)
-        most = CELLS.smooth * np.quantile(misfit[usable], CELLS.smoothest) + CELLS.noise_px
+        most = Cell.smooth * np.quantile(misfit[usable], Cell.smoothest) + Cell.noise_px
         smooth = usable & (misfit <= most)
-    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= CELLS.frames else None
+    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
     if rates_hz is None:
         return _too_few(time_s[smooth])
     rhythms, others, fitted = _least_trimmed(cells, usable, smooth, rounds=1 if free_s else 4)
@@ -179,9 +164,9 @@ class _Cells:
         places = np.column_stack([x.ravel() / columns, y.ravel() / rows])
         visible = visible.reshape(count, -1)
         self.time_s = np.array(surface.time_s)
-        self.used = np.median(visible, axis=0) > CELLS.visible  # (r c,)
+        self.used = np.median(visible, axis=0) > Cell.visible  # (r c,)
         self.basis = _polynomials(places[self.used])  # (P, B)
-        self.weight = np.where(visible[:, self.used] > CELLS.visible, visible[:, self.used], 0.0)  # (T, P)
+        self.weight = np.where(visible[:, self.used] > Cell.visible, visible[:, self.used], 0.0)  # (T, P)
         motion = np.stack(surface.motion).reshape(*visible.shape, -1).astype(np.float64)[:, self.used]
         self.motion = motion if weight is None else motion[..., : len(weight)] * weight  # (T, P, C)
 
@@ -211,7 +196,7 @@ class _Cells:
         noise[enough] = np.nanmedian(left[:, enough], axis=0)
         for part in (noise[:, :2], noise[:, 2:3], noise[:, 3:]):
             length = np.linalg.norm(part, axis=1, keepdims=True)
-            part *= np.minimum(1, CELLS.rest_noise_px / np.maximum(length, 1e-9))
+            part *= np.minimum(1, Cell.rest_noise_px / np.maximum(length, 1e-9))
         return noise
 
 
@@ -220,11 +205,10 @@ def _least_trimmed(
 ) -> tuple[tuple[Rhythm, ...], tuple[Rhythm, ...], Mask]:
     """Alternates `find_rhythms` and the selection of the frames (T,) that it explains."""
     free = fitted = smooth
-    rhythms: tuple[Rhythm, ...] = ()
-    others: tuple[Rhythm, ...] = ()
+    rhythms = others = tuple[Rhythm, ...]()
     for _ in range(rounds):
         fitted = free
-        if fitted.sum() < CELLS.frames:
+        if fitted.sum() < Cell.frames:
             return (), (), fitted
         rhythms, others = find_rhythms(cells.time_s[fitted], cells.coefficients[fitted], cells.basis)
         if not rhythms:
@@ -232,7 +216,7 @@ def _least_trimmed(
         own = _sum((*rhythms, *others), cells.time_s)
         misfit = cells.misfit(own + (cells.coefficients - own)[fitted].mean(axis=0))
         # The limit is relative to smooth frames: relative to fitted ones it would admit contacts.
-        free = usable & (misfit <= CELLS.explained * np.median(misfit[smooth]) + CELLS.noise_px)
+        free = usable & (misfit <= Cell.explained * np.median(misfit[smooth]) + Cell.noise_px)
         if (free == fitted).all():
             break
     return rhythms, others, fitted
@@ -273,7 +257,7 @@ def _sum(rhythms: Sequence[Rhythm], time_s: Floats) -> Floats:
 
 
 def _polynomials(at: Floats) -> Floats:
-    """Products (P, B) of Legendre polynomials up to `CELLS.degree` at places (P, 2) in 0..1."""
-    x, y = (np.polynomial.legendre.legvander(2 * axis - 1, CELLS.degree) for axis in at.T)
-    pairs = [(i, j) for i in range(CELLS.degree + 1) for j in range(CELLS.degree + 1 - i)]
+    """Products (P, B) of Legendre polynomials up to `Cell.degree` at places (P, 2) in 0..1."""
+    x, y = (np.polynomial.legendre.legvander(2 * axis - 1, Cell.degree) for axis in at.T)
+    pairs = [(i, j) for i in range(Cell.degree + 1) for j in range(Cell.degree + 1 - i)]
     return np.stack([x[:, i] * y[:, j] for i, j in pairs], axis=1)

@@ -11,17 +11,14 @@ estimate is smoothed in both directions (Rauch, Tung & Striebel, AIAA J. 3, 1965
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from synth.arrays import Floats, Map, Mask
 from synth.recording_flow.camera_motion import CameraPath, Course, Similarity, SimilarityBasis, weigh_outliers
-from synth.recording_flow.pulse import CELLS, PulseEstimate, SurfaceMotion, in_cells
+from synth.recording_flow.pulse import Cell, PulseEstimate, SurfaceMotion, in_cells
 
 
-@dataclass(frozen=True)
-class MotionModel:
+class Model:
     """Constants of the filter, chosen by hand on closed forms (tests/.../test_shared_motion.py)."""
 
     least_px: float = 0.3  # least length of a first or sudden camera motion
@@ -41,9 +38,6 @@ class MotionModel:
     normal: float = 0.3  # lateral motion by an axial load over that by a lateral load
     blunt: float = 0.7  # radius of a load, in spacings of the loads
     ridge: float = 0.2  # regularisation of forces, over the mean diagonal of the Gram matrix
-
-
-MODEL = MotionModel()
 
 
 class SharedMotion:
@@ -73,35 +67,29 @@ class SharedMotion:
             self._learn(shape)
 
     def add(self, time_s: float, motion: Map, visible: Map) -> Similarity | None:
-        """Camera motion in a frame; None: none since the rest frame.
-
-        `motion` (r, c, 2) px and the visible share (r, c) of its cells are those of `in_cells`.
-        """
-        weight = np.where(visible > CELLS.visible, visible * self._inside, 0.0).ravel().astype(np.float64)
+        """Camera motion in a frame by the results (r, c, 2) px, (r, c) of `in_cells`; None: none so far."""
+        weight = np.where(visible > Cell.visible, visible * self._inside, 0.0).ravel().astype(np.float64)
         now = motion.reshape(-1).astype(np.float64)
-        if np.count_nonzero(weight) < 2 * (self._columns.shape[1] + MODEL.shapes):
+        if np.count_nonzero(weight) < 2 * (self._columns.shape[1] + Model.shapes):
             return self.course[-1][1] if self.course else None
         plain, _, rest = self._fit(now, weight, self.shapes[:, :0])
         alike, amounts, left = self._fit(now, weight, self.shapes)
         left_px = self._size(left, weight)
-        if (
-            self._grows
-            and self.shapes.shape[1] < MODEL.shapes
-            and left_px > max(MODEL.new_px, MODEL.new * self._size(rest, weight))
-        ):
+        grows = self._grows and self.shapes.shape[1] < Model.shapes
+        if grows and left_px > max(Model.new_px, Model.new * self._size(rest, weight)):
             self._learn(left)
             alike, amounts, left = self._fit(now, weight, self.shapes)
             left_px = self._size(left, weight)
-        usual = float(np.median(self._steps[-MODEL.usual :])) if self._steps else 0.0
+        usual = float(np.median(self._steps[-Model.usual :])) if self._steps else 0.0
         change = self._sudden(now, weight, usual, (self._length(plain), self._size(rest, weight)))
         self._before = now, weight
-        moves = change or (max(usual, MODEL.calm_px) if self._starts else 0.0)
+        moves = change or (max(usual, Model.calm_px) if self._starts else 0.0)
         self._starts = self._starts or (len(self._times) + 1 if change else 0)
         count = len(self._state)
         predicted = self._covariance.copy()
         predicted[range(4), range(4)] += np.square(moves / self._unit) / (1 if change else 2)
         observed = np.hstack([np.eye(4), *(amount * np.eye(4) for amount in amounts)])
-        noise = np.diag((MODEL.noise_px**2 + left_px**2) / np.square(self._unit) / 2)
+        noise = np.diag((Model.noise_px**2 + left_px**2) / np.square(self._unit) / 2)
         gain = predicted @ observed.T @ np.linalg.inv(observed @ predicted @ observed.T + noise)
         last = self._state
         self._state = last + gain @ (alike - observed @ last)
@@ -131,15 +119,14 @@ class SharedMotion:
             covariance = spread + back @ (covariance - predicted) @ back.T
             predicted = forecast
             found.append(self._similarity(state, covariance))
-        moved = found[::-1]
-        still: list[Similarity | None] = [None] * (self._starts - 1)
-        return CameraPath(np.array(self._times), (*still, *moved[self._starts - 1 :]))
+        still = self._starts - 1
+        return CameraPath(np.array(self._times), (*[None] * still, *found[::-1][still:]))
 
     def _fit(self, motion: Floats, weight: Floats, shapes: Floats) -> tuple[Floats, Floats, Floats]:
         """Robust fit to visible cells: similarity (4,), amplitudes (S,) of shapes and residual (2 P,)."""
         both, left = np.hstack([self._columns, shapes]), motion
         fitted, sure = np.zeros(both.shape[1]), weight
-        for _ in range(MODEL.rounds):
+        for _ in range(Model.rounds):
             weighed = np.repeat(sure, 2)[:, None] * both
             fitted = np.linalg.lstsq(weighed.T @ both, weighed.T @ motion, rcond=1e-9)[0]
             left = motion - both @ fitted
@@ -157,7 +144,7 @@ class SharedMotion:
         count = len(self._state)
         covariance = np.zeros((count, count))
         covariance[:-4, :-4] = self._covariance
-        covariance[range(count - 4, count), range(count - 4, count)] = np.square(MODEL.doubt / self._unit) / 2
+        covariance[range(count - 4, count), range(count - 4, count)] = np.square(Model.doubt / self._unit) / 2
         self._covariance = covariance
 
     def _sudden(self, now: Floats, weight: Floats, usual: float, since_rest: tuple[float, float]) -> float:
@@ -168,14 +155,8 @@ class SharedMotion:
             if np.count_nonzero(both) > 8:
                 alike, _, left = self._fit(now - self._before[0], both, self.shapes[:, :0])
                 found.append((self._length(alike), self._size(left, both)))
-        return max(
-            (
-                size
-                for size, left in found
-                if size > max(MODEL.least_px, MODEL.jump * usual) and left < MODEL.impure * size
-            ),
-            default=0.0,
-        )
+        least = max(Model.least_px, Model.jump * usual)
+        return max((size for size, left in found if size > least and left < Model.impure * size), default=0.0)
 
     def _similarity(self, state: Floats, covariance: Floats) -> Similarity:
         of_cells = (self._columns @ covariance[:4, :4] * self._columns).sum(axis=1)
@@ -194,7 +175,7 @@ class SharedMotion:
     @staticmethod
     def _size(left: Floats, weight: Floats) -> float:
         """Size of a residual (2 P,) [px]: a quantile over cells that ignores a tool and its shadow."""
-        return float(np.quantile(np.linalg.norm(left.reshape(-1, 2), axis=1)[weight > 0], MODEL.most))
+        return float(np.quantile(np.linalg.norm(left.reshape(-1, 2), axis=1)[weight > 0], Model.most))
 
 
 def find_path(surface: SurfaceMotion, pulse: PulseEstimate | None) -> CameraPath | None:
@@ -218,17 +199,17 @@ def _half_space(at: Floats, size: tuple[int, ...], columns: Floats) -> Floats:
     lattice in and around a picture (h, w), smoothed over their spacing. The lateral motion by axial loads has
     the share that blunt tips have on a curved surface.
     """
-    apart = size[1] / MODEL.nodes
+    apart = size[1] / Model.nodes
     x, y = (apart * (np.arange(-1, round(length / apart) + 1) + 0.5) for length in size[::-1])
     nodes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     dx, dy = np.moveaxis(at[:, None] - nodes, -1, 0)
-    r = np.sqrt(dx**2 + dy**2 + (MODEL.blunt * apart) ** 2)
-    along, mixed = (1 - MODEL.poisson) / r, MODEL.poisson / r**3
-    across_x = [along + mixed * dx**2, mixed * dx * dy, MODEL.normal * dx / r**2]
-    across_y = [mixed * dx * dy, along + mixed * dy**2, MODEL.normal * dy / r**2]
+    r = np.sqrt(dx**2 + dy**2 + (Model.blunt * apart) ** 2)
+    along, mixed = (1 - Model.poisson) / r, Model.poisson / r**3
+    across_x = [along + mixed * dx**2, mixed * dx * dy, Model.normal * dx / r**2]
+    across_y = [mixed * dx * dy, along + mixed * dy**2, Model.normal * dy / r**2]
     moved = np.stack([np.hstack(across_x), np.hstack(across_y)], 1).reshape(2 * len(at), -1)
     inverse = np.linalg.pinv(columns)
     rest = moved - columns @ (inverse @ moved)
     gram = rest @ rest.T
-    gram += MODEL.ridge * np.trace(gram) / len(gram) * np.eye(len(gram))
+    gram += Model.ridge * np.trace(gram) / len(gram) * np.eye(len(gram))
     return np.asarray(inverse @ moved @ np.linalg.solve(gram, rest).T, np.float64)

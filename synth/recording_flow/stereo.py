@@ -71,10 +71,9 @@ class RightCamera:
         return StereoQuality(r.baseline_mm, rest.epipolar_px, scale, _median(self._noise))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
-        """The frame with motion in three dimensions; without a picture of that camera it is lost.
+        """The frame, the rest frame first, with motion in three dimensions; lost without a right picture.
 
-        The first frame must be the rest frame. Raises UserError for a missing rest picture, too few or
-        unreadable pictures, and a calibration that doesn't fit.
+        UserError: a missing rest picture, too few or unreadable pictures, a calibration that doesn't fit.
         """
         if not frame.trusted or (right := self._right(frame)) is None:
             return _lost(frame)

@@ -34,17 +34,9 @@ def craniotomy(
     job: Job,
     drawn: Sequence[tuple[str, float]] = (),
 ) -> SceneContent:
-    """The content of one sequence.
+    """The content of one sequence at rest; UserError: the job's photograph cannot be read.
 
-    Args:
-        surface: the cortex at rest.
-        appearance: its appearance.
-        camera: the microscope at rest.
-        job: opening and photograph.
-        drawn: kind of each instrument, `none` for one that is not drawn, and the radius of its contacts [mm].
-
-    Raises:
-        UserError: the photograph cannot be read.
+    `drawn`: kind of each instrument, `none` for one that is not drawn, and the radius of its contacts [mm].
     """
     lit = appearance.light.power * light.blackbody(appearance.light.kelvin)
     around = rim.build(surface, job.anatomy.craniotomy.radius_mm, appearance, camera.mm_per_px)

@@ -104,8 +104,7 @@ def build(
     bars, coat = [], []
     for own, ends in zip(parts, coated, strict=True):
         for part in own:
-            rings = len(part.profile) // (_AROUND + 1)
-            bars.append(Shape(part.profile, grid_faces(rings, _AROUND + 1).reshape(-1, 3)))
+            bars.append(Shape(part.profile, grid_faces(len(part.profile) // RING, RING).reshape(-1, 3)))
             # The coating ends in a sharp ring.
             coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
     whole = np.concatenate(coat).astype(np.float32)
@@ -145,10 +144,8 @@ def _round_off(s: Floats, over: float) -> Floats:
 
 
 def _forceps(half: float, aside_mm: float = 0.0) -> tuple[Part, ...]:
-    """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1).
-
-    `half`: of a tip's width; `aside_mm`: shift of the handle, which a bayonet's two bends move out of view.
-    """
+    """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1), and the handle
+    shifted by `aside_mm`, out of view."""
     s = _along(96)
     close = _round_off(s, 0.45)
     wide = (half - 0.03 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close

@@ -148,9 +148,8 @@ class Renderer:
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
-            extra["flow_next"] = truth.forward_flow(
-                own.hits, faces, there.vertices, there.camera or self.camera
-            )
+            lens = there.camera or self.camera
+            extra["flow_next"] = truth.forward_flow(own.hits, faces, there.vertices, lens)
         if "normals" in self._extra:
             extra["normals"] = truth.normal_map(camera, own.hits, shapes)
         if "blur" in self._extra:

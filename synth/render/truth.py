@@ -80,12 +80,10 @@ class ProjectedScene:
         return cls(points, cameras.to_pixels(camera, points), scene.faces, camera.size)
 
     def cast(self, pixels: Floats | None, directions: Floats) -> Hits:
-        """First intersections of rays from the lens.
+        """First intersections of rays (N, 3) from the lens, camera axes, of any length.
 
-        Args:
-            pixels: (N, 2) px of the rays in the picture; those outside have no intersection. None: all
-                pixels' centres, row by row.
-            directions: (N, 3) in camera axes, of any length, each through its pixel.
+        `pixels`: (N, 2) px that they pass through; those outside have no intersection; None: all pixels'
+        centres, row by row.
         """
         width, height = self.size
         if pixels is None:
@@ -121,10 +119,8 @@ def trace_rest(camera: Camera, surface: Shape, static: Shape) -> RestFrame:
 
 
 def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, tool: Shape) -> FrameTruth:
-    """Ground truth of one frame, of a camera with the lens of the rest frame.
-
-    `surface`: the fine one in this frame; `static`: what never moves; `tool`: the instruments in this frame.
-    """
+    """Ground truth of one frame, of a camera with the lens of the rest frame: of the fine surface and the
+    instruments in this frame, and what never moves."""
     width, height = camera.size
     pixels = cameras.pixel_grid(camera.size)
     scene = ProjectedScene.of(camera, joined(surface, static, tool))
@@ -149,21 +145,15 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
 
 
 def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> Map:
-    """Flow (H, W, 2) px from each pixel of one frame to another frame; 0 off the tissue.
-
-    `hits`: of the first frame's pixels, the surface's faces first; `vertices` (V, 3) mm of the surface and
-    `camera`: of the other frame.
-    """
+    """Flow (H, W, 2) px from each pixel of one frame, by its hits, the surface's faces first, to another
+    frame, by the surface's vertices (V, 3) mm and the camera in it; 0 off the tissue."""
     on = (hits.face >= 0) & (hits.face < len(faces))
     points = blend(faces, hits.face[on], hits.bary[on], vertices)
     return _picture(on, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on], camera)
 
 
 def normal_map(camera: Camera, hits: Hits, shapes: Sequence[Shape]) -> Map:
-    """Smoothed unit normals (H, W, 3), camera axes, at each pixel; 0 where there is nothing.
-
-    `shapes`: of `hits`, in their order.
-    """
+    """Smoothed unit normals (H, W, 3), camera axes, at hits of shapes; 0 where there is nothing."""
     vertex = np.concatenate([normals(shape) for shape in shapes]) @ camera.rotation.T
     on = hits.face >= 0
     smooth = blend(joined(*shapes).faces, hits.face[on], hits.bary[on], vertex)
@@ -177,10 +167,8 @@ def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> Map:
 
 
 def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.floating]) -> Floats:
-    """A quantity of vertices (V, C) at points on triangles: indices (N,), weights (N, 3).
-
-    0 where `face` is negative or beyond `faces`.
-    """
+    """A quantity of vertices (V, C) at points on triangles: indices (N,), weights (N, 3); 0 where `face` is
+    negative or beyond `faces`."""
     return _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
 
 

@@ -23,19 +23,8 @@ _SAMPLES = (_GRID + 0.25) / _FINE
 
 
 def springs(points: Floats, cells: Ints, attachments: Sequence[schema.AttachmentSection]) -> sp.csr_array:
-    """Springs of all attachments.
-
-    Args:
-        points: (N, 3) mm, all nodes.
-        cells: (M, 10).
-        attachments: in the axes of `points`.
-
-    Returns:
-        (N, N) mm: mN/mm for E = 1 kPa.
-
-    Raises:
-        UserError: an attachment holds no tissue.
-    """
+    """Springs (N, N) mm (mN/mm for E = 1 kPa) of all attachments on nodes (N, 3) mm of cells (M, 10), in
+    their axes. UserError: an attachment holds no tissue."""
     total = sp.csr_array((len(points), len(points)))
     if not attachments:
         return total

@@ -91,17 +91,11 @@ class Quadrature:
 
 
 def quadrature(points: Floats, cells: Ints, at: Floats = TET_POINTS) -> Quadrature:
-    """The quadrature of a mesh.
-
-    Args:
-        points: (N, 3) mm, all nodes; sides may be curved.
-        cells: (M, 10).
-        at: (Q, 4) barycentric points in every element, of equal weight.
-    """
+    """The quadrature of nodes (N, 3) mm and cells (M, 10), whose sides may be curved, at (Q, 4) barycentric
+    points of equal weight in every element."""
     gradient, determinant = gradients(points[cells], at)
-    return Quadrature(
-        cells.astype(np.int32), np.ascontiguousarray(gradient), determinant / (6 * len(at)), len(points)
-    )
+    weight = determinant / (6 * len(at))
+    return Quadrature(cells.astype(np.int32), np.ascontiguousarray(gradient), weight, len(points))
 
 
 def gradients(nodes: Floats, bary: Floats) -> tuple[Floats, Floats]:

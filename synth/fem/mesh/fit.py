@@ -23,18 +23,10 @@ _SOUND = 0.1  # least mean ratio of a moved tetrahedron
 
 
 def fit(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], Floats]) -> Floats:
-    """Moves the corners on the boundary.
+    """Moves the corners of boundary `faces` (F, 3), counter-clockwise from outside, of a mesh as of `stuff`.
 
+    Returns all points (N, 3) mm. No tetrahedron falls below a mean ratio of 0.1, unless it was below before.
     Measured on a real brain, 1,600 tetrahedra graded towards the opening: volume 82% before, 95% after.
-
-    Args:
-        points: (N, 3) mm.
-        cells: (M, 4), positively oriented.
-        faces: (F, 3) of the boundary, counter-clockwise from outside.
-        inside: positive inside and negative outside, at (n, 3) mm.
-
-    Returns:
-        (N, 3) mm. No tetrahedron falls below a mean ratio of 0.1, unless it was below before.
     """
     for _ in range(_PASSES):
         points = _once(points, cells, faces, inside)

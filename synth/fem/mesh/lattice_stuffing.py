@@ -21,15 +21,10 @@ _HALVINGS = 14
 
 
 def stuff(points: Floats, cells: Ints, inside: Callable[[Floats], Floats]) -> tuple[Floats, Ints]:
-    """Cuts a lattice along a surface; the part inside remains.
+    """Cuts a lattice along a surface, and returns points and cells of the largest connected part inside it.
 
-    Args:
-        points: (N, 3) mm, lattice corners.
-        cells: (M, 4), positively oriented.
-        inside: positive inside and negative outside, at (n, 3) mm.
-
-    Returns:
-        Points and cells of the largest connected part, positively oriented; none if nothing is inside.
+    `points`: (N, 3) mm, corners; `cells`: (M, 4), positively oriented; `inside`: positive inside and negative
+    outside, at (n, 3) mm.
     """
     points, value = points.copy(), np.where(inside(points) > 0, 1, -1)
     cells = cells[(value[cells] > 0).any(axis=1)]
@@ -70,10 +65,8 @@ def halve(
     high: Floats,
     times: int,
 ) -> Floats:
-    """Crossing of `start` + share * `way`, (n, 3) mm each, with the surface: share (n,), by bisection.
-
-    It lies between `low` and `high` (n,); `begins`: (n,) whether `low` is inside.
-    """
+    """Share (n,) between `low` and `high` (n,) at which `start` + share * `way`, (n, 3) mm, crosses the
+    surface, by bisection; `begins`: (n,) whether `low` is inside."""
     for _ in range(times):
         middle = 0.5 * (low + high)
         before = (inside(start + middle[:, None] * way) > 0) == begins

@@ -17,17 +17,9 @@ EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 
 
 def refine(points: Floats, cells: Ints, size: Callable[[Floats], Floats], target: int) -> tuple[Floats, Ints]:
-    """Bisects until there are about `target` tetrahedra, graded by `size`.
-
-    Args:
-        points: (N, 3) mm.
-        cells: (M, 4), positively oriented.
-        size: wanted edge length at (n, 3) points, up to a factor.
-        target: number of tetrahedra to stop at; the conforming closure overshoots it by a few per cent.
-
-    Returns:
-        Points (N', 3) and cells (M', 4), conforming and positively oriented. The first N points stay.
-    """
+    """Bisects points (N, 3) mm and cells (M, 4), positively oriented, until there are `target` or, as closure
+    conforms, a few per cent more; the first N points stay. `size`: wanted edge length at (n, 3) mm, up to a
+    factor."""
     while len(cells) < target:
         need = longest(points, cells) / size(points[cells].mean(axis=1))
         # Marking only the worst keeps the grading even; a handful at a time would take hundreds of rounds.

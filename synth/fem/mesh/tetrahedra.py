@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -77,26 +78,16 @@ def block(
     size = np.asarray(size_mm)
     fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]
     if fall > 0.8 * size[2]:
-        raise UserError(
-            f"anatomy.dome_mm: the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
-        )
+        steep = f"the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
+        raise UserError(f"anatomy.dome_mm: {steep}")
     points, cells = _bricks(size, tets / 60)
     opening = anatomy.craniotomy.radius_mm
     points, cells = refine(points, cells, _grading(opening, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
     points, cells = with_midsides(points, cells)
-    faces = boundary(cells)
-
-    def ground(xy: Floats) -> Floats:
-        return dome(xy, anatomy.dome_mm)
-
-    points = raise_top(
-        points,
-        cells,
-        faces[(points[faces, 2] > -1e-9).all(axis=1)],
-        ground,
-        ground if height is None else height.over(ground),
-    )
+    faces, ground = boundary(cells), partial(dome, radius_mm=anatomy.dome_mm)
+    top = faces[(points[faces, 2] > -1e-9).all(axis=1)]
+    points = raise_top(points, cells, top, ground, ground if height is None else height.over(ground))
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
     return _finished(points, cells, wall, anatomy.craniotomy, anatomy.attachments, slips)
 
@@ -109,13 +100,10 @@ def from_brain(
     *,
     slips: bool = False,
 ) -> Tets:
-    """A user's whole brain, held by the skull everywhere but in the opening.
+    """A user's whole brain, held by the skull everywhere but in the opening; arguments as in `block`.
 
-    Arguments as in `block`.
-
-    Raises:
-        UserError: the surface encloses no volume that can be meshed, or none under the opening; an attachment
-            holds nothing.
+    UserError: the surface encloses no volume that can be meshed, or none under the opening; an attachment
+    holds nothing.
     """
     points, cells = _filled(brain, _grading(anatomy.craniotomy.radius_mm, focus), tets)
     if len(cells) < 0.2 * tets:
@@ -160,22 +148,18 @@ def outer_faces(cells: Ints) -> tuple[Ints, Ints]:
 def _grading(opening_mm: float, focus: Sequence[Contact]) -> Callable[[Floats], Floats]:
     """Wanted size: constant under the contacts (or the opening), growing with the distance from them.
 
-    Measured: growth in proportion to the distance gives the smallest error in the opening; a focus under the
-    contact gives a third of the error of one under the whole opening. A constant size over half the contact's
-    radius, where most of the pressure is, and depth counting 1.5 times give the smallest error under a
-    nonlinear law with the relief.
+    Measured: growth in proportion to the distance, a constant size over half the contact's radius and depth
+    counting 1.5 times give the smallest error; a focus under the contact gives a third of the error of one
+    under the whole opening.
     """
 
     def size(at: Floats) -> Floats:
         if not focus:
             aside = np.maximum(np.hypot(at[:, 0], at[:, 1]) - opening_mm, 0)
             return np.asarray((1 + np.hypot(aside, at[:, 2]) / (0.5 * opening_mm)) ** 2)
-        away = [
-            np.maximum(
-                _EVEN * a, np.sqrt((at[:, 0] - x) ** 2 + (at[:, 1] - y) ** 2 + (_DEPTH * at[:, 2]) ** 2)
-            )
-            for x, y, a in focus
-        ]
+        deep = (_DEPTH * at[:, 2]) ** 2
+        far = [np.sqrt((at[:, 0] - x) ** 2 + (at[:, 1] - y) ** 2 + deep) for x, y, _ in focus]
+        away = [np.maximum(_EVEN * a, one) for one, (*_, a) in zip(far, focus, strict=True)]
         return np.asarray(np.min(away, axis=0))
 
     return size
@@ -190,9 +174,8 @@ def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
     axes.append(np.linspace(-size[2], 0, n[2] + 1))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     at = np.arange(len(grid)).reshape(n + 1)
-    cube = [
-        at[x : x + n[0], y : y + n[1], z : z + n[2]].ravel() for z in (0, 1) for y in (0, 1) for x in (0, 1)
-    ]
+    corners = product((0, 1), repeat=3)
+    cube = [at[x : x + n[0], y : y + n[1], z : z + n[2]].ravel() for z, y, x in corners]
     cells = np.stack(cube, axis=1)[:, _KUHN].reshape(-1, 4)
     volume = bary_slope(grid[cells])[1]
     cells[volume < 0] = cells[volume < 0][:, [0, 2, 1, 3]]
@@ -245,12 +228,9 @@ def _finished(
 def _springs(
     points: Floats, faces: Ints, at: schema.CraniotomySection, slips: bool
 ) -> tuple[sp.csr_array, sp.csr_array | None]:
-    """The skull's springs on the surface, which grow over the rim's width from none in the opening to firm.
-
-    Returns:
-        (N, N) mm of those that hold in every direction, and (3N, 3N) mm of those along the normal alone. Deep
-        below, where nerves and vessels tether the brain, all hold in every direction.
-    """
+    """The skull's springs on the surface, which grow over the rim's width from none in the opening to firm:
+    (N, N) mm of those that hold in every direction, and (3N, 3N) mm of those along the normal alone. Deep
+    below, where nerves and vessels tether the brain, all hold in every direction."""
     corner = points[faces[:, :3]]
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = 0.5 * np.linalg.norm(facing, axis=1)

@@ -7,6 +7,7 @@ import numpy as np
 
 from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
+from synth.flow import image
 from synth.flow.confidence import deviation
 from synth.flow.stereo.depth_motion import Solver, fine
 from synth.flow.stereo.track import Moved
@@ -22,16 +23,10 @@ class DepthTracker:
     """
 
     def __init__(self, K: Floats, rest: Map, blocked: Mask, tissue: Mask) -> None:
-        """Starts at the rest frame.
+        """Starts at the rest frame, with a mask (H, W) of its tissue and one of its instruments and glare.
 
-        Args:
-            K: (3, 3) px, camera matrix of pictures without distortion.
-            rest: (H, W) mm, depth along the optical axis in the rest frame; not finite or <= 0: unknown.
-            blocked: (H, W), instrument and glare masks of the rest frame.
-            tissue: (H, W).
-
-        Raises:
-            UserError: shapes that differ, or no depth of the tissue.
+        `K`: (3, 3) px, of pictures without distortion; `rest`: depth (H, W) mm along the optical axis; not
+        finite or <= 0: unknown. UserError: shapes that differ, or no depth of the tissue.
         """
         if rest.shape != tissue.shape:
             raise UserError(f"depth: pictures {rest.shape} and tissue {tissue.shape} differ")
@@ -44,35 +39,27 @@ class DepthTracker:
         self.solver = Solver((tissue.shape[0], tissue.shape[1]))
 
     def step(self, depth: Map, blocked: Mask, flow: Map, confidence: Map) -> Moved:
-        """The motion from rest to the next frame.
-
-        Args:
-            depth: (H, W) mm, along the optical axis.
-            blocked: (H, W), instrument and glare masks.
-            flow, confidence: (H, W, 2) px, and (H, W) in 0..1.
-        """
+        """The motion to the next frame, of depth (H, W) mm, flow (H, W, 2) px and its confidence (H, W)."""
         if depth.shape != self.tissue.shape:
             raise UserError(f"depth: a picture of {depth.shape}, but the rest frame is {self.tissue.shape}")
-        height, width = depth.shape
-        x = np.arange(width, dtype=np.float32) + flow[..., 0]
-        y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
+        at = *image.ends(flow), cv2.INTER_LINEAR
         usable = _known(depth) & ~blocked
-        there = cv2.remap(np.where(usable, depth, 0).astype(np.float32), x, y, cv2.INTER_LINEAR)
-        visible = cv2.remap(usable.astype(np.float32), x, y, cv2.INTER_LINEAR, borderValue=0) > 0.999
+        there = cv2.remap(np.where(usable, depth, 0).astype(np.float32), *at)
+        visible = cv2.remap(usable.astype(np.float32), *at, borderValue=0) > 0.999
         rise = np.where(visible & self._known, there - self._rest, 0).astype(np.float32)
         weight = np.clip(confidence, 0, 1) * (visible & self._known)
         straight = np.ascontiguousarray(flow.transpose(2, 0, 1))
         change = self.solver.smooth(rise, weight.astype(np.float32), straight, 1.0)
         spread = np.maximum(fine(_CAUTION * change.deviation, self.solver.cell, self.tissue.shape), 1e-4)
-        return self._moved(change.px, spread, straight, confidence)
-
-    def _moved(self, rise: Map, spread: Map, flow: Map, confidence: Map) -> Moved:
-        """Motion from a change of depth `rise`, its deviation `spread` [mm] and the flow (2, H, W) px."""
-        height, width = self.tissue.shape
+        rise = change.px
+        height, width = depth.shape
         x = np.arange(width, dtype=np.float32) - np.float32(self.K[0, 2])
         y = np.arange(height, dtype=np.float32)[:, None] - np.float32(self.K[1, 2])
         after = self._rest + rise
-        across = [(flow[k] * after + at * rise) / np.float32(self.K[k, k]) for k, at in enumerate((x, y))]
+        across = [
+            (straight[k] * after + from_axis * rise) / np.float32(self.K[k, k])
+            for k, from_axis in enumerate((x, y))
+        ]
         off = self._rest / np.float32(self.K[0, 0]) * deviation(confidence)
         inside = self.tissue[..., None]
         return Moved(

@@ -1,11 +1,8 @@
 """Correction of the depth motion of stereo and its standard deviation, as in `synth.flow.correction`.
 
 A thin plate that is soft enough for a dimple follows noise; a stiffer one flattens the dimple, by an eighth
-at a contact. A network trained on rendered ground truth estimates the error from the lateral motion, the
-remaining residual and its precision. It works on the cells of the solver, in mm, so that neither the size of
-pictures nor the baseline is learnt.
-
-`evidence.flow.correction_training` trains the weights. They are stored next to this file with a card.
+at a contact. A network estimates the error from the lateral motion, the remaining residual and its precision.
+It works on the cells of the solver, in mm, so that neither the size of pictures nor the baseline is learnt.
 """
 
 from __future__ import annotations
@@ -39,12 +36,11 @@ def describe(
     """`FEATURES` (CHANNELS, h, w) float32 of a frame on the cells of the solver.
 
     Args:
-        change: solution of the solver.
-        solver: of the change.
-        flow: (2, H, W) px, rectified flow of the left camera.
+        change, solver: the solver's solution, by the rectified flow (2, H, W) px of the left camera.
+        flow: as there.
         visible: (h, w) share of a cell that is unmasked tissue in the left picture.
         spread: (h, w) px, standard deviation of a flow component.
-        px_per_mm: magnitude of the change of disparity of a point that moves 1 mm along the optical axis.
+        px_per_mm: as in `Solver.solve`.
         mm_per_px: size of a pixel at the tissue.
     """
     coarse, across = solver.coarse, [mm_per_px * solver.coarse(part) for part in flow]

@@ -41,8 +41,7 @@ _MEDIAN = 0.4549  # median of the square of a standard normal variable
 _ONE, _EIGHT, _TWELFTH, _HALF = np.float32(1), np.float32(8), np.float32(1 / 12), np.float32(0.5)
 
 
-@dataclass(frozen=True)
-class DepthMotionConstants:
+class DepthMotion:
     """Constants of the prior and the solver, chosen by hand on renders (docs/results/flow/stereo)."""
 
     columns: int = 40  # cells across the picture
@@ -50,9 +49,6 @@ class DepthMotionConstants:
     strained_mm: float = 2.0  # added to k per px/px of the gradient of the flow
     cold: int = 4  # linearisations from zero
     warm: int = 2  # linearisations from the frame before
-
-
-DEPTH = DepthMotionConstants()
 
 
 @dataclass(frozen=True)
@@ -93,24 +89,18 @@ class Solver:
     def __init__(self, size: tuple[int, int]) -> None:
         """`size`: (height, width) [px]."""
         height, width = size
-        self.cell = max(1, round(width / DEPTH.columns))
+        self.cell = max(1, round(width / DepthMotion.columns))
         self.shape = (-(-height // self.cell), -(-width // self.cell))
         self._bends = second_differences(self.shape)
 
     def solve(
-        self,
-        pictures: StereoPictures,
-        flow: Map,
-        disparity: Map,
-        px_per_mm: float,
-        initial: Map | None = None,
+        self, pictures: StereoPictures, flow: Map, disparity: Map, px_per_mm: float, initial: Map | None
     ) -> Change:
         """Solves for the change of disparity since rest.
 
         Args:
             pictures: rest and now.
-            flow: (2, H, W) px, of the left camera.
-            disparity: (H, W) px at rest, finite everywhere.
+            flow, disparity: (2, H, W) px, of the left camera, and (H, W) px at rest, finite everywhere.
             px_per_mm: magnitude of the change of disparity of a point that moves 1 mm along the optical axis.
             initial: (H, W) px, the solution of the previous frame; None: zero.
         """
@@ -125,7 +115,7 @@ class Solver:
         sums = np.zeros((4, *self.shape), np.float64)
         here = np.empty_like(flow)
         here[1] = flow[1]
-        for _ in range(DEPTH.cold if initial is None else DEPTH.warm):
+        for _ in range(DepthMotion.cold if initial is None else DepthMotion.warm):
             here[0] = flow[0] - disparity - change
             kernels.warp_into(pictures.right, pictures.right_usable, here, warped, visible)
             both = mask * visible
@@ -141,15 +131,13 @@ class Solver:
         return Change(change, precision, pull, stiffness, misfit.astype(np.float32), both, lag)
 
     def smooth(self, samples: Map, weight: Map, flow: Map, px_per_mm: float) -> Change:
-        """The change of disparity of given samples (H, W) px, by the same prior and Student's weights.
-
-        `weight` (H, W) >= 0 is 0 where there is no sample; `flow` and `px_per_mm` are those of `solve`.
-        """
+        """The change of given samples (H, W) px of weight (H, W) >= 0, by the same prior and Student's
+        weights; otherwise as `solve`."""
         stiffness, prior = self._prior(flow, px_per_mm)
         change = np.zeros_like(samples)
         misfit = np.ones(self.shape, np.float32)
         information, pull = np.zeros((2, *self.shape), np.float32)
-        for _ in range(DEPTH.cold):
+        for _ in range(DepthMotion.cold):
             off = samples - change
             known = weight > 0
             noise = float(np.median(np.square(off[known]))) / _MEDIAN if known.any() else 1.0
@@ -172,7 +160,7 @@ class Solver:
 
     def _prior(self, flow: Map, px_per_mm: float) -> tuple[Map, sparse.csr_matrix]:
         """1 / k^2 (h, w) in 1/px^2, and the matrix of the prior."""
-        bend = px_per_mm * (DEPTH.bend_mm + DEPTH.strained_mm * self.steepness(flow))
+        bend = px_per_mm * (DepthMotion.bend_mm + DepthMotion.strained_mm * self.steepness(flow))
         stiffness = np.asarray(1 / bend**2, np.float32)
         weights = sparse.diags(np.tile(stiffness.ravel().astype(np.float64), 3))
         return stiffness, self._bends.T @ weights @ self._bends
@@ -236,11 +224,10 @@ def _noise(residual: Map, mask: Map) -> Map:
 
 
 def _lag(residual: Map, slope: Map, down: Map, mask: Map, noise: np.float32) -> float:
-    """Share of the vertical motion that is missing in the right picture.
+    """Share of the vertical motion that is missing in the right picture, as it is not synchronous.
 
-    Vertical motion is the same in both rectified pictures at any depth. A residual along the vertical slope
-    therefore shows that the pictures are not synchronous. `residual`: of the brightness, of variance `noise`;
-    `slope`: derivative of the brightness by y; `down`: vertical flow of the left camera [px]; (H, W) each.
+    Else that motion is the same in both rectified pictures at any depth. (H, W) each: `residual` of
+    brightness, of variance `noise`; `slope`, its derivative by y; `down`, the left vertical flow [px].
     """
     some = (slice(None, None, 2), slice(None, None, 2))
     q, along = residual[some], (slope * down)[some]
@@ -258,11 +245,9 @@ def gather(
 
     Args:
         now, rest: (3, H, W), the warped right picture now and the right rest picture, with their derivatives.
-        lefts: (3, H, W), the sum of the left pictures at rest and now.
-        less: (3, H, W), the target of `now`.
+        lefts, less: (3, H, W), the sum of the left pictures at rest and now, and the target of `now`.
         mask, change: (H, W), and (H, W) px, the value of d used for the warp.
-        noise: (3,), variance of the channels.
-        cell: px.
+        noise, cell: (3,), variance of the channels; px.
         sums: (4, h, w), incremented by J^2, J (J d + q), q^2 (mean over channels) and the number of pixels.
     """
     _, height, width = now.shape

@@ -35,15 +35,10 @@ class Rest:
 
 
 def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refine: bool = True) -> Rest:
-    """Rest disparity of a rectified pair.
+    """Rest disparity of a rectified pair of grey levels (H, W), or (n, H, W) of n frames, which are averaged.
 
-    Args:
-        left, right: (n, H, W) grey levels of n rest frames, which are averaged, or (H, W) of one.
-        left_usable, right_usable: (H, W), unmasked tissue, and unmasked pixels of the right picture.
-        refine: to subpixels.
-
-    Raises:
-        UserError: too little matches within an eighth of the width to both sides.
+    `left_usable`, `right_usable`: (H, W), unmasked tissue, and unmasked pixels of the right picture;
+    `refine`: to subpixels. UserError: too little matches within an eighth of the width to both sides.
     """
     left, right = (np.atleast_3d(one.T).T.mean(axis=0, dtype=np.float32) for one in (left, right))
     width = left.shape[1]

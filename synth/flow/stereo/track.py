@@ -17,8 +17,7 @@ from synth.flow.stereo.depth_motion import Change, Solver, StereoPictures, fine
 from synth.flow.stereo.rig import Rectified, StereoRig
 
 
-@dataclass(frozen=True)
-class StereoConstants:
+class Stereo:
     """Constants of motion in three dimensions; chosen by hand where no source is given."""
 
     still_px: float = 0.3  # 98th percentile of the flow below which a frame is at rest
@@ -29,9 +28,6 @@ class StereoConstants:
     along: float = 1.3  # factor of the deviation along the optical axis, likewise
     added: float = 0.4  # relative standard deviation of the correction of depth
     lost: float = 0.05  # visible share of the tissue below which the next frame starts from zero
-
-
-STEREO = StereoConstants()
 
 
 @dataclass(frozen=True)
@@ -66,10 +62,8 @@ class StereoTracker:
 
         Args:
             rig: the pair of cameras.
-            lefts: (n, H, W, 3) uint8, the first n left frames, all at rest; frame 0 is the rest frame.
-            rights: (n, H, W, 3) uint8, those of the right camera.
-            left_blocked: (H, W), instrument and glare masks of the left rest frame.
-            right_blocked: (H, W), those of the right rest frame.
+            lefts, rights: (n, H, W, 3) uint8, the first n frames, all at rest; frame 0 is the rest frame.
+            left_blocked, right_blocked: (H, W), instrument and glare masks of the rest frame.
             tissue: (H, W), in the left rest frame.
 
         Raises:
@@ -115,22 +109,17 @@ class StereoTracker:
     def step(
         self, left: Pixels, right: Pixels, left_blocked: Mask, right_blocked: Mask, flow: Map, confidence: Map
     ) -> Moved:
-        """The motion from rest to the next frame.
-
-        Args:
-            left, right: (H, W, 3) uint8.
-            left_blocked, right_blocked: (H, W), instrument and glare masks.
-            flow, confidence: (H, W, 2) px, of the left camera, and (H, W) in 0..1.
-        """
+        """The motion from rest to the next frame: pictures (H, W, 3) uint8, masks (H, W) of instruments and
+        glare, and the left camera's flow (H, W, 2) px with its confidence (H, W)."""
         r = self.rectified
         now, now_usable = self._normalised(left, r.flags(~left_blocked, 0), 0)
         other, other_usable = self._normalised(right, r.flags(~right_blocked, 1), 1)
         # Where the flow lost the tissue, both cameras may see an unmasked occluder.
-        tracked = self._usable * (r.picture(confidence, 0) > STEREO.tracked)
+        tracked = self._usable * (r.picture(confidence, 0) > Stereo.tracked)
         pictures = StereoPictures(self._left, self._right, tracked, now, other, now_usable, other_usable)
         straight = r.flow(flow)
         change = self.solver.solve(pictures, straight, self.rest.disparity, self.px_per_mm, self._change)
-        lost = float(change.visible.sum()) < STEREO.lost * float(self._usable.sum())
+        lost = float(change.visible.sum()) < Stereo.lost * float(self._usable.sum())
         self._change = None if lost else change.px
         return self._moved(change, straight, confidence, lost)
 
@@ -142,20 +131,18 @@ class StereoTracker:
         if lost:  # no correction where the right camera shows nothing
             added = np.zeros_like(added)
         # Where the right camera sees nothing, the deviation is that of the plate.
-        off = np.maximum(
-            np.hypot(STEREO.along * off, STEREO.added * added), change.deviation / self.px_per_mm
-        )
+        off = np.hypot(Stereo.along * off, Stereo.added * added)
+        off = np.maximum(off, change.deviation / self.px_per_mm)
         # A right picture of another moment turns lateral motion into apparent depth.
-        late = np.sqrt(max(change.lag**2 - STEREO.in_time**2, 0.0)) * solver.coarse(
-            np.abs(flow[0]) + np.abs(change.px)
-        )
+        late = np.sqrt(max(change.lag**2 - Stereo.in_time**2, 0.0))
+        late = late * solver.coarse(np.abs(flow[0]) + np.abs(change.px))
         off = np.hypot(off, late / self.px_per_mm)
         # The correction [mm] as a change of disparity at the depth found.
         here = r.depth(disparity + change.px)
         nearer = here / (here + fine(added, solver.cell, disparity.shape))
         px = (disparity + change.px + r.shift) * nearer - r.shift - disparity
         motion = r.motion(disparity, px, flow)
-        across = STEREO.across * self._mm_per_px * spread
+        across = Stereo.across * self._mm_per_px * spread
         # Logarithms are interpolated, because cubic interpolation of the deviations could give negative ones.
         logs = [fine(np.log(part), solver.cell, disparity.shape) for part in (across, across, off)]
         planes = [r.back(np.ascontiguousarray(motion[..., k])) for k in range(3)]
@@ -166,11 +153,8 @@ class StereoTracker:
         )
 
     def describe(self, change: Change, flow: Map, confidence: Map) -> tuple[Map, Map]:
-        """Features of `depth_correction`, and the standard deviation (h, w) px of a flow component.
-
-        `flow`: (2, H, W) px, rectified; `confidence`: (H, W) in 0..1, of the flow, on the original left
-        pixels.
-        """
+        """Features of `depth_correction`, and the standard deviation (h, w) px of a flow component, by the
+        rectified flow (2, H, W) px and its confidence (H, W) on the original left pixels."""
         r, coarse = self.rectified, self.solver.coarse
         visible = r.flags(confidence > 0, 0).astype(np.float32)
         share = coarse(visible)
@@ -190,9 +174,9 @@ class StereoTracker:
 def still_frames(flow: Map, tissue: Mask) -> int:
     """Number of leading frames of a flow (T, H, W, 2) px that are at rest: 1 to 4."""
     count = 1
-    while count < min(len(flow), STEREO.rests):
+    while count < min(len(flow), Stereo.rests):
         length = np.linalg.norm(flow[count][tissue], axis=-1)
-        if length.size and np.quantile(length, 0.98) > STEREO.still_px:
+        if length.size and np.quantile(length, 0.98) > Stereo.still_px:
             break
         count += 1
     return count

@@ -74,12 +74,10 @@ def unroll(height: Callable[[Floats], Floats], plan_mm: float, radius_mm: float)
     turn = np.vdot(laid - laid.mean(), below - below.mean())
     size = np.sqrt(_area(vertices[which][corners]) / _area(np.stack([laid.real, laid.imag], -1)[corners]))
     moved = below.mean() + size * turn / np.abs(turn) * (laid - laid.mean()) - below
-    unknown = np.ones(len(vertices), bool)
-    unknown[which] = False
+    unknown = np.ones((_COARSE, _COARSE), bool)
+    unknown.flat[which] = False
     shift.reshape(-1, 2)[which] = np.stack([moved.real, moved.imag], axis=-1)
-    nearest = distance_transform_edt(
-        unknown.reshape(_COARSE, _COARSE), return_distances=False, return_indices=True
-    )
+    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
     return Chart(shift[tuple(nearest)], plan_mm, plan_mm + 2 * float(np.abs(shift).max()))
 
 

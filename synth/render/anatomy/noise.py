@@ -17,10 +17,8 @@ _ROWS = 8  # of a map at a time: intermediate results stay in the processor's ca
 
 
 def band(rng: np.random.Generator, pixels: int, extent_mm: float, wavelength_mm: float, width: float) -> Map:
-    """Isotropic noise (pixels, pixels) float32 about one wavelength; zero mean, unit variance.
-
-    `width`: half width of the band as a share of its centre frequency.
-    """
+    """Isotropic noise (pixels, pixels) float32 about one wavelength, in a band of half width `width` as a
+    share of its centre frequency; zero mean, unit variance."""
     frequency = _frequencies(pixels, extent_mm)
     return _filtered(rng, np.exp(-0.5 * ((frequency * wavelength_mm - 1) / width) ** 2))
 
@@ -78,7 +76,4 @@ def _filtered(rng: np.random.Generator, gain: Floats) -> Map:
     gain[0, 0] = 0.0
     spectrum *= gain.astype(np.float32)
     noise = np.fft.irfft2(spectrum, s=(pixels, pixels))
-    mean, deviation = noise.mean(), noise.std()
-    noise -= mean
-    noise /= deviation
-    return np.asarray(noise, np.float32)
+    return np.asarray((noise - noise.mean()) / noise.std(), np.float32)

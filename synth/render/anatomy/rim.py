@@ -28,7 +28,6 @@ _SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is
 _WIDTH_MM = 26.0  # of the rim; the picture ends before
 
 
-@dataclass(frozen=True)
 class CutEdge:
     """Cross-section of the dura's cut edge [mm]: rings from its underside over its lip to the fold."""
 
@@ -40,7 +39,6 @@ class CutEdge:
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
 
-@dataclass(frozen=True)
 class FoldedDura:
     """The dura folded back over the rim [mm]; `width`: mean and spread around the opening, see `_uneven`."""
 
@@ -50,7 +48,6 @@ class FoldedDura:
     vessel: Rgb = (0.35, 1.0, 0.95)  # absorption of its vessels
 
 
-@dataclass(frozen=True)
 class Wound:
     """Gutter behind the dura, and the wall beyond that rises in two steps [mm]."""
 
@@ -64,7 +61,6 @@ class Wound:
     blood: Rgb = (0.26, 2.4, 2.8)  # absorption
 
 
-@dataclass(frozen=True)
 class Bone:
     """Albedos of compact bone and of its spongy section, absorption of blood stains."""
 
@@ -73,7 +69,6 @@ class Bone:
     stain: Rgb = (0.2, 1.2, 1.4)
 
 
-@dataclass(frozen=True)
 class Drape:
     """Surgical drapes: distance behind the wall's foot [mm], and albedos."""
 
@@ -221,10 +216,8 @@ def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
 
 
 def _folded(away: Floats, dura: Floats, pleats: Floats, asides: list[Floats]) -> Floats:
-    """Height (A, R) mm of the folded dura: its fold, pleats, free end, and rays and tents at stitches.
-
-    `away`: mm from the edge; `dura`: mm, its end; `pleats`: see `FoldedDura`; `asides`: mm from each stitch.
-    """
+    """Height (A, R) mm of the folded dura: its fold, pleats, free end, and rays and tents at stitches; all in
+    mm: `away` from the edge, `dura` its end, `asides` from each stitch."""
     raised = 0.11 * pleats * ridge(away, at=0.8, width=0.5)
     raised += 0.2 * np.sin(3.2 * away + 2 * pleats) * np.clip(away - 0.8, 0, 1)
     # It leans against the wall: its free end is the highest, and curls.
@@ -277,9 +270,8 @@ def _dura(appearance: Appearance, fibres: Map, mottle: Map, grain: Map, distance
     """Albedo of the folded dura, with its vessels and the redder margin along them."""
     margin = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
     blood = 4.5 * thickness((distance, radius)) + margin
-    return through(
-        speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain), blood, FoldedDura.vessel
-    )
+    pale = speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain)
+    return through(pale, blood, FoldedDura.vessel)
 
 
 def _muscle(appearance: Appearance, past: Map, mottle: Map, grain: Map) -> Map:

@@ -7,7 +7,6 @@ Sizes (mm), albedos (linear RGB) and absorptions were chosen by eye on an intra-
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter1d
@@ -25,7 +24,6 @@ _COTTON_MM = 0.45
 _BLADE_RINGS, _BLADE_AROUND = 60, 24
 
 
-@dataclass(frozen=True)
 class Cotton:
     """Albedo of white felt and its blue thread, absorption of the blood that soaks it."""
 
@@ -34,7 +32,6 @@ class Cotton:
     blood: Rgb = (0.15, 1.3, 1.4)
 
 
-@dataclass(frozen=True)
 class Suture:
     """A stitch's black thread."""
 
@@ -77,13 +74,8 @@ def threaded(
 
 
 def dural_vessels(edge: Floats, rng: np.random.Generator) -> Tree:
-    """Meningeal vessels (nodes in world x, y mm) that branch over the dura around an opening.
-
-    `edge`: (A,) mm, radius of the opening at even angles.
-    """
-    nodes: list[Floats] = []
-    parent: list[int] = []
-    radius: list[float] = []
+    """Meningeal vessels (nodes in world x, y mm) over the dura around an opening with an edge (A,) mm."""
+    nodes, parent, radius = list[Floats](), list[int](), list[float]()
     mean = float(edge.mean())
     # A stem: its start (angle, mm from the edge), lean, width (sign: its way around), steps, and parent node.
     stems: list[tuple[float, float, float, float, int, int]] = []
@@ -153,10 +145,8 @@ def patties(edge: Floats, points: Floats, rng: np.random.Generator) -> list[tupl
 
 
 def retractor(edge: Floats, points: Floats, rng: np.random.Generator) -> Shape:
-    """A blade of steel from outside over the rim, bent down into the opening.
-
-    `edge`: (A,) mm, radius of the opening at even angles; `points`: (N, 3) mm, of the surfaces below it.
-    """
+    """A blade of steel from outside over the rim, on points (N, 3) mm, bent down into an opening with an edge
+    (A,) mm."""
     around, wide = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(2.8, 4.2))
     outwards = np.array([np.cos(around), np.sin(around)])
     across = np.array([-outwards[1], outwards[0]])

@@ -60,15 +60,9 @@ def grow(
 ) -> CortexSurface:
     """A cortex under the opening, with veins that stand out of it.
 
-    Args:
-        relief: as drawn; a user's brain has folds of its own.
-        anatomy: the job's section.
-        brain: a user's, z outwards, origin at the craniotomy's centre; any winding, holes and duplicates
-            allowed. None: random gyri on a dome.
-        veined: whether veins stand out of it.
-
-    Raises:
-        UserError: there is no surface under the opening.
+    `brain`: a user's, with folds of its own, z outwards, origin at the craniotomy's centre; any winding,
+    holes and duplicates allowed; None: random gyri on a dome. `veined`: whether veins
+    stand out. UserError: no surface under the opening.
     """
     extent = 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
     side = max(20, round(anatomy.vertices**0.5))
@@ -91,9 +85,7 @@ def grow(
 
     pia = height(xy)
     chart = unroll(height, extent, anatomy.craniotomy.radius_mm + MARGIN_MM / 2)
-    tree = vessels.Vessels(
-        **{name: replace(one, nodes=chart.at(one.nodes)) for name, one in vars(tree).items()}
-    )
+    tree = vessels.Vessels(*(replace(one, nodes=chart.at(one.nodes)) for one in vars(tree).values()))
     laid = chart.at(xy)
     z = pia + veined * noise.sample(bulge(tree.veins, chart.extent_mm), laid, chart.extent_mm)
     return CortexSurface(
@@ -143,10 +135,8 @@ def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Ma
     height = _height_map(brain, extent, _RELIEF_PX // 2)
     hole = np.isnan(height)
     if hole.mean() > 1 - LEAST_FILLED:
-        raise UserError(
-            "anatomy.craniotomy: the brain's surface does not fill the opening there; `synth preview` of the "
-            "mesh finds suitable places"
-        )
+        found = "`synth preview` of the mesh finds suitable places"
+        raise UserError(f"anatomy.craniotomy: the brain's surface does not fill the opening there; {found}")
     if hole.any():  # the height of the nearest pixel
         nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
         height = height[tuple(nearest)]

@@ -7,7 +7,6 @@ unit of the layer's depth map. All were chosen by eye on an intra-operative phot
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +30,6 @@ _TEXELS_A_PIXEL = 2.2
 _NARROW = 2  # exponent on the sulci's depth map, so that only clefts are dark and wet, not the slopes above
 
 
-@dataclass(frozen=True)
 class Parenchyma:
     """Two tints in clouds, finely grained, under the blood of the pia and of vessels below the pia."""
 
@@ -42,7 +40,6 @@ class Parenchyma:
     scatter: Rgb = (0.055, 0.032, 0.026)  # blur by light that travels in tissue, farthest in red
 
 
-@dataclass(frozen=True)
 class Sulcus:
     """Grey fluid under hazy arachnoid with whiter strands; a cleft returns little light."""
 
@@ -52,7 +49,6 @@ class Sulcus:
     depth: tuple[float, float] = 2.4, 1.8  # optical: by the sulcus's depth, and more beyond half of it
 
 
-@dataclass(frozen=True)
 class Bleeding:
     """Blood under the arachnoid, ragged and thin at its edges; pairs are ranges."""
 
@@ -62,7 +58,6 @@ class Bleeding:
     blood: Rgb = (0.12, 1.5, 2.3)  # absorption
 
 
-@dataclass(frozen=True)
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
@@ -72,7 +67,6 @@ class Artery:
     wide: tuple[float, float] = 0.16, 0.24  # radius of the first opaque walls, and span to fully opaque ones
 
 
-@dataclass(frozen=True)
 class Vein:
     """Dark red where thin and at the sides, bluish along a thick one's crest, in a dark margin of tissue."""
 
@@ -82,7 +76,6 @@ class Vein:
     margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
 
 
-@dataclass(frozen=True)
 class Film:
     """Fluid over everything: it climbs along vessels, smooths finer relief, and undulates a little."""
 
@@ -99,24 +92,14 @@ def resolution(extent_mm: float, mm_per_px: float) -> int:
 def cortex(
     surface: CortexSurface, appearance: Appearance, pixels: int, photo: Path | None, shade: Map | None = None
 ) -> Coat:
-    """Maps of parenchyma, vessels and wet film over the surface's chart.
+    """Maps of parenchyma, vessels and wet film over the surface's chart, `pixels` on a side.
 
-    Args:
-        surface: the cortex.
-        appearance: its appearance.
-        pixels: side of the maps.
-        photo: a picture that replaces the painted albedo.
-        shade: (m, m) share of light that the rim lets reach the surface; 1 if not given.
-
-    Raises:
-        UserError: the photograph cannot be read.
+    `photo`: a picture that replaces the painted albedo; `shade`: (m, m) share of light that the rim lets
+    reach the surface; 1 if not given. UserError: the photograph cannot be read.
     """
     extent = surface.chart.extent_mm
     rng = np.random.default_rng([surface.seed, 2])
-    tubes = {
-        name: tube.raster(getattr(surface.vessels, name), pixels, extent)
-        for name in ("veins", "arteries", "deep")
-    }
+    tubes = {name: tube.raster(one, pixels, extent) for name, one in vars(surface.vessels).items()}
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
@@ -190,9 +173,8 @@ def _parenchyma(
 
     `pale`: share of the less perfused tint; `deep`: mm.
     """
-    gyrus, perfused = (
-        np.asarray(c, np.float32) for c in (appearance.gyrus_albedo, appearance.perfused_albedo)
-    )
+    tints = appearance.perfused_albedo, appearance.gyrus_albedo
+    perfused, gyrus = (np.asarray(tint, np.float32) for tint in tints)
     albedo = over(perfused, gyrus, pale)
     albedo = albedo * (1 + appearance.grain * grain[..., None] * np.array(Parenchyma.grain, np.float32))
     blood = appearance.pial_absorbance * (0.04 + 0.8 * sulci) + (0.32 + 1.1 * sulci) * around
@@ -315,9 +297,8 @@ def _photograph(path: Path, pixels: int) -> Map:
         raise UserError(f"appearance.photo: {error}") from None
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
-    square = cv2.resize(
-        image[top : top + side, left : left + side], (pixels, pixels), interpolation=cv2.INTER_AREA
-    )
+    square = image[top : top + side, left : left + side]
+    square = cv2.resize(square, (pixels, pixels), interpolation=cv2.INTER_AREA)
     encoded = square[..., ::-1].astype(np.float32) / 255
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
     # A map's first row has the lowest y.

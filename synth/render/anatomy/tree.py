@@ -42,14 +42,11 @@ def grow(
     """Space colonisation: nodes step towards the attractors nearest to them until none is left in reach.
 
     Args:
-        nodes: (N, 2) mm, where growth starts.
-        parent: (N,).
+        nodes, parent: (N, 2) mm, where growth starts, and (N,).
         attractors: (A, 2) mm.
         buds: (N,) which of these nodes may sprout; new ones all may.
-        step: length of a segment [mm].
-        kill: distance within which an attractor is used up [mm].
-        wander: random part of a step's direction, as a share.
-        rng: source of that part.
+        step, kill: length of a segment; distance within which an attractor is used up [mm].
+        wander, rng: random part of a step's direction, as a share, and its source.
 
     Returns:
         All nodes (M, 2) and parents (M,), those at the start first.
@@ -90,10 +87,8 @@ def grow(
 
 
 def _pulls(nearest: Ints, toward: Floats) -> tuple[Ints, Floats]:
-    """Nodes (P,) with attractors, and the unit mean (P, 2) of the directions to theirs.
-
-    `nearest`: (A,) the node of each attractor; `toward`: (A, 2) mm, from the node to it.
-    """
+    """Nodes (P,) with attractors, and the unit mean (P, 2) of the directions to theirs, by the nearest node
+    (A,) of each and the way (A, 2) mm to it."""
     toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
     pulled, index = np.unique(nearest, return_inverse=True)
     mean = np.stack([np.bincount(index, toward[:, axis]).astype(np.float64) for axis in (0, 1)], axis=1)
@@ -142,10 +137,8 @@ def pruned(nodes: Floats, parent: Ints, fixed: int, shortest: int) -> tuple[Floa
 def scattered(
     extent_mm: float, spacing: float, rng: np.random.Generator, density: Map | None = None
 ) -> Floats:
-    """Points (n, 2) mm about `spacing` mm apart: a jittered grid, which neither clumps nor lines up.
-
-    `density`: (m, m) share of the points that stay; all of them if not given.
-    """
+    """Points (n, 2) mm about `spacing` mm apart: a jittered grid, which neither clumps nor lines up, of which
+    a share `density` (m, m) stays."""
     side = max(1, int(extent_mm / spacing))
     cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
     points = ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm

@@ -13,11 +13,7 @@ from synth.system.jit import vectorised
 
 
 def raster(tree: Tree, pixels: int, extent_mm: float) -> tuple[Map, Map]:
-    """Distance to the nearest centre line and that line's radius, both (pixels, pixels) float32 mm.
-
-    Centre lines are drawn to the nearest pixel; far from any vessel the distance is large and the radius
-    that of the nearest one.
-    """
+    """Distance to the nearest centre line, to a pixel, and its radius, (pixels, pixels) float32 mm."""
     scale = pixels / extent_mm
     child = np.flatnonzero(tree.parent >= 0)
     start, end = tree.nodes[tree.parent[child]], tree.nodes[child]

@@ -57,10 +57,8 @@ def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
 
 
 def spot(camera: Camera, rest: Camera, even: float) -> Map:
-    """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening.
-
-    Even within a radius of `even` widths of the field, fading outside; fixed to the microscope's pose `rest`.
-    """
+    """Share (H, W) of the lamps' light at each pixel of a camera, in the plane of the opening: even within
+    `even` widths of the field, fading outside; fixed to the microscope's pose `rest`."""
     field = rest.size[0] * rest.mm_per_px
     axis = rest.centre / np.linalg.norm(rest.centre)
     width, height = camera.size

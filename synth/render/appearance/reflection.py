@@ -46,10 +46,7 @@ def tint(coat: npt.NDArray[np.floating]) -> Floats:
 
 
 def glow(steel: Shape, coat: npt.NDArray[np.floating], theatre: Theatre) -> Floats:
-    """Radiance (V, 3) that the vertices of steel mirror towards the theatre's lens.
-
-    `coat`: (V,) 0 bare to 1 coated black.
-    """
+    """Radiance (V, 3) that steel, `coat` (V,) 0 bare to 1 black, mirrors towards the theatre's lens."""
     normal = normals(steel)
     towards = theatre.lens - steel.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)

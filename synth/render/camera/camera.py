@@ -134,10 +134,8 @@ def right_camera(camera: Camera, baseline_mm: float) -> Camera:
 def calibrated_right(
     camera: Camera, K: Floats, distortion: Floats, rotation: Floats, translation: Floats
 ) -> Camera:
-    """The right camera of a calibrated pair: x_right = rotation @ x_left + translation, (3, 3) and (3,) mm.
-
-    It is focused on the plane that the left one is focused on.
-    """
+    """The right camera of a calibrated pair, focused on the same plane: x_right = rotation @ x_left +
+    translation, (3, 3) and (3,) mm."""
     moved = rotation @ camera.translation + translation
     return replace(
         camera,

@@ -46,17 +46,12 @@ class CameraSensor:
 
 
 def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Pixels:
-    """The sRGB picture (H, W, 3) uint8 of linear radiance (H, W, 3) float32.
-
-    `rng`: source of photon and readout noise.
-    """
+    """The sRGB picture (H, W, 3) uint8 of linear radiance (H, W, 3) float32; `rng`: of the noise."""
     video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
     video = _sharpen(video, sensor.sharpening)
     np.clip(video, 0, 1, out=video)
     video = video if sensor.coded else _subsampled(video, sensor.chroma)
-    np.clip(video, 0, 1, out=video)
-    video *= np.float32(255)
-    return np.rint(video, out=video).astype(np.uint8)
+    return np.asarray(np.rint(np.clip(video, 0, 1) * np.float32(255)), np.uint8)
 
 
 def balanced_light(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Map:

@@ -32,11 +32,7 @@ _REGISTER = 64  # bytes of a vector register
 
 
 def pick(variant: str) -> str:
-    """The variant to use on this machine for `render.variant`.
-
-    Raises:
-        UserError: the machine cannot run it.
-    """
+    """The variant to use on this machine for `render.variant`; UserError: the machine cannot run it."""
     if variant == "scalar_rgb":
         return variant
     # All scenes of a job share kernels; by default Dr.Jit would cache them in the user's home without limit.
@@ -95,9 +91,8 @@ class Stage:
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
         # Irradiance of all lamps at their targets, in green.
-        self._power = sum(
-            float(lamp.intensity[1] / ((lamp.position - lamp.target) ** 2).sum()) for lamp in lamps
-        )
+        distances = [((lamp.position - lamp.target) ** 2).sum() for lamp in lamps]
+        self._power = sum(float(one.intensity[1] / d) for one, d in zip(lamps, distances, strict=True))
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
@@ -199,20 +194,12 @@ def _register_glow(variant: str) -> None:
 def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
     towards = lamp.target - lamp.position
     up = [0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 * np.linalg.norm(towards) else [1.0, 0.0, 0.0]
-    placed = mi.ScalarTransform4f().look_at(
-        origin=lamp.position.tolist(), target=lamp.target.tolist(), up=up
-    ) @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
-    radiance = lamp.intensity / (np.pi * lamp.radius**2)
-    return {
-        "type": "disk",
-        "to_world": placed,
-        "light": {
-            "type": "area",
-            "radiance": {"type": "rgb", "value": radiance.tolist()},
-            # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
-            "sampling_weight": 1.0,
-        },
-    }
+    placed = mi.ScalarTransform4f().look_at(lamp.position.tolist(), lamp.target.tolist(), up)
+    placed = placed @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
+    radiance = {"type": "rgb", "value": (lamp.intensity / (np.pi * lamp.radius**2)).tolist()}
+    # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
+    light = {"type": "area", "radiance": radiance, "sampling_weight": 1.0}
+    return {"type": "disk", "to_world": placed, "light": light}
 
 
 def _mesh(mi: Any, name: str, body: Body) -> Any:
@@ -227,14 +214,8 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     # Visible, but never sampled as a lamp, since its weight is 0.
     kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
     properties["glow"] = mi.load_dict({"type": kind, "radiance": radiance, "sampling_weight": 0.0})
-    mesh = mi.Mesh(
-        name,
-        vertex_count=len(body.vertices),
-        face_count=len(body.faces),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
+    given = {"has_vertex_normals": True, "has_vertex_texcoords": True, "props": properties}
+    mesh = mi.Mesh(name, vertex_count=len(body.vertices), face_count=len(body.faces), **given)
     if isinstance(body.material, Metal):
         mesh.add_attribute("vertex_glow", 3, _aligned(body.material.glow, np.float32))
         mesh.add_attribute("vertex_tint", 3, _aligned(body.material.tint, np.float32))
@@ -258,13 +239,12 @@ def _bent(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
 def _aligned(values: Array, kind: type[np.generic]) -> Array:
     """The values as one row of a type, in memory aligned to vector registers.
 
-    Dr.Jit uses NumPy's memory in place, and compiles separate kernels for aligned and unaligned arrays;
-    without this it is a matter of chance which of them a scene needs.
+    Dr.Jit uses NumPy's memory in place, and compiles separate kernels for aligned and unaligned arrays.
     """
-    count = values.size
-    raw = np.empty(count * np.dtype(kind).itemsize + _REGISTER, np.uint8)
+    size = values.size * np.dtype(kind).itemsize
+    raw = np.empty(size + _REGISTER, np.uint8)
     start = -raw.ctypes.data % _REGISTER
-    flat = raw[start : start + count * np.dtype(kind).itemsize].view(kind)
+    flat = raw[start : start + size].view(kind)
     flat[:] = values.ravel()
     return flat
 
@@ -275,30 +255,13 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
         return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
     encoded = material.maps.normal * np.float32(0.5) + np.float32(0.5)
     albedo = mi.load_dict(_bitmap(mi, material.maps.albedo))  # shared by both coats
-
-    def coat(roughness: float) -> dict[str, Any]:
-        return {
-            "type": "roughplastic",
-            "distribution": "ggx",
-            "diffuse_reflectance": albedo,
-            "alpha": roughness,
-            "int_ior": material.index,
-            "nonlinear": True,
-        }
-
-    return {
-        "type": "twosided",
-        "bent": {
-            "type": "normalmap",
-            "normalmap": _bitmap(mi, encoded),
-            "film": {
-                "type": "blendbsdf",
-                "weight": _bitmap(mi, material.maps.dry),
-                "smooth": coat(material.roughness),
-                "rough": coat(material.dry_roughness),
-            },
-        },
-    }
+    plastic = {"type": "roughplastic", "distribution": "ggx", "nonlinear": True}
+    plastic |= {"diffuse_reflectance": albedo, "int_ior": material.index}
+    film = {"type": "blendbsdf", "weight": _bitmap(mi, material.maps.dry)}
+    film |= {"smooth": plastic | {"alpha": material.roughness}}
+    film |= {"rough": plastic | {"alpha": material.dry_roughness}}
+    bent = {"type": "normalmap", "normalmap": _bitmap(mi, encoded), "film": film}
+    return {"type": "twosided", "bent": bent}
 
 
 def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
@@ -308,11 +271,6 @@ def _bitmap(mi: Any, image: Map) -> dict[str, Any]:
         given = {"bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32))}
     else:  # in place, in a quarter of the time: a bitmap is copied and converted first
         given = {"data": mi.TensorXf(_aligned(texels, np.float32).reshape(texels.shape))}
-    return {
-        "type": "bitmap",
-        **given,
-        "raw": True,
-        "filter_type": "bilinear",
-        "wrap_mode": "clamp",
-        "accel": False,  # a GPU's texture units interpolate with 8 bits of fraction
-    }
+    # Not `accel`: a GPU's texture units interpolate with 8 bits of fraction.
+    how = {"raw": True, "filter_type": "bilinear", "wrap_mode": "clamp", "accel": False}
+    return {"type": "bitmap", **given, **how}

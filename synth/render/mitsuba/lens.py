@@ -27,14 +27,9 @@ class Compiled:
 
         _register(mi.variant())
         self.spp = spp
-        self.sensor = mi.load_dict(
-            {
-                "type": "sulcus_lens",
-                "film": _film(*camera.size),
-                "sampler": {"type": "multijitter", "sample_count": spp},
-                "aperture": camera.aperture_mm,
-            }
-        )
+        sampler = {"type": "multijitter", "sample_count": spp}
+        lens = {"type": "sulcus_lens", "aperture": camera.aperture_mm}
+        self.sensor = mi.load_dict(lens | {"film": _film(*camera.size), "sampler": sampler})
         self.place(camera)
 
     def place(self, camera: Camera) -> None:
@@ -75,26 +70,20 @@ class Scalar:
         """Moves the lens to the camera's pose."""
         import mitsuba as mi
 
-        if (lens := [*camera.K.ravel(), *camera.distortion]) != self._fitted:
+        if (given := [*camera.K.ravel(), *camera.distortion]) != self._fitted:
             self._fit(camera)
-            self._fitted = lens
+            self._fitted = given
         to_world = np.eye(4)
         # Mitsuba's cameras have x to the left and y up.
         to_world[:3, :3] = (camera.rotation * np.array([[-1.0], [-1.0], [1.0]])).T
         to_world[:3, 3] = camera.centre
-        thin = {"aperture_radius": camera.aperture_mm, "focus_distance": camera.focus_mm}
-        self.sensor = mi.load_dict(
-            {
-                **({"type": "thinlens", **thin} if camera.aperture_mm > 0 else {"type": "perspective"}),
-                "fov": self._fov,
-                "fov_axis": "x",
-                "near_clip": 1.0,
-                "far_clip": 1e4,
-                "to_world": mi.ScalarTransform4f(to_world.tolist()),
-                "film": self._film,
-                "sampler": {"type": "multijitter", "sample_count": self.spp},
-            }
-        )
+        lens = {"type": "perspective", "fov": self._fov, "fov_axis": "x", "near_clip": 1.0, "far_clip": 1e4}
+        if camera.aperture_mm > 0:
+            lens |= {"type": "thinlens", "aperture_radius": camera.aperture_mm}
+            lens |= {"focus_distance": camera.focus_mm}
+        sampler = {"type": "multijitter", "sample_count": self.spp}
+        placed = {"to_world": mi.ScalarTransform4f(to_world.tolist()), "film": self._film, "sampler": sampler}
+        self.sensor = mi.load_dict(lens | placed)
 
     def develop(self, image: Map) -> Map:
         """The recorded picture (H, W, 3) of a larger, finer film."""
@@ -105,14 +94,8 @@ class Scalar:
 
 def _film(width: int, height: int) -> dict[str, Any]:
     # A box filter does not mix pixels, so sums have one order on any number of threads: the same bytes.
-    return {
-        "type": "hdrfilm",
-        "width": width,
-        "height": height,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-        "component_format": "float32",
-    }
+    how = {"rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"}
+    return {"type": "hdrfilm", "width": width, "height": height, **how}
 
 
 _NAMES = "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
@@ -180,7 +163,7 @@ def _register(variant: str) -> None:
             self.v = dict(zip(v, data(v.values()), strict=True))
             self.around = mi.ScalarPoint3f(*camera.centre.tolist())
 
-        def sample_ray(
+        def sample_ray_differential(
             self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
         ) -> tuple[Any, Any]:
             v = self.v
@@ -192,13 +175,7 @@ def _register(variant: str) -> None:
             origin = self.centre + right * lens.x + down * lens.y
             sharp = self.centre + (right * x + down * y + forward) * v["focus"]
             ray = mi.Ray3f(mi.Point3f(origin), dr.normalize(mi.Vector3f(sharp - origin)), time)
-            return ray, mi.Color3f(1.0)
-
-        def sample_ray_differential(
-            self, time: Any, wavelength: Any, position: Any, aperture: Any, active: Any = True
-        ) -> tuple[Any, Any]:
-            ray, weight = self.sample_ray(time, wavelength, position, aperture, active)
-            return mi.RayDifferential3f(ray), weight
+            return mi.RayDifferential3f(ray), mi.Color3f(1.0)
 
         def bbox(self) -> Any:
             box = mi.ScalarBoundingBox3f()

@@ -88,12 +88,10 @@ def vtk() -> bytes:
     rows = [b"%d %d %d" % tuple(face) for face in FACES]
     lines = [b"# vtk DataFile Version 3.0", SLICER, b"ASCII", b"DATASET POLYDATA"]
     lines += [b"POINTS %d float" % len(POINTS), *(b"%f %f %f" % tuple(one) for one in POINTS)]
-    lines += [
-        b"POLYGONS %d %d" % (HALF.sum(), 4 * HALF.sum()),
-        *(b"3 " + rows[k] for k in np.flatnonzero(HALF)),
-    ]
-    strips = [b"3 " + rows[k] for k in np.flatnonzero(~HALF)]
-    return b"\n".join([*lines, b"TRIANGLE_STRIPS %d %d" % (len(strips), 4 * len(strips)), *strips, b""])
+    for kind, which in ((b"POLYGONS", HALF), (b"TRIANGLE_STRIPS", ~HALF)):
+        lines.append(kind + b" %d %d" % (which.sum(), 4 * which.sum()))
+        lines += [b"3 " + rows[k] for k in np.flatnonzero(which)]
+    return b"\n".join([*lines, b""])
 
 
 def vtp(appended: bool) -> bytes:
@@ -119,16 +117,11 @@ def vtp(appended: bool) -> bytes:
     return about + b"<PolyData>" + body + b"</PolyData>" + end + b"</VTKFile>"
 
 
-@pytest.mark.parametrize(
-    ("suffix", "data"),
-    [
-        ("stl", stl(tail=b"\n")),
-        ("stl", stl(count=0)),
-        ("vtk", vtk()),
-        ("vtp", vtp(appended=False)),
-        ("vtp", vtp(appended=True)),
-    ],
-)
+SPACED = [("stl", stl(tail=b"\n")), ("stl", stl(count=0)), ("vtk", vtk())]
+SPACED += [("vtp", vtp(appended)) for appended in (False, True)]
+
+
+@pytest.mark.parametrize(("suffix", "data"), SPACED)
 def test_the_stated_space_becomes_ras_and_no_face_is_lost(suffix: str, data: bytes, tmp_path: Path) -> None:
     (tmp_path / f"brain.{suffix}").write_bytes(data)
     with pytest.warns(match="LPS"):
@@ -139,23 +132,16 @@ def test_the_stated_space_becomes_ras_and_no_face_is_lost(suffix: str, data: byt
     np.testing.assert_allclose(vertices.mean(axis=0), true.vertices.mean(axis=0), atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("sign", "turn", "named"),
-    [
-        ([1, 1, 1], 1, "accepted"),
-        ([-1, -1, 1], 1, "negated"),
-        ([-1, 1, 1], 1, "negated"),
-        ([1, 1, 1], -1, "direction"),
-        ([1.3, 1.3, 1.3], 1, "nearest"),
-    ],
-)
-def test_an_opening_in_other_axes_is_refused(
-    sign: list[float], turn: int, named: str, tmp_path: Path
-) -> None:
+OTHER_AXES = [((1, 1, 1), "accepted"), ((-1, -1, 1), "negated"), ((-1, 1, 1), "negated")]
+OTHER_AXES += [((1.3, 1.3, 1.3), "nearest"), ((1, 1, 1), "direction")]
+
+
+@pytest.mark.parametrize(("sign", "named"), OTHER_AXES)
+def test_an_opening_in_other_axes_is_refused(sign: tuple[float, ...], named: str, tmp_path: Path) -> None:
     (tmp_path / "brain.stl").write_bytes(stl(b"no space"))
     found = []
     for k in np.flatnonzero(BALL.vertices[:, 2] > 0.5)[::12]:
-        point, out = POINTS[k] * sign, BALL.vertices[k] * sign * turn
+        point, out = POINTS[k] * sign, BALL.vertices[k] * sign * (-1 if named == "direction" else 1)
         try:
             opening = schema.CraniotomySection(point=tuple(point), direction=tuple(out))
             brain_surface.load_brain(tmp_path / "brain.stl", opening)

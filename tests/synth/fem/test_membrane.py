@@ -65,9 +65,8 @@ def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None
 @pytest.mark.slow
 def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     """The instruments' work while loading equals the stored energy, and comes back in unloading."""
-    fem = schema.FemSection(
-        gestures=("push",), load=(0.25, 0.25), membrane=schema.MembraneSection(probability=1)
-    )
+    sheet = schema.MembraneSection(probability=1)
+    fem = schema.FemSection(gestures=("push",), load=(0.25, 0.25), membrane=sheet)
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
     tets = tetrahedra.block(ANATOMY, 700, gesture.focus)

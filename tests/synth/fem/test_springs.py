@@ -83,11 +83,8 @@ def test_damped_motion_comes_to_rest_in_equilibrium() -> None:
     tets = tetrahedra.block(ANATOMY, 300, slips=True)
     load = np.zeros_like(tets.points)
     load[np.hypot(*tets.points[:, :2].T) < 15] = [0.05, 0.0, -0.02]
-    frames = 40
-    clock = Clock(0.5, 1, 1.0, 20.0)
-    found = march_in_time(
-        tets, Tissue(1.0, 0.4, "linear"), np.stack([load] * frames), np.full(frames, 0.1), clock
-    )
+    loads, tissue = np.stack([load] * 40), Tissue(1.0, 0.4, "linear")
+    found = march_in_time(tets, tissue, loads, np.full(40, 0.1), Clock(0.5, 1, 1.0, 20.0))
     still = assemble(tets, "linear", 0.4).solve(load)
     assert np.abs(found.displacement[-1] - still).max() <= 2e-3 * np.abs(still).max()
     assert found.energy[-1] == pytest.approx(0.5 * float(np.vdot(load, still)), rel=5e-3)

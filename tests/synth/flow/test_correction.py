@@ -14,10 +14,8 @@ def _described(mirrored: bool) -> np.ndarray:
     coloured = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
     shift = np.float32([[1, 0, 0.4], [0, 1, -0.25]])
     moved = cv2.warpAffine(coloured, shift, (88, 104), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    pictures = [
-        np.clip(one, 0, 255).astype(np.uint8)[:, :: -1 if mirrored else 1] for one in (coloured, moved)
-    ]
-    rest, now = (np.ascontiguousarray(one) for one in pictures)
+    pictures = np.clip([coloured, moved], 0, 255).astype(np.uint8)
+    rest, now = np.ascontiguousarray(pictures[:, :, :: -1 if mirrored else 1])
     greys = rest[..., 1] / np.float32(12), now[..., 1] / np.float32(12)
     every, flow = np.ones((104, 88), bool), np.zeros((104, 88, 2), np.float32)
     return correction.describe(rest, now, every, greys, np.float32(every), flow, np.float32(every))

@@ -9,8 +9,7 @@ from synth.flow.mask_selection import Proposal, SelectingTracker
 
 _SIZE = 96
 _NOTHING = np.zeros((_SIZE, _SIZE), bool)
-_MIDDLE = np.zeros((_SIZE, _SIZE), bool)
-_MIDDLE[30:66, 30:66] = True
+_MIDDLE = np.pad(np.ones((36, 36), bool), 30)
 
 
 def _texture() -> NDArray[np.float64]:
@@ -27,13 +26,13 @@ def _moved(by_px: float) -> NDArray[np.float64]:
     return shift(_texture(), (0, by_px), order=5, mode="mirror")
 
 
-def _tracker(rest: NDArray[np.uint8], found: Proposal) -> SelectingTracker:
-    return SelectingTracker("tvl1", rest, found, ~_NOTHING)
+def _tracker(rest: NDArray[np.float64], found: Proposal) -> SelectingTracker:
+    return SelectingTracker("tvl1", _picture(rest), found, ~_NOTHING)
 
 
 def test_tissue_that_is_detected_as_a_tool_is_not_masked() -> None:
     wrong = Proposal(_NOTHING, _MIDDLE, _NOTHING)
-    tracker = _tracker(_picture(_texture()), wrong)
+    tracker = _tracker(_texture(), wrong)
     for by_px in (1.0, 2.0):
         flow, _ = tracker.step(_picture(_moved(by_px)), wrong)
     assert not tracker.blocked.any()
@@ -42,7 +41,7 @@ def test_tissue_that_is_detected_as_a_tool_is_not_masked() -> None:
 
 
 def test_a_tool_that_occludes_the_tissue_is_masked() -> None:
-    tracker = _tracker(_picture(_texture()), Proposal(_NOTHING, _NOTHING, _NOTHING))
+    tracker = _tracker(_texture(), Proposal(_NOTHING, _NOTHING, _NOTHING))
     for by_px in (1.0, 2.0):
         now = _picture(np.where(_MIDDLE, 60.0, _moved(by_px)))
         tracker.step(now, Proposal(_NOTHING, _MIDDLE, _NOTHING))
@@ -55,7 +54,7 @@ def test_still_highlights_on_moving_tissue_are_masked_and_masking_helps() -> Non
     shine = Proposal(wet, _NOTHING, _NOTHING)
     errors = {}
     for name, found in (("chosen", shine), ("none", Proposal(_NOTHING, _NOTHING, _NOTHING))):
-        tracker = _tracker(_picture(np.where(wet, 250.0, _texture())), found)
+        tracker = _tracker(np.where(wet, 250.0, _texture()), found)
         for by_px in (1.5, 3.0):
             flow, _ = tracker.step(_picture(np.where(wet, 250.0, _moved(by_px))), found)
         errors[name] = float(np.abs(flow - [3.0, 0.0]).mean())
@@ -75,7 +74,7 @@ def test_confidence_is_low_where_only_highlights_support_zero_motion(contrast: f
     spots = gaussian_filter(np.random.default_rng(1).standard_normal((_SIZE, _SIZE)), 6)
     wet = spots > np.quantile(spots, 0.95)
     found = Proposal(wet, _NOTHING, _NOTHING)
-    tracker = _tracker(_picture(np.where(wet, 250.0, _faint(0.0, 2, contrast))), found)
+    tracker = _tracker(np.where(wet, 250.0, _faint(0.0, 2, contrast)), found)
     for k, by_px in enumerate((1.5, 3.0, 3.0)):
         flow, confidence = tracker.step(_picture(np.where(wet, 250.0, _faint(by_px, 3 + k, contrast))), found)
         off = float(np.linalg.norm(flow - [by_px, 0.0], axis=-1)[~wet].mean())

@@ -97,7 +97,7 @@ def test_invalid_results_of_an_estimator_are_reported_with_its_name(wrong: str) 
 def test_estimators_are_deterministic() -> None:
     (pair,) = pairs(Recipe(size=128), 1, 13)
     for name in ("tvl1", "opencv-tvl1", "dis"):
-        flows = [estimator.create(name).flow(pair.rest, pair.now, pair.rest_usable, pair.now_usable)[0]
-                 for _ in range(3)]  # fmt: skip
-        for flow in flows[1:]:
-            np.testing.assert_array_equal(flow, flows[0], err_msg=name)
+        given = pair.rest, pair.now, pair.rest_usable, pair.now_usable
+        first, *others = (estimator.create(name).flow(*given)[0] for _ in range(3))
+        for flow in others:
+            np.testing.assert_array_equal(flow, first, err_msg=name)

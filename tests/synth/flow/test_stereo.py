@@ -16,18 +16,16 @@ SIZE = (160, 120)
 FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0
 K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
 K_RIGHT = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
-PARALLEL = StereoRig(
-    Intrinsics(K, np.zeros(5)), Intrinsics(K_RIGHT, np.zeros(5)), np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE
-)
+PINHOLES = Intrinsics(K, np.zeros(5)), Intrinsics(K_RIGHT, np.zeros(5))
+PARALLEL = StereoRig(*PINHOLES, np.eye(3), np.array([-BASE, 0.0, 0.0]), SIZE)
 TURN = cv2.Rodrigues(np.array([0.004, 0.08, 0.01]))[0]
-TURNED = StereoRig(
-    Intrinsics(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0])),
-    Intrinsics(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0])),
-    TURN,
-    TURN @ np.array([-BASE, 0.4, -0.8]),
-    SIZE,
-)
+LEFT = Intrinsics(K, np.array([-0.2, 0.1, 0.002, -0.001, 0.0]))
+RIGHT = Intrinsics(np.diag([1.01, 1.01, 1.0]) @ K, np.array([-0.1, 0.0, 0.0, 0.001, 0.0]))
+TURNED = StereoRig(LEFT, RIGHT, TURN, TURN @ np.array([-BASE, 0.4, -0.8]), SIZE)
 COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+EVERY, NONE = np.ones(SIZE[::-1], bool), np.zeros(SIZE[::-1], bool)
+TRUST = np.ones(SIZE[::-1], np.float32)
+INNER = (slice(10, -10), slice(10, -10), 2)
 
 
 def texture(rng: np.random.Generator) -> np.ndarray:
@@ -63,16 +61,13 @@ def test_rectified_rows_and_depths_match_opencvs_projections(rig: StereoRig) -> 
             lens = (rig.left, rig.right)[camera]
             own = cv2.projectPoints(where, *pose, lens.K, lens.distortion)[0][:, 0]
             inverse = rectified._inverse[camera]
-            x, y = (
-                cv2.remap(part, *own.T.astype(np.float32)[:, None], cv2.INTER_LINEAR)[0] for part in inverse
-            )
-            found.append(np.stack([x, y], axis=1))
+            at = *own.T.astype(np.float32)[:, None], cv2.INTER_LINEAR
+            found.append(np.stack([cv2.remap(part, *at)[0] for part in inverse], axis=1))
         return found[0], found[1]
 
     left, right = straight(points)
-    inside = ((left > 2) & (left < np.array(SIZE) - 3) & (right > 2) & (right < np.array(SIZE) - 3)).all(
-        axis=1
-    )
+    both = np.hstack([left, right])
+    inside = ((both > 2) & (both < np.array(SIZE * 2) - 3)).all(axis=1)
     assert inside.sum() > 15
     np.testing.assert_allclose(left[inside, 1], right[inside, 1], atol=0.02)
     disparity = np.float32(left[:, 0] - right[:, 0])
@@ -119,9 +114,8 @@ def test_rest_disparity_of_a_slope_with_a_step() -> None:
     for _ in range(30):
         x = COLUMNS + 4.3 + 0.03 * (x - 80) + 3.0 * (ROWS > 60)
     right = view(picture, x, ROWS)[..., 0].astype(np.float32)
-    every = np.ones(truth.shape, bool)
-    found = rest.match(left, right, every, every)
-    coarse = rest.match(left, right, every, every, refine=False)
+    found = rest.match(left, right, EVERY, EVERY)
+    coarse = rest.match(left, right, EVERY, EVERY, refine=False)
     inner = (slice(8, -8), slice(16, -16))
     error, before = (np.abs(one.disparity - truth)[inner] for one in (found, coarse))
     assert np.median(error) < 0.05
@@ -129,7 +123,7 @@ def test_rest_disparity_of_a_slope_with_a_step() -> None:
     assert (error > 2).mean() < 0.02
     assert found.epipolar_px < 0.05
     with pytest.raises(UserError):
-        rest.match(left, np.zeros_like(left), every, every)
+        rest.match(left, np.zeros_like(left), EVERY, EVERY)
 
 
 def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
@@ -137,8 +131,6 @@ def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
     picture = texture(rng)
     d, v = dent(0.6), -0.8
     u = 1.7 - 4.0 * d  # the tissue is strained where it is dented
-    every = np.ones(SIZE[::-1], bool)
-    none = ~every
 
     def noisy(rgb: np.ndarray) -> np.ndarray:
         return np.clip(rgb + rng.normal(scale=2.0, size=rgb.shape), 0, 255).astype(np.uint8)
@@ -146,53 +138,46 @@ def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
     # The tissue lies at the distance of zero disparity.
     first = noisy(view(picture, COLUMNS, ROWS)), noisy(view(picture, COLUMNS, ROWS))
     left, right = (noisy(view(picture, _source(along), ROWS - v)) for along in (u, u - d))
-    tracker = StereoTracker(PARALLEL, first[0][None], first[1][None], none, none, every)
+    tracker = StereoTracker(PARALLEL, first[0][None], first[1][None], NONE, NONE, EVERY)
     flow = np.stack([u, np.full_like(u, v)], axis=-1).astype(np.float32)
-    trust = np.ones(every.shape, np.float32)
-    moved = tracker.step(left, right, none, none, flow, trust)
+    moved = tracker.step(left, right, NONE, NONE, flow, TRUST)
     depth = FOCAL * BASE / (FOCAL * BASE / AWAY + d)
-    inner = (slice(10, -10), slice(10, -10))
-    error = (moved.motion[..., 2] - (depth - AWAY))[inner]
+    error = (moved.motion[..., 2] - (depth - AWAY))[INNER[:2]]
     assert (depth - AWAY).max() > 1.5
     assert np.sqrt((error**2).mean()) < 0.12
     assert moved.motion[60, 80, 2] == pytest.approx(depth[60, 80] - AWAY, abs=0.2)
     across = moved.motion[60, 80, :2] - np.array([u[60, 80], v]) * AWAY / FOCAL
     assert np.abs(across).max() < 0.02
-    assert (moved.deviation[inner] > 0).all()
+    assert (moved.deviation[INNER[:2]] > 0).all()
 
 
 def test_a_blocked_right_camera_raises_the_deviation_and_the_next_frame_recovers() -> None:
     picture = texture(np.random.default_rng(6))
-    every = np.ones(SIZE[::-1], bool)
     rest_frame = view(picture, COLUMNS, ROWS)
-    tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
-    still = np.zeros((*every.shape, 2), np.float32), np.ones(every.shape, np.float32)
-    sure = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
-    blind = tracker.step(rest_frame, np.zeros_like(rest_frame), ~every, every, *still)
-    again = tracker.step(rest_frame, rest_frame, ~every, ~every, *still)
-    inner = (slice(10, -10), slice(10, -10), 2)
-    assert np.abs(sure.motion[inner]).max() < 0.05
-    assert np.abs(blind.motion[inner]).max() < 0.05
-    assert (blind.deviation[inner] > 3 * sure.deviation[inner]).all()
+    tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], NONE, NONE, EVERY)
+    still = np.zeros((*SIZE[::-1], 2), np.float32), TRUST
+    sure = tracker.step(rest_frame, rest_frame, NONE, NONE, *still)
+    blind = tracker.step(rest_frame, np.zeros_like(rest_frame), NONE, EVERY, *still)
+    again = tracker.step(rest_frame, rest_frame, NONE, NONE, *still)
+    assert np.abs(sure.motion[INNER]).max() < 0.05
+    assert np.abs(blind.motion[INNER]).max() < 0.05
+    assert (blind.deviation[INNER] > 3 * sure.deviation[INNER]).all()
     np.testing.assert_allclose(again.motion, sure.motion, atol=1e-3)
 
 
 def test_a_right_picture_of_another_moment_is_detected() -> None:
     rng = np.random.default_rng(7)
     picture = texture(rng)
-    every = np.ones(SIZE[::-1], bool)
     rest_frame = view(picture, COLUMNS, ROWS)
     now, before = (view(picture, COLUMNS - 1.5 * part, ROWS - 1.2 * part) for part in (1.0, 0.5))
-    flow = np.tile(np.array([1.5, 1.2], np.float32), (*every.shape, 1))
-    trust = np.ones(every.shape, np.float32)
+    flow = np.tile(np.array([1.5, 1.2], np.float32), (*SIZE[::-1], 1))
     lags, spreads, errors = [], [], []
     for right in (now, before):
-        tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], ~every, ~every, every)
-        moved = tracker.step(now, right, ~every, ~every, flow, trust)
-        inner = (slice(10, -10), slice(10, -10), 2)
+        tracker = StereoTracker(PARALLEL, rest_frame[None], rest_frame[None], NONE, NONE, EVERY)
+        moved = tracker.step(now, right, NONE, NONE, flow, TRUST)
         lags.append(tracker.lag)
-        spreads.append(np.median(moved.deviation[inner]))
-        errors.append(np.sqrt(np.square(moved.motion[inner]).mean()))
+        spreads.append(np.median(moved.deviation[INNER]))
+        errors.append(np.sqrt(np.square(moved.motion[INNER]).mean()))
     assert abs(lags[0]) < 0.05
     assert lags[1] == pytest.approx(0.5, abs=0.2)
     assert errors[1] > 10 * errors[0], "half of the motion appears as depth"

@@ -22,10 +22,8 @@ def texture(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]
     rng = np.random.default_rng(0)
     waves = [rng.uniform(6, 25) for _ in range(40)]
     turns, phases = rng.uniform(0, 2 * np.pi, (2, 40))
-    grey = sum(
-        np.cos(2 * np.pi * (np.cos(a) * x + np.sin(a) * y) / long + p)
-        for long, a, p in zip(waves, turns, phases, strict=True)
-    )
+    each = zip(waves, turns, phases, strict=True)
+    grey = sum(np.cos(2 * np.pi * (np.cos(a) * x + np.sin(a) * y) / long + p) for long, a, p in each)
     return np.clip(128 + 12 * np.asarray(grey), 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
 
 

@@ -24,9 +24,8 @@ def load(peak_px: float) -> NDArray[np.float32]:
 
 def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked: bool = False) -> list[str]:
     search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
+    mask, sure = ROD if masked else None, np.ones(SHAPE, np.float32)
     for k in range(4):
-        sure = np.ones(SHAPE, np.float32)
-        mask = ROD if masked else None
         search.add(FrameMotion(k / 3 * motion, sure, is_rest=k == 0, index=k, masked=mask), depth)
     return [one.message for one in search.findings]
 

@@ -54,16 +54,14 @@ def simulate(
 
 def error_mm(pulse: PulseEstimate, time: NDArray[np.float64], truth: list[NDArray[np.float64]]) -> float:
     """Root mean square error of the pulsation [mm]."""
-    return MM_PER_PX * float(
-        np.sqrt(np.mean([np.square(pulse.at(t) - own).mean() for t, own in zip(time, truth, strict=True)]))
-    )
+    squares = [np.square(pulse.at(t) - own).mean() for t, own in zip(time, truth, strict=True)]
+    return MM_PER_PX * float(np.sqrt(np.mean(squares)))
 
 
 @pytest.mark.slow
 def test_heart_and_breath_between_contacts_are_found() -> None:
     surface, time, truth = simulate()
     pulse = find_pulse(surface, time[0]).pulse
-    assert pulse is not None
     assert [rhythm.rate_hz for rhythm in pulse.rhythms] == pytest.approx([1.2, 0.25], rel=0.01)
     assert error_mm(pulse, time, truth) < 0.01
     # The amplitude of the heart by definition: half of the peak-to-peak motion.
@@ -77,12 +75,10 @@ def test_heart_and_breath_between_contacts_are_found() -> None:
 def test_noise_of_the_rest_frame_is_removed_up_to_a_limit() -> None:
     surface, time, truth = simulate(rest_px=0.06)
     pulse = find_pulse(surface, time[0]).pulse
-    assert pulse is not None
     without = replace(pulse, rest_noise=0 * pulse.rest_noise)
     assert error_mm(pulse, time, truth) < 0.7 * error_mm(without, time, truth)
     surface, time, _ = simulate(rest_px=0.5)
     pulse = find_pulse(surface, time[0]).pulse
-    assert pulse is not None
     assert np.linalg.norm(pulse.rest_noise, axis=-1).max() == pytest.approx(0.15, abs=0.01)
 
 

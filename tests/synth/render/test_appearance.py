@@ -16,9 +16,7 @@ from synth.render.appearance import light
 from synth.render.camera import camera
 from synth.sequence import scenario
 
-JOB = Job.model_validate(
-    {"anatomy": {"vertices": 2500}, "render": {"size": (64, 48), "variant": "scalar_rgb"}}
-)
+JOB = Job.model_validate({"anatomy": {"vertices": 2500}, "render": {"size": (64, 48)}})
 
 
 @pytest.fixture(scope="module")

@@ -16,29 +16,31 @@ from synth.render.camera.colour_processing import PLAIN as ORDINARY
 SRGB = (tuple(encoded(np.array(KNOTS)).tolist()),) * 3
 PLAIN = CameraSensor(vignette=0.0, bloom=0.0, curves=SRGB, sharpening=0.0)
 NOISELESS = replace(PLAIN, full_well=1e9, read_noise=0.0, bits=30)
+MATRIX = ((1.3, -0.2, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
+RNG = np.random.default_rng(4)
 
 
 def flat(level: float, side: int = 200) -> np.ndarray:
     return np.full((side, side, 3), level, np.float32)
 
 
-def linear(video: np.ndarray) -> np.ndarray:
-    encoded = video / 255
+def recorded(light: np.ndarray, sensor: CameraSensor) -> np.ndarray:
+    """Linear light (H, W, 3) of the picture."""
+    encoded = record(light, sensor, np.random.default_rng(0)) / 255
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 @pytest.mark.parametrize("level", [0.1, 0.4, 0.8])
 def test_noise_is_photons_and_readout(level: float) -> None:
     sensor = replace(PLAIN, full_well=500.0, read_noise=6.0)
-    found = linear(record(flat(level), sensor, np.random.default_rng(0)).astype(float))
+    found = recorded(flat(level), sensor)
     expected = np.sqrt(level * 500 + 36) / 500
     assert found.std() == pytest.approx(expected, rel=0.05)
     assert found.mean() == pytest.approx(level, rel=0.02)
 
 
 def test_white_balance_multiplies_channels() -> None:
-    sensor = replace(PLAIN, white=(1.5, 1.0, 0.5), full_well=1e6, read_noise=0.0)
-    found = linear(record(flat(0.4), sensor, np.random.default_rng(0)).astype(float)).mean(axis=(0, 1))
+    found = recorded(flat(0.4), replace(NOISELESS, white=(1.5, 1.0, 0.5))).mean(axis=(0, 1))
     np.testing.assert_allclose(found, [0.6, 0.4, 0.2], rtol=0.02)
 
 
@@ -49,14 +51,11 @@ def test_what_fills_the_sensor_is_white_under_any_lamp() -> None:
 
 
 def test_a_matrix_mixes_linear_light_and_keeps_white() -> None:
-    matrix = ((1.5, -0.4, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
+    mixed = replace(NOISELESS, matrix=MATRIX)
     colour = flat(1.0) * np.array([0.5, 0.3, 0.2], np.float32)
-    found = linear(record(colour, replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float))
-    np.testing.assert_allclose(found.mean(axis=(0, 1)), np.array(matrix) @ [0.5, 0.3, 0.2], rtol=0.02)
-    grey = linear(
-        record(flat(0.4), replace(NOISELESS, matrix=matrix), np.random.default_rng(0)).astype(float)
-    )
-    np.testing.assert_allclose(grey, 0.4, rtol=0.02)
+    expected = np.array(mixed.matrix) @ [0.5, 0.3, 0.2]
+    np.testing.assert_allclose(recorded(colour, mixed).mean(axis=(0, 1)), expected, rtol=0.02)
+    np.testing.assert_allclose(recorded(flat(0.4), mixed), 0.4, rtol=0.02)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -77,15 +76,14 @@ def test_a_camera_keeps_its_knots_and_rises_between_them_not_steeply_in_the_dark
 def test_bloom_keeps_the_light() -> None:
     spot = np.zeros((101, 101, 3), np.float32)
     spot[50, 50] = 0.5
-    without = linear(record(spot, NOISELESS, np.random.default_rng(0)).astype(float))
-    with_bloom = linear(record(spot, replace(NOISELESS, bloom=0.4), np.random.default_rng(0)).astype(float))
+    without = recorded(spot, NOISELESS)
+    with_bloom = recorded(spot, replace(NOISELESS, bloom=0.4))
     assert with_bloom[50, 50, 0] < 0.75 * without[50, 50, 0]
     assert with_bloom[52, 50, 0] > without[52, 50, 0]
 
 
 def test_corners_lose_the_given_share() -> None:
-    sensor = replace(PLAIN, vignette=0.3, full_well=1e6, read_noise=0.0)
-    found = linear(record(flat(0.5, 201), sensor, np.random.default_rng(0)).astype(float))[..., 0]
+    found = recorded(flat(0.5, 201), replace(NOISELESS, vignette=0.3))[..., 0]
     assert found[0, 0] / found[100, 100] == pytest.approx(0.7, rel=0.03)
 
 
@@ -98,8 +96,7 @@ def test_same_seed_same_bytes_other_seed_other_noise() -> None:
 def test_blur_widens_an_edge_by_its_own_width() -> None:
     edge = np.zeros((64, 128, 3), np.float32)
     edge[:, 64:] = 0.5
-    sensor = replace(PLAIN, full_well=1e9, read_noise=0.0, blur=2.0)
-    light = linear(record(edge, sensor, np.random.default_rng(0))[32, :, 1].astype(float)) / 0.5
+    light = recorded(edge, replace(NOISELESS, blur=2.0))[32, :, 1] / 0.5
     # A Gaussian's edge rises from 15.9 to 84.1% over two of its standard deviations.
     low, high = np.interp([0.1587, 0.8413], light[54:75], np.arange(54, 75))
     assert (high - low) / 2 == pytest.approx(2.0, rel=0.05)
@@ -127,10 +124,6 @@ def test_odd_sizes_and_no_codec() -> None:
     section = SensorSection.model_validate({"bitrate_mbps": 1.0, "chroma": "4:2:0"})
     assert np.abs(video_link.recorded(video, section, 25.0).astype(int) - 90).max() <= 4
     assert video_link.recorded(video, SensorSection(), 25.0) is video
-
-
-MATRIX = ((1.3, -0.2, -0.1), (-0.2, 1.4, -0.2), (0.0, -0.5, 1.5))
-RNG = np.random.default_rng(4)
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])

@@ -43,15 +43,14 @@ def check_denoised(exact: np.ndarray, before: list[np.ndarray], after: list[np.n
 
 
 def test_noise_along_a_soft_edge_falls_and_what_lies_behind_keeps_its_pixels() -> None:
-    rng = np.random.default_rng(3)
+    rng, none = np.random.default_rng(3), np.zeros((64, 64), np.float32)
     ground = np.where(np.mgrid[:64, :64][1] % 6 < 3, 0.8, 0.3).astype(np.float32)
     before, after = [], []
     for _ in range(8):
         exact, cover = soft_edge(64, rng)
         radiance = np.stack([0.1 * cover + ground * (1 - cover)] * 3).astype(np.float32)
         near = np.stack([0.1 * cover] * 3).astype(np.float32)
-        blocked, none = np.zeros_like(radiance), np.zeros((64, 64), np.float32)
-        light = Light(radiance, near, cover.astype(np.float32), blocked, none)
+        light = Light(radiance, near, cover.astype(np.float32), np.zeros_like(radiance), none)
         truth = 0.1 * exact + ground * (1 - exact)
         before.append(radiance[0] - truth)
         after.append(soften(light, 1.0, 4)[..., 0] - truth)
@@ -61,13 +60,12 @@ def test_noise_along_a_soft_edge_falls_and_what_lies_behind_keeps_its_pixels() -
 
 
 def test_noise_along_a_soft_shadow_falls() -> None:
-    rng = np.random.default_rng(3)
+    rng, none = np.random.default_rng(3), np.zeros((64, 64), np.float32)
     before, after = [], []
     for _ in range(8):
         exact, shade = soft_edge(64, rng)
         blocked = np.stack([0.6 * shade] * 3).astype(np.float32)
-        none = np.zeros((64, 64), np.float32)
-        light = Light(0.6 - blocked, np.zeros_like(blocked), none, blocked, 2 * shade.astype(np.float32))
+        light = Light(0.6 - blocked, 0 * blocked, none, blocked, 2 * shade.astype(np.float32))
         before.append(light.radiance[0] - 0.6 * (1 - exact))
         after.append(soften(light, 2.0, 4)[..., 0] - 0.6 * (1 - exact))
     check_denoised(exact, before, after)

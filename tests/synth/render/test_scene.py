@@ -21,6 +21,7 @@ from synth.sequence import scenario
 from synth.sequence.scene import at_rest
 from synth.system import gpu, llvm
 
+pytestmark = pytest.mark.slow
 VARIANTS = ["scalar_rgb"]
 VARIANTS += ["llvm_ad_rgb"] * bool(llvm.find()) + ["cuda_ad_rgb"] * (gpu.obstacle(gpu.probe()) is None)
 TIPS = np.array([[-1.0, 1.0, 0.2], [1.2, 1.4, 0.2]])
@@ -31,10 +32,7 @@ def made(
     variant: str, spp: int = 4, extra: tuple[str, ...] = (), tool: bool = True, **render: object
 ) -> tuple[Renderer, np.ndarray]:
     settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
-    job = Job(
-        anatomy=AnatomySection(vertices=2500),
-        render=RenderSection.model_validate(settings),
-    )
+    job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(settings))
     surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
@@ -44,7 +42,6 @@ def made(
     return Renderer(content, lens, appearance.sensor, job.render, extra), surface.vertices
 
 
-@pytest.mark.slow
 def test_same_seed_same_bytes() -> None:
     ours, vertices = made(VARIANTS[-1])
     shots = [ours.render(SceneState(vertices, TIPS, SHAFTS), seed) for seed in (7, 8, 7)]
@@ -56,7 +53,6 @@ def test_same_seed_same_bytes() -> None:
     assert (again.render(SceneState(vertices, TIPS, SHAFTS), 7).rgb == shots[0].rgb).all()
 
 
-@pytest.mark.slow
 def test_the_picture_moves_with_the_truth() -> None:
     """The picture follows a sideways shift of the cortex by the flow, and by no other shift."""
     ours, vertices = made(VARIANTS[-1], spp=64, tool=False)
@@ -72,15 +68,10 @@ def test_the_picture_moves_with_the_truth() -> None:
     assert min(errors, key=lambda d: errors[d]) == 3
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS[1:])
 def test_variants_agree_pixel_by_pixel(variant: str) -> None:
-    """Means of independent frames differ within their standard errors, over the picture.
-
-    Without distortion, where no variant resamples. After Mitsuba's own z-tests of renderings.
-    """
-    frames = 8
-    stacks = []
+    """Undistorted, means of independent frames differ within their standard errors (Mitsuba's z-test)."""
+    frames, stacks = 8, []
     for name, seed in (("scalar_rgb", 50), (variant, 90)):
         ours, vertices = made(name, spp=16, size=(64, 48), distortion=(0.0,) * 5)
         shots = [ours.render(SceneState(vertices, TIPS, SHAFTS), seed + k) for k in range(frames)]
@@ -93,7 +84,6 @@ def test_variants_agree_pixel_by_pixel(variant: str) -> None:
     assert (np.abs(z) > 4.5).mean() < 0.01
 
 
-@pytest.mark.slow
 def test_few_paths_have_the_mean_of_many() -> None:
     ours, vertices = made(VARIANTS[-1], spp=4)
     many, _ = made(VARIANTS[-1], spp=256)
@@ -104,7 +94,6 @@ def test_few_paths_have_the_mean_of_many() -> None:
     assert np.median(np.abs(apart)) < 0.004
 
 
-@pytest.mark.slow
 def test_tissue_is_visible_through_the_opening_only() -> None:
     """The wound's floor lies lower than the dura in front of it, and over the brain."""
     for seed in range(3):
@@ -118,7 +107,6 @@ def test_tissue_is_visible_through_the_opening_only() -> None:
         assert (np.hypot(points[0], points[1]) < opening + 1.0).all()
 
 
-@pytest.mark.slow
 def test_traction_is_in_camera_axes() -> None:
     ours, vertices = made(VARIANTS[-1])
     nodal = np.zeros_like(vertices)
@@ -129,7 +117,6 @@ def test_traction_is_in_camera_axes() -> None:
     assert (ours.traction(nodal)[~ours.rest.tissue] == 0).all()
 
 
-@pytest.mark.slow
 def test_without_llvm_the_scalar_variant_is_taken() -> None:
     code = "from synth.render.mitsuba.adapter import pick; print(pick('auto'))"
     environment = os.environ | {"PATH": "/usr/bin:/bin", "SULCUS_LLVM": ""}
@@ -137,7 +124,6 @@ def test_without_llvm_the_scalar_variant_is_taken() -> None:
     assert done.stdout.strip() == "scalar_rgb"
 
 
-@pytest.mark.slow
 def test_an_open_shutter_adds_up_light() -> None:
     ours, vertices = made(VARIANTS[-1], spp=4, tool=False)
     moments = [SceneState(vertices, TIPS, SHAFTS, None, power) for power in (0.5, 1.5)]
@@ -147,18 +133,13 @@ def test_an_open_shutter_adds_up_light() -> None:
     assert (both.flow == sharp.flow).all()
 
 
-@pytest.mark.slow
 def test_truth_on_request() -> None:
     """Flow to the next frame chains with flow from rest; normals face the lens."""
-    extra = ("flow_next", "normals")
-    ours, vertices = made(VARIANTS[-1], spp=1, tool=False, extra=extra)
+    ours, vertices = made(VARIANTS[-1], spp=1, tool=False, extra=("flow_next", "normals"))
     push = np.exp(-(vertices[:, :2] ** 2).sum(axis=1) / 30)[:, None] * np.array([0.6, 0.2, 0.5])
     moments = [SceneState(vertices + k * push, TIPS, SHAFTS) for k in range(3)]
     shots = [ours.render(moments[k], k, (), moments[min(k + 1, 2)]) for k in range(3)]
     first, second = shots[0], shots[1]
-    assert first.flow_next is not None
-    assert second.flow_next is not None
-    assert first.normals is not None
     # In the rest frame a pixel's point is the same for both.
     np.testing.assert_allclose(first.flow_next, second.flow, atol=1e-4)
     rows, columns = np.nonzero(ours.rest.tissue & second.visible & shots[2].visible)
@@ -173,10 +154,8 @@ def test_truth_on_request() -> None:
     assert (shots[2].flow_next == 0).sum() > 0
 
 
-@pytest.mark.slow
 def test_rest_disparity_triangulates_to_the_rest_points() -> None:
     ours, _ = made(VARIANTS[-1], spp=1, tool=False, stereo_mm=20.0)
-    assert ours.right is not None
     rows, columns = (at[::50] for at in np.nonzero(ours.rest.tissue))
     pixels = np.stack([columns, rows], 1).astype(np.float64)
     left, right = ours.camera, ours.right
@@ -188,7 +167,6 @@ def test_rest_disparity_triangulates_to_the_rest_points() -> None:
     np.testing.assert_allclose((there[:3] / there[3]).T, expected, atol=0.05)
 
 
-@pytest.mark.slow
 def test_scenery_is_in_the_same_place_in_pictures_and_truth() -> None:
     """Its pixels differ from those of a scene without it, and tissue that moves under it is invisible."""
     plain, vertices = made("scalar_rgb", RenderSection().spp, tool=False)
@@ -220,7 +198,6 @@ SMALL = ["render.size=[64, 48]", "sequences=4", "anatomy.vertices=2500", "render
 _LARGE = 500  # operations: a kernel that traces light; the rest fill and copy arrays
 
 
-@pytest.mark.slow
 def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
     if pick("auto") == "scalar_rgb":
         pytest.skip("no LLVM here, so nothing is compiled")
@@ -230,15 +207,13 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
     mi.set_variant("llvm_ad_rgb")
     bare = reader.load_job("demo", SMALL)
     dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, cottonoid, bone, drape]"])
-    tips = np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0]])
-    shafts = np.tile([0.3, 0.2, 0.93], (2, 1))
     large = []
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
         for index, job in enumerate((bare, dressed)):
             scene = at_rest(job, index)
             for frame in range(2):
-                state = SceneState(scene.surface.vertices + 0.1 * frame, tips, shafts)
+                state = SceneState(scene.surface.vertices + 0.1 * frame, TIPS + np.array([0, 0, 4]), SHAFTS)
                 scene.renderer.render(state, seed=frame)
             found = [one for one in dr.kernel_history() if one.get("operation_count", 0) > _LARGE]
             large.append({one["hash"] for one in found})

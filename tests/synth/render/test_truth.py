@@ -11,7 +11,6 @@ from synth.geometry.triangles import Shape
 from synth.job.schema import AnatomySection, RenderSection
 from synth.render import truth
 from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera import camera
 from synth.render.camera.camera import Camera
 from synth.sequence import scenario
@@ -19,33 +18,45 @@ from synth.sequence import scenario
 NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int32))
 
 
+def grown(vertices: int) -> Shape:
+    section = AnatomySection(vertices=vertices)
+    found = anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
+    return Shape(found.vertices, found.faces)
+
+
+def placed(**render: object) -> Camera:
+    section = RenderSection.model_validate(render)
+    return camera.place(scenario.draw_view(section, np.random.default_rng(2)), section)
+
+
 @pytest.fixture(scope="module")
-def surface() -> CortexSurface:
-    section = AnatomySection(vertices=2500)
-    return anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
+def shape() -> Shape:
+    return grown(2500)
 
 
 @pytest.fixture(scope="module")
 def lens() -> Camera:
-    render = RenderSection(size=(96, 72), tilt_deg=(20.0, 20.0), distortion=(-0.3, 0.1, 0.004, -0.003, 0.0))
-    return camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
+    return placed(size=(96, 72), tilt_deg=20.0, distortion=(-0.3, 0.1, 0.004, -0.003, 0.0))
 
 
-def bump(surface: CortexSurface) -> np.ndarray:
+@pytest.fixture(scope="module")
+def rest(shape: Shape, lens: Camera) -> truth.RestFrame:
+    return truth.trace_rest(lens, shape, NOTHING)
+
+
+@pytest.fixture(scope="module")
+def moved(shape: Shape) -> Shape:
     """A smooth pull of 2 mm with some sideways motion."""
-    x, y = surface.vertices[:, 0], surface.vertices[:, 1]
+    x, y, _ = shape.vertices.T
     pull = 2.0 * np.exp(-((x - 1) ** 2 + (y + 2) ** 2) / 18)
-    return surface.vertices + np.stack([0.5 * pull, -0.3 * pull, pull], axis=1)
+    return Shape(shape.vertices + np.stack([0.5 * pull, -0.3 * pull, pull], axis=1), shape.faces)
 
 
 def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     """Faces of up to some 20 px through a lens 60 mm away that shortens the corner by a tenth."""
-    section = AnatomySection(vertices=400)
-    coarse = anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
-    bent = (-0.9, 0.8, 0.01, -0.01, 0.0)
-    render = RenderSection(size=(320, 240), working_distance_mm=(60.0, 60.0), distortion=bent)
-    near = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
-    rest = truth.trace_rest(near, Shape(coarse.vertices, coarse.faces), NOTHING)
+    coarse = grown(400)
+    near = placed(size=(320, 240), working_distance_mm=60.0, distortion=(-0.9, 0.8, 0.01, -0.01, 0.0))
+    rest = truth.trace_rest(near, coarse, NOTHING)
     pixels = camera.pixel_grid(near.size)[::11]
     rays = camera.rays(near, pixels)
     origins, directions = np.tile(near.centre, (len(pixels), 1)), rays @ near.rotation
@@ -56,18 +67,17 @@ def test_rays_meet_what_trimesh_meets_even_where_triangles_bow() -> None:
     where, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
     expected = np.full((len(pixels), 3), np.nan)
     expected[ray] = where
-    ours = np.einsum(
-        "nk,nkc->nc", rest.bary.reshape(-1, 3)[::11], coarse.vertices[coarse.faces[rest.face.ravel()[::11]]]
-    )
+    corners = coarse.vertices[coarse.faces[rest.face.ravel()[::11]]]
+    ours = np.einsum("nk,nkc->nc", rest.bary.reshape(-1, 3)[::11], corners)
     ours[~rest.tissue.ravel()[::11]] = np.nan
     assert np.isfinite(expected).all(axis=1).sum() > 2000
     np.testing.assert_allclose(ours, expected, atol=1e-6)
 
 
-def test_flow_warps_the_moved_surface_back_to_rest(surface: CortexSurface, lens: Camera) -> None:
+def test_flow_warps_the_moved_surface_back_to_rest(
+    shape: Shape, moved: Shape, lens: Camera, rest: truth.RestFrame
+) -> None:
     """The material point of a pixel at rest is the one at the flow's end in the moved frame."""
-    shape, moved = Shape(surface.vertices, surface.faces), Shape(bump(surface), surface.faces)
-    rest = truth.trace_rest(lens, shape, NOTHING)
     now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
     visible = now.visible & rest.tissue
     assert visible.mean() > 0.5
@@ -85,13 +95,9 @@ def test_flow_warps_the_moved_surface_back_to_rest(surface: CortexSurface, lens:
     assert np.quantile(error, 0.999) < 1e-3
 
 
-def test_what_hides_a_point_makes_it_invisible(surface: CortexSurface, lens: Camera) -> None:
-    shape = Shape(surface.vertices, surface.faces)
-    rest = truth.trace_rest(lens, shape, NOTHING)
-    plate = Shape(
-        np.array([[-4.0, -4.0, 6.0], [4.0, -4.0, 6.0], [4.0, 4.0, 6.0], [-4.0, 4.0, 6.0]]),
-        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
-    )
+def test_what_hides_a_point_makes_it_invisible(shape: Shape, lens: Camera, rest: truth.RestFrame) -> None:
+    corners = np.array([[-4.0, -4.0, 6.0], [4.0, -4.0, 6.0], [4.0, 4.0, 6.0], [-4.0, 4.0, 6.0]])
+    plate = Shape(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
     now = truth.trace_frame(lens, rest, shape, NOTHING, plate)
     assert 0.02 < now.tool.mean() < 0.3
     # Nothing moved, so a rest pixel is visible just where the plate is not.
@@ -106,34 +112,27 @@ def test_a_triangle_with_a_corner_behind_the_lens_is_dropped(lens: Camera, turn:
     directions = camera.rays(lens, camera.pixel_grid(lens.size))
     found = directions.reshape(72, 96, 3)[[10, 60], [12, 80]]
     corners = np.concatenate([80.0 * found / found[:, 2:], [[0.0, 6.0, -3.0]]])
-    shape = Shape(
-        (corners - lens.translation) @ lens.rotation, np.array([np.roll([0, 1, 2], turn)], np.int32)
-    )
-    hits = truth.ProjectedScene.of(lens, shape).cast(None, directions)
+    faces = np.array([np.roll([0, 1, 2], turn)], np.int32)
+    triangle = Shape((corners - lens.translation) @ lens.rotation, faces)
+    hits = truth.ProjectedScene.of(lens, triangle).cast(None, directions)
     assert (hits.face < 0).all()
     assert np.isinf(hits.along).all()
 
 
-def test_areas_of_pixels_add_up_to_the_surfaces(surface: CortexSurface) -> None:
-    render = RenderSection(size=(320, 240), field_mm=(60.0, 60.0), tilt_deg=(20.0, 20.0))
-    lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
-    rest = truth.trace_rest(lens, Shape(surface.vertices, surface.faces), NOTHING)
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+def test_areas_of_pixels_add_up_to_the_surfaces(shape: Shape) -> None:
+    rest = truth.trace_rest(placed(size=(320, 240), field_mm=60.0, tilt_deg=20.0), shape, NOTHING)
+    mesh = trimesh.Trimesh(*shape, process=False)
     assert rest.area.sum() == pytest.approx(mesh.area, rel=5e-3)
 
 
-def test_a_camera_that_moves_is_part_of_the_flow(surface: CortexSurface, lens: Camera) -> None:
-    shape = Shape(surface.vertices, surface.faces)
-    rest = truth.trace_rest(lens, shape, NOTHING)
+def test_a_camera_that_moves_is_part_of_the_flow(shape: Shape, lens: Camera, rest: truth.RestFrame) -> None:
     later = replace(lens, translation=lens.translation + np.array([0.5, 0.0, 0.0]))
     now = truth.trace_frame(later, rest, shape, NOTHING, NOTHING)
     expected = 0.5 * lens.K[0, 0] / lens.translation[2]
     assert np.median(now.flow[rest.tissue][:, 0]) == pytest.approx(expected, rel=0.02)
 
 
-def test_motion_lands_where_opencv_projects_it(surface: CortexSurface, lens: Camera) -> None:
-    rest = truth.trace_rest(lens, Shape(surface.vertices, surface.faces), NOTHING)
-    moved = Shape(bump(surface), surface.faces)
+def test_motion_lands_where_opencv_projects_it(moved: Shape, lens: Camera, rest: truth.RestFrame) -> None:
     now = truth.trace_frame(lens, rest, moved, NOTHING, NOTHING)
     on = rest.tissue
     points = rest.points.reshape(*on.shape, 3)[on] + now.motion[on]

@@ -173,7 +173,7 @@ BAD: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "infinite force": (r"s\.npz", arrays(contact=at(2, np.inf))),
     "not a number at rest": (r"s\.npz", arrays(rest=lambda x: np.where(x == x[0], np.nan, x))),
     "remeshed": (r"block_2\.vtu", remeshed),
-    "lines only": (r"block_0\.vtu", change("block_0.vtu", r"(types.*?>)[\d ]+", r"\1" + "3 " * 10**4)),
+    "lines only": (r"block_0\.vtu", change("block_0.vtu", r"(types.*?>)[\d ]+", r"\g<1>" + "3 " * 10**4)),
     "no such field": (r"contact.*displacement", change("block_0.vtu", 'Name="contact"', 'Name="lambda"')),
     "field lost later": (r"block_3\.vtu", change("block_3.vtu", 'Name="contact"', 'Name="lambda"')),
     "nothing moves": (r"stress.*displacement", change("block_0.vtu", 'Name="displacement"', 'Name="stress"')),
