@@ -25,8 +25,8 @@ _ARRAYS = r"\b(Map|Mask|Floats|Pixels|Array)\b"
 def checked(function: Callable[P, R]) -> Callable[P, R]:
     """The function; arguments that are not what its annotations state end in a UserError that names them.
 
-    Numbers of NumPy are numbers, Booleans are not; a number must be finite; a protocol needs its methods;
-    lists of numbers become arrays.
+    Booleans are no numbers, which must be finite; a protocol needs its methods; lists of numbers become
+    arrays.
     """
     signature, title = inspect.signature(function), re.sub(r"\.__\w+__$", "", function.__qualname__)
 

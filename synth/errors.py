@@ -10,11 +10,7 @@ from numbers import Real
 
 
 class UserError(Exception):
-    """Something in the job, the input or the machine that the user can fix.
-
-    The message is complete without a traceback; several problems are several lines. Command lines print it
-    to stderr and exit with code 2.
-    """
+    """Something in the job, the input or the machine that the user can fix; problems are a line each."""
 
 
 class InvalidValue(UserError, ValueError):
@@ -46,10 +42,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def as_user_error(label: str) -> Iterator[None]:
-    """Turns any exception of third-party code or formats in the block into a one-line UserError with `label`.
-
-    `sys.exit` included; a MemoryError stays one.
-    """
+    """Turns any exception in the block but MemoryError into a one-line UserError that begins with `label`."""
     try:
         yield
     except UserError as error:

@@ -1,8 +1,4 @@
-"""Versions of the formats on disk, and the check that every reader makes.
-
-A change of what a file means raises its number here. The reader of format N reads N and N - 1, and so the
-files of the previous release.
-"""
+"""Versions of the formats on disk: a changed meaning raises its number, and N reads N and N - 1."""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ STORED = object()
 def check_answer(
     label: str, what: str, found: Any, shape: tuple[int, ...], limits: tuple[float, float] = (-3e38, 3e38)
 ) -> NDArray[np.float32]:
-    """An array returned by a plug-in or passed by a caller, as (...) float32 of that shape and within limits.
+    """An array from a plug-in or a caller, as (...) float32 of that shape and within limits.
 
-    Raises a UserError that begins with `label` and `what` for anything else.
+    UserError that begins with `label` and `what` for anything else.
     """
     with as_user_error(f"{label}: {what}"):
         array = np.asarray(found, np.float32)
@@ -36,10 +36,9 @@ class Registry:
     """Plug-ins of one kind by name: built-in ones, those passed to `add`, and those of installed packages."""
 
     def __init__(self, group: str, key: str, noun: str, own: Mapping[str, str], *further: str) -> None:
-        """`group`: of entry points; `key`: the job's key that names one; `noun`: the kind, for messages.
+        """`group`: of entry points; `key`: of the job, with `further` values; `noun`: the kind, for messages.
 
-        `own`: built-in ones as `module:attribute`, empty where nothing is to be loaded; they take precedence
-        over plug-ins of the same name. `further`: other values of the job's key.
+        `own`: built-in ones, which take precedence, as `module:attribute`, empty if there is nothing to load.
         """
         self.group, self.own = group, own
         self._key, self._noun, self._further = key, noun, further
@@ -76,7 +75,7 @@ class Registry:
     def load(self, name: str) -> Any:
         """The object registered under `name`; that of an entry point is called without arguments if callable.
 
-        Raises UserError if there is none, or for any exception of its package in loading it.
+        UserError: there is none, or any exception of its package.
         """
         if name in self._added:
             return self._added[name]
@@ -95,15 +94,7 @@ class Registry:
         return points[name]
 
 
-ESTIMATORS = Registry(
-    "sulcus.flow",
-    "flow.backend",
-    "estimator",
-    {
-        "tvl1": "synth.flow.tvl1:Tvl1",
-        "opencv-tvl1": "synth.flow.opencv:OpenCvTvl1",
-        "dis": "synth.flow.opencv:Dis",
-    },
-    "ideal",
-)
+_OWN = {"tvl1": "tvl1:Tvl1", "opencv-tvl1": "opencv:OpenCvTvl1", "dis": "opencv:Dis"}
+_MODULES = {name: f"synth.flow.{place}" for name, place in _OWN.items()}
+ESTIMATORS = Registry("sulcus.flow", "flow.backend", "estimator", _MODULES, "ideal")
 """Flow estimators: an entry point is a callable without arguments that returns a `synth.Estimator`."""

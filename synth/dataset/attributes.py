@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
 from synth.errors import UserError
 from synth.formats import STORE, check_format
 from synth.system.checked_file import LARGEST_PIXELS
-from synth.system.config_file import first_mistake
+from synth.system.config_file import validated
 
 FORMAT = "sulcus-sequence"
 
@@ -21,8 +21,6 @@ _Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Triple = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Square = Annotated[list[_Triple], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[_Number], Field(min_length=4, max_length=4)]
-_Pose = Annotated[list[_Four], Field(min_length=4, max_length=4)]
-_Edge = Annotated[int, Field(ge=1, le=LARGEST_PIXELS)]
 
 
 class _Gesture(BaseModel):
@@ -43,7 +41,7 @@ class Attributes(BaseModel):
 
     index: Annotated[int, Field(ge=0, lt=10**12)]
     frames: Annotated[int, Field(ge=1, le=1_000_000)]
-    size: Annotated[list[_Edge], Field(min_length=2, max_length=2)]
+    size: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
     content_hash: _Hash
     seal_hash: _Hash
     field_hashes: dict[str, _Hash]
@@ -55,7 +53,9 @@ class Attributes(BaseModel):
     distortion: Annotated[list[_Number], Field(max_length=14)] | None = None
     rotation: _Square | None = None
     translation: _Triple | None = None
-    mesh_to_world: _Pose | None = None  # from a user's brain mesh to world axes
+    mesh_to_world: Annotated[list[_Four], Field(min_length=4, max_length=4)] | None = (
+        None  # from a user's brain mesh to world axes
+    )
     scenario: _Scenario | None = None
     mechanics: dict[str, Any] | None = None
     summary: dict[str, _Number | dict[str, _Number]] = {}
@@ -68,22 +68,16 @@ def check_attributes(attrs: Mapping[str, Any], where: str) -> None:
     if attrs.get("format") != FORMAT:
         raise UserError(f"{where}: is a Zarr store, but not a sequence")
     check_format(attrs.get("format_version"), STORE, where)
-    try:
-        width, height = Attributes.model_validate(dict(attrs)).size
-    except ValidationError as error:
-        raise UserError(f"{where}: an attribute is invalid ({first_mistake(error)})") from None
+    width, height = validated(Attributes, dict(attrs), f"{where}: an attribute is invalid").size
     if width * height > LARGEST_PIXELS:
         raise UserError(f"{where}: {width} x {height} pixels per frame is too large")
 
 
-def first_gesture(scenario: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The first instrument's gesture in a sequence's attribute `scenario`; empty without instruments."""
-    return next(iter(scenario.get("gestures", ())), {})
+def gestures_of(attrs: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The gesture of each instrument in a sequence's attributes."""
+    return (attrs.get("scenario") or {}).get("gestures", [])  # type: ignore[no-any-return]
 
 
-def name_gestures(scenario: Mapping[str, Any], of: str = "kind") -> str:
-    """Gestures of all instruments in a sequence's attribute `scenario`: "pull + push"; may be empty.
-
-    `of`: "instrument" names their instruments instead.
-    """
-    return " + ".join(one[of] for one in scenario.get("gestures", ()) if one.get(of))
+def name_gestures(attrs: Mapping[str, Any], of: str = "kind") -> str:
+    """Gestures of all instruments ("pull + push") or, by `of`, their "instrument"; may be empty."""
+    return " + ".join(one[of] for one in gestures_of(attrs) if one.get(of))

@@ -1,8 +1,7 @@
-"""Fast reading of single frames of a stored field, without the milliseconds of overhead that Zarr adds.
+"""Fast reading of single frames of a local field in the writer's layout: Zarr adds milliseconds to each.
 
-Only for fields on a local disk in the layout of the writer (a file of frames, each compressed by Blosc and
-followed by its CRC-32C, and an index at the end of the file: zarr-specs.readthedocs.io, sharding codec 1.0).
-For others `open_frames` returns None, and Zarr is used.
+A file of frames, each compressed by Blosc and followed by its CRC-32C, ends with an index
+(zarr-specs.readthedocs.io, sharding codec 1.0).
 """
 
 from __future__ import annotations

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from synth.dataset import location, provenance
 from synth.errors import UserError
@@ -22,10 +21,9 @@ from synth.job.schema import Job
 from synth.plugins import STORED
 from synth.system import checked_file, file_lock
 from synth.system.checked_file import write_whole as write_whole
-from synth.system.config_file import first_mistake
+from synth.system.config_file import validated
 
 _NAME = "dataset.json"
-_STATE = ".run"
 
 
 class _Described(BaseModel):
@@ -42,7 +40,7 @@ class Folder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.state = root / _STATE
+        self.state = root / ".run"
         self.logs = self.state / "logs"
         self.scratch = self.state / "scratch"
         self.lock_fd = -1
@@ -56,10 +54,7 @@ class Folder:
         found = checked_file.read_json(self.root / _NAME)
         if isinstance(found, dict):
             check_format(found.get("format_version", 1), FOLDER, str(self.root / _NAME))
-        try:
-            return _Described.model_validate(found).model_dump()
-        except ValidationError as error:
-            raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
+        return validated(_Described, found, f"{self.root / _NAME}: is damaged").model_dump()
 
     def job(self) -> Job:
         """The dataset's job; its plug-ins need not be installed."""
@@ -70,10 +65,7 @@ class Folder:
             job["appearance"].pop("cottonoid", None)
             if not job["render"].pop("tool", True):
                 job["fem"]["instrument"] = "none"
-        try:
-            return Job.model_validate(job, context=STORED)
-        except ValidationError as error:
-            raise UserError(f"{self.root / _NAME}: is damaged ({first_mistake(error)})") from None
+        return validated(Job, job, f"{self.root / _NAME}: is damaged", STORED)
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -85,7 +77,7 @@ class Folder:
         """`{index: {"reason", "kind", "tries", "log"}}` of the failed sequences."""
         found = {}
         for path in sorted((self.state / "failed").glob("*.json")):
-            with contextlib.suppress(UserError, ValueError):  # damaged: the sequence is computed again
+            with suppress(UserError, ValueError):  # damaged: the sequence is computed again
                 failure = checked_file.read_json(path)
                 if isinstance(failure, dict) and isinstance(failure.get("reason"), str):
                     found[int(path.stem)] = failure
@@ -96,12 +88,10 @@ class Folder:
         write_whole(self.state / "failed" / f"{failure['index']:06d}.json", json.dumps(failure, indent=1))
         self.sweep(failure["index"])
 
-    def clear_failures(self, indices: Sequence[int] | None = None) -> list[int]:
-        """Deletes the marks of failed sequences, all if `indices` is None; returns their indices."""
-        indices = sorted(self.failures()) if indices is None else list(indices)
-        for index in indices:
+    def clear_failures(self, indices: Iterable[int] | None = None) -> None:
+        """Deletes the marks of failed sequences, all if `indices` is None."""
+        for index in self.failures() if indices is None else indices:
             (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
-        return indices
 
     def sweep(self, index: int) -> None:
         """Deletes the unfinished store of sequence `index`."""
@@ -132,17 +122,15 @@ class Folder:
         """Deletes the files of a run without a finished sequence."""
         for name in (_NAME, "job.yaml", "index.parquet"):
             (self.root / name).unlink(missing_ok=True)
-        if self.state.exists():
-            shutil.rmtree(self.state)
+        shutil.rmtree(self.state)
 
 
 @contextmanager
 def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folder]:
-    """The folder for `job`, created or continued, and locked for this process.
+    """The folder for `job`, created or continued, and locked for this process; other content stays unchanged.
 
-    A folder with other content is left unchanged. More sequences than before extend the dataset.
-    `mix_versions` continues that of another version of the program; `dataset.json` names all versions.
-    UserError: the dataset of another job or version, other files, another run, or no permission.
+    More sequences than before extend the dataset; `mix_versions` continues another version's. UserError: the
+    dataset of another job or version, other files, another run, or no permission.
     """
     folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
     name = identity.identify_job(job)
@@ -188,8 +176,7 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
     if not root.is_dir():
         raise UserError(f"{root}: is a file; choose a folder")
     if not (root / _NAME).exists():
-        others = sorted(entry.name for entry in root.iterdir() if not entry.name.startswith("."))
-        if others:
+        if others := sorted(entry.name for entry in root.iterdir() if not entry.name.startswith(".")):
             raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
         return
     described = folder.described()
@@ -197,21 +184,16 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
         changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"
         raise UserError(f"{root}: contains the dataset of another job ({what}); choose another folder")
-    count = folder.job().sequences
-    if count > job.sequences:
+    if (count := folder.job().sequences) > job.sequences:
         raise UserError(f"{root}: contains {count} sequences of this job; sequences={job.sequences} is fewer")
 
 
 def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     """The versions that created the dataset, including this one. UserError if they may not be mixed."""
     now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
-    if not count:
-        return [now]
-    before: list[dict[str, str]] = folder.described()["generators"]
-    if now in before and (mix or len(before) == 1):
-        return before
-    if mix:
-        return [*before, now]
+    before: list[dict[str, str]] = folder.described()["generators"] if count else []
+    if mix or not count or before == [now]:
+        return [*before, *([] if now in before else [now])]
     last = before[-1] if before else {}
     changed = (key for key in now if last.get(key) != now[key])
     changes = [f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in changed]

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
-from synth.dataset.attributes import first_gesture, name_gestures
+from synth.dataset.attributes import gestures_of, name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
@@ -32,15 +32,8 @@ class IndexColumn(NamedTuple):
     type: pa.DataType
     meaning: str
     unit: str = "-"
-    source: str | Callable[[Sequence], Any] = ""
-    """Path of the attribute, `name` if empty, or a function of the sequence."""
-    title: str = ""
-    """Heading of its chart and range in the card; empty: it has none."""
-
-    def field(self) -> pa.Field:
-        """The column in a Parquet schema."""
-        about = {"meaning": self.meaning} | ({} if self.unit == "-" else {"unit": self.unit})
-        return pa.field(self.name, self.type, metadata=about)
+    source: str | Callable[[Sequence], Any] = ""  # path of the attribute (empty: `name`), or a function
+    title: str = ""  # heading of its chart and range in the card; empty: it has none
 
     def read(self, sequence: Sequence) -> Any:
         """The cell of a finished sequence; None if it has no such attribute."""
@@ -74,13 +67,13 @@ COLUMNS = (
                 source="opening_id"),
     IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
     IndexColumn("gesture", _TEXT, "kind of gesture of each instrument",
-                source=lambda one: name_gestures(one.attrs.get("scenario") or {}) or None),
+                source=lambda one: name_gestures(one.attrs) or None),
     IndexColumn("instrument", _TEXT, "instrument of each gesture; none: not drawn",
-                source=lambda one: name_gestures(one.attrs.get("scenario") or {}, "instrument") or None),
+                source=lambda one: name_gestures(one.attrs, "instrument") or None),
     IndexColumn("young_kpa", _REAL, "Young's modulus", "kPa", title="Young's modulus"),
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
-                source=lambda one: first_gesture(one.attrs.get("scenario") or {}).get("load")),
+                source=lambda one: next(iter(gestures_of(one.attrs)), {}).get("load")),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
     IndexColumn("peak_flow_px", _REAL, "largest true motion", "px", "summary.peak_flow_px"),
     IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm",
@@ -97,7 +90,12 @@ COLUMNS = (
 )
 # fmt: on
 
-SCHEMA = pa.schema([one.field() for one in COLUMNS])
+SCHEMA = pa.schema(
+    [
+        pa.field(name, kind, metadata={"meaning": meaning} | ({} if unit == "-" else {"unit": unit}))
+        for name, kind, meaning, unit, *_ in COLUMNS
+    ]
+)
 
 _LARGEST_BYTES = 1 << 28
 _MOST_ROWS = 2_000_000
@@ -105,8 +103,7 @@ _REMEDY = "; `synth report` writes it again"
 
 
 def read_index(root: Path) -> pa.Table:
-    """The index as stored; `synth verify` compares its rows with the stores.
-    UserError: it is missing, damaged, or of another program or version."""
+    """The index as stored. UserError: it is missing, damaged, or of another program or version."""
     path = root / NAME
     try:
         # Arrow refuses a path that is not UTF-8.
@@ -117,10 +114,10 @@ def read_index(root: Path) -> pa.Table:
         if file.metadata.num_rows > _MOST_ROWS or file.metadata.schema.names != names:
             raise UserError(f"{path}: is the index of another program or version{_REMEDY}")
         table = file.read(use_threads=False)
-        for place, field in enumerate(SCHEMA):
-            if field.name not in names:
-                table = table.add_column(place, field, pa.nulls(table.num_rows, field.type))
-        table = table.cast(SCHEMA)
+        lacking = {name: pa.nulls(table.num_rows) for name in SCHEMA.names if name not in names}
+        table = (
+            pa.table(dict(zip(names, table.columns, strict=True)) | lacking).select(SCHEMA.names).cast(SCHEMA)
+        )
         table.validate(full=True)
     except (OSError, pa.ArrowException, ValueError, LookupError, MemoryError) as error:
         raise UserError(f"{path}: is damaged ({first_line(error)}){_REMEDY}") from error
@@ -128,12 +125,11 @@ def read_index(root: Path) -> pa.Table:
 
 
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
-    """The split of the dataset in `root`, as stored, else as `write_index` would create it.
-    UserError: there are too few groups to split, and a split is `required`."""
+    """The stored split, else as `write_index` would create it. UserError: `required` and too few groups."""
     stored = split.read_stored(root)
     if stored.sides:
         return stored
-    rows = [row_of(_open(Folder(root), key)) for key in Folder(root).sealed()]
+    rows = [row_of(open_sequence(location.store(root, key))) for key in Folder(root).sealed()]
     try:
         assign = split.assign_sides if required else split.assign_if_possible
         return _dealt(rows, assign(rows, stored), stored)
@@ -142,10 +138,7 @@ def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
 
 
 def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
-    """Positions of a dataset's sequences by side, in the order train, validation, test, without empty sides.
-
-    All are "train" if there are too few to split. UserError if one has no side.
-    """
+    """Positions of sequences by side, without empty sides; all are "train" if there are too few to split."""
     names, chosen = [one.attrs["content_hash"] for one in dataset], read_split(dataset.root, required=False)
     found = chosen.find(names, dataset.root) if chosen.sides else ["train"] * len(names)
     groups = {side: [k for k, one in enumerate(found) if one == side] for side in split.SIDES}
@@ -155,15 +148,16 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
 def write_index(folder: Folder, rule: DatasetSplit | None = None) -> list[dict[str, Any]]:
     """Updates the index from the folder, and creates it again if it can't be read. Returns all rows.
 
-    The split is stored next to it; new sequences are assigned a side, and the others keep theirs. `rule`, a
-    split without sides, replaces it; then UserError as `assign_sides`.
+    New sequences are assigned a side, which is stored. `rule`, a split without sides, replaces the stored
+    one; then UserError as `assign_sides`.
     """
     known: dict[int, dict[str, Any]] = {}
     with suppress(UserError):
         known = {row["index"]: row for row in read_index(folder.root).to_pylist() if row["status"] == "done"}
     failures = folder.failures().items()
     each = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
-    each |= {key: known.get(key) or row_of(_open(folder, key)) for key in folder.sealed()}
+    stores = {key: location.store(folder.root, key) for key in folder.sealed()}
+    each |= {key: known.get(key) or row_of(open_sequence(path)) for key, path in stores.items()}
     rows, chosen = [each[key] for key in sorted(each)], rule or split.read_stored(folder.root)
     sides = split.assign_sides(rows, rule) if rule else split.assign_if_possible(rows, chosen)
     for row, side in zip(rows, sides, strict=True):
@@ -202,7 +196,3 @@ def dataset_hash(rows: Iterable[Mapping[str, Any]]) -> str:
         if row["status"] == "done":
             total.update(f"{row['index']}:{row['content_hash']}\n".encode())
     return total.hexdigest()
-
-
-def _open(folder: Folder, key: int) -> Sequence:
-    return open_sequence(location.store(folder.root, key))

@@ -33,10 +33,7 @@ def index_of(name: str) -> int | None:
 
 
 def find_location(where: Path | str) -> StoreLocation:
-    """The location of a path or an address such as `s3://bucket/out/000000.zarr` or `zip://000000.zarr::out.zip`.
-
-    Raises UserError if it does not exist or cannot be opened.
-    """
+    """The location of a path or an address such as `zip://000000.zarr::out.zip`. May raise UserError."""
     where, remote = str(where), "://" in str(where)
     fs, base = _open(where)
     if not fs.isdir(base):

@@ -16,10 +16,7 @@ _MAKING = tuple(f"synth/{name}" for name in ("job", "geometry", "fem", "render",
 
 @cache
 def generator() -> dict[str, str]:
-    """`{"format", "code", package: version}`: sequences of a job are comparable if it is equal.
-
-    `code` is a hash of all files of the packages that create a sequence, including comments.
-    """
+    """`{"format", "code", package: version}`; `code` is a hash of the packages that create a sequence."""
     return {"format": str(STORE), "code": code(*_MAKING), **_computing()}
 
 

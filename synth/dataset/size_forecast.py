@@ -48,10 +48,7 @@ def pilot(done: Sequence[int]) -> list[int]:
 
 
 def field_bytes(field: Field, frames: int, size: tuple[int, int], half: bool = False) -> tuple[float, float]:
-    """Bytes of a field of `size` (height, width) in memory, and on disk by the measured compression.
-
-    `half`: `store.flow: float16` is set.
-    """
+    """Bytes of a field of `size` (height, width) in memory and on disk; `half`: `store.flow` is float16."""
     raw = float(np.prod(field.shape(frames, size))) * np.dtype(field.dtype).itemsize
     return raw, field.packed * (raw / 2 if half and field.half else raw)
 
@@ -75,8 +72,7 @@ def estimate(job: Job) -> float:
 def estimate_memory(job: Job) -> float:
     """Bytes of memory that a worker needs for one sequence of `job`, whose motion and video are in memory.
 
-    Fitted to the peaks of sequences of 10 to 300 frames, 2,500 to 12,000 vertices and 64 to 320 columns, plus
-    a quarter; at most 1.5 times the measured values.
+    At most 1.5 times the measured peaks of 10 to 300 frames, 2,500 to 12,000 vertices, 64 to 320 columns.
     """
     width, height = job.render.size
     pixels = width * height * (2 if job.render.stereo_mm else 1)
@@ -87,8 +83,7 @@ def estimate_memory(job: Job) -> float:
 
 def refuse_if_too_long(job: Job, worker_bytes: int, workers: int) -> None:
     """Raises UserError if a sequence needs more memory than a worker has."""
-    needed = estimate_memory(job)
-    if needed > worker_bytes:
+    if (needed := estimate_memory(job)) > worker_bytes:
         fewer = ", or --workers 1" if workers > 1 else ""
         raise UserError(
             f"a sequence of {job.frames} frames needs about {amount(needed)} of memory but each of {workers} "

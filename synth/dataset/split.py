@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import FiniteFloat, TypeAdapter, ValidationError
-from scipy.sparse import coo_array
+from pydantic import FiniteFloat
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
@@ -21,7 +21,7 @@ from synth.dataset.folder import write_whole
 from synth.errors import UserError
 from synth.job import identity
 from synth.system import checked_file
-from synth.system.config_file import first_mistake
+from synth.system.config_file import validated
 
 By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
 """Groups that must not be on two sides: `opening` is the craniotomy of a user's brain, else the anatomy;
@@ -36,7 +36,7 @@ NAME = "split.json"
 
 @dataclass(frozen=True)
 class DatasetSplit:
-    """How a dataset is split, and the side of every sequence: all of `split.json`."""
+    """How a dataset is split, and the side of every sequence: `split.json`."""
 
     by: By = "anatomy"
     shares: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = (0.7, 0.15, 0.15)
@@ -62,17 +62,10 @@ class DatasetSplit:
 
 
 def read_stored(root: Path) -> DatasetSplit:
-    """The content of `split.json` of the dataset in `root`; the default without sides if it is missing.
-
-    Raises UserError if it is damaged.
-    """
+    """A dataset's `split.json`; the default without sides if it is missing. UserError if it is damaged."""
     if not os.path.lexists(root / NAME):
         return DatasetSplit()
-    found = checked_file.read_json(root / NAME)
-    try:
-        return TypeAdapter(DatasetSplit).validate_python(found)
-    except ValidationError as error:
-        raise UserError(f"{root / NAME}: is damaged ({first_mistake(error)})") from None
+    return validated(DatasetSplit, checked_file.read_json(root / NAME), f"{root / NAME}: is damaged")
 
 
 def store(root: Path, chosen: DatasetSplit) -> None:
@@ -83,14 +76,10 @@ def store(root: Path, chosen: DatasetSplit) -> None:
 def parse_rule(
     by: str, shares: str, held_out: Sequence[str], share_anatomy: bool = False, apart_mm: float = 0.0
 ) -> DatasetSplit:
-    """A split without sides, parsed from a command line; `by` opening implies `share_anatomy`. May raise
-    UserError."""
+    """A command line's split, without sides; `by` opening implies `share_anatomy`. May raise UserError."""
     shared = share_anatomy or by == "opening"
     given = {"by": by, "shares": shares.split(","), "held_out": held_out, "share_anatomy": shared}
-    try:
-        return TypeAdapter(DatasetSplit).validate_python({**given, "apart_mm": apart_mm})
-    except ValidationError as error:
-        raise UserError(f"by {by}, shares {shares}: {first_mistake(error)}") from None
+    return validated(DatasetSplit, given | {"apart_mm": apart_mm}, f"by {by}, shares {shares}")
 
 
 def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -102,11 +91,10 @@ def count(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
 def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[Side | None]:
     """The side of every row of the index; None for a failed sequence.
 
-    Sequences keep the side that they have, and new ones get that of their group. The remaining groups are
-    assigned so as to approximate the shares, depending on their names but not on the order of rows. Sequences
-    of a held-out family are always in the test set, with their whole groups. A new sequence that joins groups
-    on two sides gets none. UserError: an unknown family, shares that do not sum to 1, or fewer groups than
-    sides.
+    Sequences keep their side, and new ones get that of their group; None if it joins groups on two sides.
+    Other groups are assigned so as to approximate the shares, by their names, not by the order of rows.
+    Groups with a held-out family are in the test set. UserError: an unknown family, shares that do not sum to
+    1, or fewer groups than sides.
     """
     by, shares = chosen.by, chosen.shares
     if not (abs(sum(shares) - 1) <= 1e-6 and min(shares) >= 0):  # NaN is neither
@@ -130,10 +118,9 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
             hint = "list further openings in craniotomy.also of the job"
         elif len(on) < len(done) and not chosen.share_anatomy:
             hint += ", or split within a brain by `synth split --by opening` or --share-anatomy"
-        wanted = sorted(needing | set(fixed.values()))
-        each = ", ".join(SIDES[k] for k in wanted)
-        few = f"{len(done)} sequences form {len(on)} groups by {by}, but {len(wanted)} are needed"
-        raise UserError(f"{few}, one each for {each}: {hint}")
+        each = [SIDES[k] for k in sorted(needing | set(fixed.values()))]
+        few = f"{len(done)} sequences form {len(on)} groups by {by}, but {len(each)} are needed"
+        raise UserError(f"{few}, one each for {', '.join(each)}: {hint}")
     order = sorted(on, key=lambda name: hashlib.blake2b(name.encode(), digest_size=8).hexdigest())
     part = draw_groups(groups, shares, order, fixed)
     dealt = [SIDES[k] if len(on[group]) < 2 else None for group, k in zip(groups, part, strict=True)]
@@ -149,8 +136,8 @@ def draw_groups(
 ) -> list[int]:
     """The part (0, 1, ...) of each of N members, by its group; no group is in two parts.
 
-    Larger groups are assigned first, those of equal size in `order`. `shares`: of each part, in any unit; a
-    part of share 0 stays empty. `fixed`: parts of groups that are assigned already.
+    Larger groups are assigned first, those of equal size in `order`. `shares`: of each part, in any unit; one
+    of 0 stays empty. `fixed`: parts of groups that are assigned already.
     """
     size = Counter(groups)
     part = dict(fixed or {})
@@ -210,18 +197,16 @@ def find_crossings(groups: Sequence[Hashable], sides: Sequence[str]) -> dict[Has
 
 
 def join_groups(*keys: Sequence[Hashable]) -> list[int]:
-    """A group number for each sequence: connected components of sequences that share a key.
+    """A number for each sequence's group, the position of its first: connected components of those sharing a
+    key.
 
-    `keys`: properties that must not be on two sides, one value per sequence each. The number of a group is
-    the position of its first sequence.
+    `keys`: properties that must not be on two sides, one value per sequence each.
     """
-    count, known, first = len(keys[0]), dict[Hashable, int](), dict[int, int]()
-    held = [(which, value) for which, values in enumerate(keys) for value in values]
-    by = [count + known.setdefault(one, len(known)) for one in held]
-    size = count + len(known)
-    joined = coo_array((np.ones(len(by)), (np.arange(len(by)) % max(count, 1), by)), shape=(size, size))
-    part = connected_components(joined, directed=False)[1][:count]
-    return [first.setdefault(group, i) for i, group in enumerate(part.tolist())]
+    joined, first = DisjointSet(range(len(keys[0]))), dict[Hashable, int]()
+    for which, values in enumerate(keys):
+        for k, value in enumerate(values):
+            joined.merge(k, first.setdefault((which, value), k))
+    return [first.setdefault(joined[k], k) for k in range(len(keys[0]))]
 
 
 def name_anatomy(attrs: Mapping[str, Any]) -> str:
@@ -248,10 +233,7 @@ def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str
 
 
 def _join_openings(names: Sequence[str], apart_mm: float) -> list[str]:
-    """The names of openings (of `synth.job.identity`), with one name for those of a brain that overlap.
-
-    Names of anatomies, for procedural brains and stores without an opening, are unchanged.
-    """
+    """Names of openings (of `synth.job.identity`), with one name for those of a brain that overlap."""
     placed = sorted({name for name in names if " at " in name})
     if not placed:
         return list(names)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_right
-from collections import OrderedDict
 from collections.abc import Sequence as Several
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,20 @@ from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
 
-_OPEN = 64  # stores that one process keeps open; opening one takes some milliseconds
+
+@lru_cache(maxsize=128)  # opening a store takes some milliseconds
+def _open(
+    process: int, dataset: Dataset, position: int, fields: tuple[str, ...]
+) -> tuple[Sequence, dict[str, FieldReader]]:
+    """A sequence and its fields in this process: one that was forked must not use its parent's handles."""
+    sequence = dataset[position]
+    return sequence, {name: sequence[name] for name in fields}
 
 
 class TorchDataset:
-    """Every frame of every sequence in `root`, as `{field: array}`.
+    """Every frame of every sequence in `root`, as `{field: array}`, with its `index` and `frame`.
 
-    Fields without a frame axis are returned whole; `index` and `frame` identify the item. Safe in forked or
-    spawned workers: each process opens its own stores.
+    Fields without a frame axis are returned whole. Safe in forked or spawned workers.
 
         frames = TorchDataset("out", ["rgb", "flow", "traction"])
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
@@ -46,12 +52,9 @@ class TorchDataset:
             raise UserError(f"sequences: the dataset has positions 0 to {len(self._dataset) - 1}")
         self._ends: list[int] = []
         for sequence in map(self._dataset.__getitem__, self._chosen):
-            missing = [name for name in fields if name not in sequence]
-            if missing:
+            if missing := [name for name in fields if name not in sequence]:
                 raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
             self._ends.append(len(self) + sequence.frames)
-        self._owner = os.getpid()
-        self._open: OrderedDict[int, tuple[Sequence, dict[str, FieldReader]]] = OrderedDict()
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -61,20 +64,6 @@ class TorchDataset:
             raise IndexError(item)
         which = bisect_right(self._ends, item)
         frame = item - (self._ends[which - 1] if which else 0)
-        sequence, readers = self._readers(self._chosen[which])
+        sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)
         values = {name: one[frame] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
         return {"index": sequence.index, "frame": frame, **values}
-
-    def _readers(self, position: int) -> tuple[Sequence, dict[str, FieldReader]]:
-        if self._owner != os.getpid():  # forked: the parent's handles must not be used
-            self._owner, self._open = os.getpid(), OrderedDict()
-        if position not in self._open:
-            sequence = self._dataset[position]
-            self._open[position] = (sequence, {name: sequence[name] for name in self._fields})
-            if len(self._open) > _OPEN:
-                self._open.popitem(last=False)
-        self._open.move_to_end(position)
-        return self._open[position]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_open": OrderedDict()}

@@ -12,11 +12,12 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import synth
+from synth.dataset.folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import gpu, llvm
@@ -26,9 +27,9 @@ Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "
 """Outcome of an attempt: `done` is the only success; `input` would fail the same way again."""
 
 _TICK_S = 0.2
+_STALL_S = 1800.0  # a process without a report for so long is killed
 _LOG_TAIL = 4000  # characters
-# A process is replaced after so many sequences, in case a library leaks memory. None did so in 16 sequences
-# (731 MB after the last, 736 after the second); a start takes as long as half a sequence.
+# In case a library leaks memory; none did so in 16 sequences. A start takes as long as half a sequence.
 _SEQUENCES_PER_PROCESS = 128
 
 
@@ -47,40 +48,24 @@ class Setup:
     """Settings of all worker processes of a run."""
 
     job: Mapping[str, Any]  # the job, JSON-ready, paths resolved
-    folder: Path  # the dataset; all paths are absolute, as workers have another working directory
-    logs: Path
-    scratch: Path  # working directories of the processes
+    folder: Path  # the dataset; absolute, as workers have another working directory
     work: str  # `module:function` that computes a sequence: `(job, index, folder, report)`
     memory_bytes: int | None = None  # limit of a process
-    stall_s: float = 1800.0  # a process without a report for so long is killed
     lock_fd: int | None = None  # the dataset's lock, inherited so that it is held until all workers end
-    environment: Mapping[str, str] | None = None  # added to that of the engine
+    environment: Mapping[str, str] = field(default_factory=dict)  # added to that of the engine
     generator: str = ""  # the engine's version of the program; a cluster's machine with another one refuses
-    turn: int = 0  # number of this run of the dataset; it is over when `turn_file` has another number
-    turn_file: Path = Path()
-
-
-class Slot(Protocol):
-    """A place where one sequence at a time is computed; the engine has a thread for every slot."""
-
-    def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
-        """Computes one sequence; returns when it is sealed, has failed, or `stop` is set."""
-        ...
-
-    def close(self) -> None:
-        """Releases the slot's resources."""
-        ...
+    turn: int = 0  # number of this run of the dataset; it is over when the folder's has another number
 
 
 class Child:
-    """A slot on this machine: a worker process, started when needed and replaced when used up or dead."""
+    """A worker process for one sequence at a time, started when needed and replaced when used up or dead."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._process: subprocess.Popen[bytes] | None = None
 
     def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
-        """Computes one sequence, see `Slot`. The process survives only "done" and "input"."""
+        """Computes a sequence until it is sealed, has failed, or `stop` is set; faults end the process."""
         if self._process is None:
             self._process = self._start()
         attempt = self._attempt(self._process, index, report, stop)
@@ -110,7 +95,7 @@ class Child:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             pass_fds=(theirs,) if lock is None else (theirs, lock),
-            env=_environment(self._setup.environment or {}),
+            env={**os.environ, **self._setup.environment},
             # Ctrl-C in the terminal goes to the engine only, which then ends its workers in order.
             start_new_session=True,
         )
@@ -124,7 +109,7 @@ class Child:
     ) -> Attempt:
         _write(process, str(index))
         last = time.monotonic()
-        limit, stall_s = self._setup.memory_bytes, self._setup.stall_s
+        limit = self._setup.memory_bytes
         while not stop.is_set():
             messages = self._read()
             for message in messages or ():
@@ -139,8 +124,8 @@ class Child:
             if limit is not None and _memory(process.pid) > limit:
                 reason = f"used more than {limit / 1e9:.3g} GB of memory"
                 return Attempt(index, "memory", reason, self._log(index))
-            if time.monotonic() - last > stall_s:
-                return Attempt(index, "stalled", f"reported nothing for {stall_s:.0f} s", self._log(index))
+            if time.monotonic() - last > _STALL_S:
+                return Attempt(index, "stalled", f"reported nothing for {_STALL_S:.0f} s", self._log(index))
         return Attempt(index, "stopped")
 
     def _read(self) -> list[dict[str, Any]] | None:
@@ -153,33 +138,22 @@ class Child:
 
     def _log(self, index: int) -> str:
         with contextlib.suppress(FileNotFoundError):
-            return (self._setup.logs / f"{index:06d}.log").read_text("utf-8", errors="replace")[-_LOG_TAIL:]
+            log = Folder(self._setup.folder).logs / f"{index:06d}.log"
+            return log.read_text("utf-8", errors="replace")[-_LOG_TAIL:]
         return ""
 
 
 def _write(process: subprocess.Popen[bytes], line: str) -> None:
     assert process.stdin is not None
-    # `run` detects a dead process and its reason.
-    with contextlib.suppress(BrokenPipeError):
+    with contextlib.suppress(BrokenPipeError):  # `run` detects a dead process and its reason
         process.stdin.write(line.encode() + b"\n")
         process.stdin.flush()
 
 
 def _memory(pid: int) -> int:
-    try:
-        pages = Path(f"/proc/{pid}/statm").read_text().split()
-    except OSError:  # it has ended
-        return 0
-    return int(pages[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def _environment(more: Mapping[str, str]) -> dict[str, str]:
-    """One thread per numerical library: more slow each other down, and their number must not change a sum."""
-    threads = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
-    found = {**os.environ, **{f"{name}_NUM_THREADS": "1" for name in threads}, "PYTHONHASHSEED": "0"}
-    home = str(Path(synth.__file__).resolve().parents[1])
-    found["PYTHONPATH"] = os.pathsep.join(filter(None, [home, found.get("PYTHONPATH", "")]))
-    return {**found, **more}
+    with contextlib.suppress(OSError):  # it has ended
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0
 
 
 def _ending(code: int) -> str:
@@ -193,25 +167,28 @@ def _ending(code: int) -> str:
 def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
     """Names of the GPUs that workers share, for CUDA_VISIBLE_DEVICES; None: it is not set.
 
-    `chosen`: `auto`, `none` or names separated by commas; `wanted`: the job renders on a GPU, else `auto`
-    sets nothing. UserError for a GPU that does not exist.
+    `chosen`: `auto` (only if `wanted`), `none` or names separated by commas. UserError for a GPU not there.
     """
     if chosen == "none":
         return ()
     if chosen == "auto":
         return (gpu.visible() or None) if wanted else None
     named, here = tuple(word.strip() for word in chosen.split(",")), gpu.visible()
-    missing = [name for name in named if name not in here]
-    if missing:
+    if missing := [name for name in named if name not in here]:
         raise UserError(f"--gpus {', '.join(missing)}: this machine has {', '.join(here) or 'none'}")
     return named
 
 
 def environment(job: Job, workers: int) -> dict[str, str]:
-    """Environment of all workers of a machine: the number of threads of each, and the renderer's LLVM."""
+    """What all workers of a machine have in their environment: threads, the program, the renderer's LLVM."""
     threads = max(1, len(os.sched_getaffinity(0)) // workers)
     library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
-    return {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or ""}
+    home = str(Path(synth.__file__).resolve().parents[1])
+    path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
+    own = {"SULCUS_THREADS": str(threads), "SULCUS_LLVM": library or "", "PYTHONPATH": path}
+    # One thread per numerical library: more slow each other down, and their number must not change a sum.
+    single = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA", "BLOSC")
+    return {**own, "PYTHONHASHSEED": "0", **{f"{name}_NUM_THREADS": "1" for name in single}}
 
 
 def share_of_memory(workers: int) -> int:

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import provenance
-from synth.engine.child import Attempt, Child, Setup, Slot, environment, share_of_memory
+from synth.dataset.folder import Folder
+from synth.engine.child import Attempt, Child, Setup, environment, share_of_memory
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import checked_file
@@ -30,22 +31,19 @@ _thread = threading.local()  # on a Dask worker: setup and child of each of its 
 
 
 @contextmanager
-def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
+def open_slots(engine: str, setup: Setup) -> Iterator[list[Child]]:
     """The slots of `dask://host:port`, `tls://host:port`, or of a SLURM cluster described in a YAML file.
 
-    Anyone who can connect to a scheduler can run code on it, so a note on stderr warns if others can. `tls://`
-    uses the certificates in Dask's configuration. UserError: the extra is not installed, no scheduler
-    answers, or the file is wrong.
+    Whoever can connect to a scheduler can run code on it: a note on stderr warns if others can. UserError:
+    the extra is not installed, no scheduler answers, the file is wrong, or `tls://` without Dask's
+    certificates.
     """
     try:
         import distributed
     except ImportError:
         raise UserError(f"a Dask engine {_LACKING}") from None
     # The lock can't be sent to other machines; workers detect the end of their run by the turn.
-    own = {key: value for key, value in (setup.environment or {}).items() if not key.startswith("SULCUS_")}
-    sent = replace(
-        setup, lock_fd=None, environment=own, memory_bytes=None, generator=provenance.fingerprint()
-    )
+    sent = replace(setup, lock_fd=None, environment={}, memory_bytes=None, generator=provenance.fingerprint())
     with _cluster(engine) as (address, expected, security):
         try:
             client = distributed.Client(address, timeout=_CONNECT, security=security)
@@ -62,11 +60,12 @@ def open_slots(engine: str, setup: Setup) -> Iterator[list[Slot]]:
             yield [_DaskSlot(client, sent)] * max(sum(client.nthreads().values()), expected, 1)
 
 
-class _DaskSlot:
-    """A thread of the cluster's workers."""
+class _DaskSlot(Child):
+    """A thread of the cluster's workers, whose processes end themselves when the turn changes."""
 
     def __init__(self, client: Any, setup: Setup) -> None:
-        self._client, self._setup = client, setup
+        super().__init__(setup)
+        self._client = client
 
     def run(self, index: int, report: StageCallback, stop: threading.Event) -> Attempt:
         report("on the cluster", 0, 1)
@@ -83,9 +82,6 @@ class _DaskSlot:
             return Attempt(index, "crash", f"the cluster lost it ({why})")
         finally:
             future.release()
-
-    def close(self) -> None:
-        """Does nothing: the processes on the cluster end themselves when the turn changes."""
 
 
 def _attempt(setup: Setup, index: int) -> dict[str, Any]:
@@ -109,7 +105,6 @@ def _child(setup: Setup, threads: int) -> Child:
         if hasattr(_thread, "child"):
             _thread.child.close()
         here = environment(Job.model_validate(setup.job), threads)
-        here.update(setup.environment or {})
         local = replace(setup, environment=here, memory_bytes=share_of_memory(threads))
         _thread.setup, _thread.child = setup, Child(local)
     child: Child = _thread.child
@@ -120,7 +115,7 @@ def _stop_when_passed(setup: Setup, stop: threading.Event, ended: threading.Even
     """Sets `stop` when another run of the dataset has begun: the engine of this one is gone."""
     while not ended.wait(_TICK_S):
         with suppress(OSError, ValueError):  # being rewritten, or the file system is briefly unavailable
-            if int(setup.turn_file.read_text()) != setup.turn:
+            if int(Folder(setup.folder).turn_file.read_text()) != setup.turn:
                 stop.set()
                 return
 
@@ -149,8 +144,7 @@ def _cluster(engine: str) -> Iterator[tuple[str, int, Any]]:
 
 
 def open_to(cluster: str | dict[str, Any]) -> str:
-    """A warning if others could run code on a cluster (an address or the dict of `read_slurm`), else empty.
-    UserError: an address without a host or a port."""
+    """A warning if others could run code on a cluster, else empty. UserError: no host or port."""
     if isinstance(cluster, str):
         kind, _, place = cluster.partition("://")
         host, _, port = place.rpartition(":")

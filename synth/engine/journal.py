@@ -50,10 +50,8 @@ class Journal(Watcher):
 
     def __init__(self, folder: Folder, workers: int, report: Callable[[RunProgress], None]) -> None:
         self._path, self._report = folder.state / FILE, report
-        self._cold = workers
+        self._cold, self._left, self._written = workers, 0, -_EVERY_S
         self._ends: deque[float] = deque(maxlen=_LATEST + 1)
-        self._left = 0
-        self._written = -_EVERY_S
         self._in_flight: dict[int, list[Any]] = {}
 
     def begin(self, total: int, already: int, failed: int) -> None:
@@ -93,10 +91,7 @@ class Journal(Watcher):
 
 
 class RunBars(ProgressBars, Watcher):
-    """A bar for the dataset and one for every sequence in work; plain lines without a terminal.
-
-    The time left is the run's estimate: that of rich would include the compilation in first sequences.
-    """
+    """A bar for the dataset and one for every sequence in work; plain lines without a terminal."""
 
     def __init__(self) -> None:
         super().__init__(TimeElapsedColumn(), TextColumn("{task.fields[left]}", style="cyan"))

@@ -6,16 +6,17 @@ import os
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 from synth.arguments import checked
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
-from synth.engine.child import Attempt, Child, Setup, Slot, choose_gpus, environment, share_of_memory
+from synth.engine.child import Attempt, Child, Setup, choose_gpus, environment, share_of_memory
 from synth.engine.journal import Journal, RunBars, Watcher
 from synth.errors import UserError, as_positive
 from synth.job.reader import as_job
@@ -24,8 +25,6 @@ from synth.publish import card, croissant, sequence_video
 
 _TRIES = 3  # attempts per sequence
 _VERDICT = 5  # the job is refused if so many sequences fail because of it before any succeeds
-
-_Event = Callable[[Watcher], None]
 
 
 @dataclass(frozen=True)
@@ -36,13 +35,10 @@ class Options:
     workers: int | None = None  # number of processes; None: one per core
     gpus: str = "auto"  # GPUs of this machine that the workers share: `auto`, `none`, or their numbers, `0,1`
     memory_gb: float | None = None  # limit of one process; None: an equal share of the available memory
-    stall_s: float = 1800.0  # a process without a report for so long is killed
     work: str = "synth.sequence.pipeline:render_sequence"  # `module:function` that computes one sequence
-    environment: Mapping[str, str] = field(default_factory=dict)  # added to the environment of the workers
     mix_versions: bool = False  # continue a dataset that another version of the program began
 
     def __post_init__(self) -> None:
-        """Raises UserError for a number of processes or a limit that isn't positive."""
         for name in ("workers", "memory_gb"):
             if getattr(self, name) is not None:
                 as_positive(name, getattr(self, name))
@@ -92,8 +88,7 @@ def render_job(
 def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary:
     """Computes the sequences of `job` that `root` lacks; raises as `render_job`.
 
-    Of a job that can't be carried out nothing is left behind. KeyboardInterrupt: when the workers have ended;
-    sealed sequences stay, the next run continues.
+    Of a job that can't be carried out nothing is left. KeyboardInterrupt: when the workers have ended.
     """
     workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
     share = share_of_memory(workers) if memory is None else int(memory * 1e9)
@@ -114,15 +109,11 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root.resolve(),
-            logs=folder.logs.resolve(),
-            scratch=folder.scratch.resolve(),
             work=options.work,
             memory_bytes=share,
-            stall_s=options.stall_s,
             lock_fd=folder.lock_fd,
-            environment={**environment(job, workers), **options.environment},
+            environment=environment(job, workers),
             turn=folder.turn,
-            turn_file=folder.turn_file.resolve(),
         )
         try:
             with _slots(options.engine, setup, workers, gpus) as slots:
@@ -178,14 +169,14 @@ def _publish(folder: Folder) -> None:
 class _Pool:
     """Threads, each with its own slot, and the queue of sequences to compute."""
 
-    def __init__(self, folder: Folder, slots: Sequence[Slot], todo: list[int]) -> None:
+    def __init__(self, folder: Folder, slots: Sequence[Child], todo: list[int]) -> None:
         self._folder, self._slots = folder, slots
         self._todo = deque((k, 1) for k in todo)
         self._busy = 0
         self._change = threading.Condition()
         self._stop = threading.Event()
         # For the main thread: calls of watchers, an error, or None when a thread ends.
-        self._events: queue.SimpleQueue[_Event | BaseException | None] = queue.SimpleQueue()
+        self._events = queue.SimpleQueue[Callable[[Watcher], None] | BaseException | None]()
         self._done = 0
         self._refused: list[Attempt] = []
 
@@ -214,7 +205,7 @@ class _Pool:
             self._folder.sweep_all()
         return self._done
 
-    def _serve(self, slot: Slot) -> None:
+    def _serve(self, slot: Child) -> None:
         try:
             while (task := self._take()) is not None:
                 index, tries = task
@@ -239,17 +230,14 @@ class _Pool:
             return self._todo.popleft()
 
     def _settle(self, attempt: Attempt, tries: int) -> None:
-        again = False
-        if attempt.kind == "done":
-            self._done += 1
-        elif attempt.kind == "disk":
+        if attempt.kind == "disk":
             raise UserError(f"{self._folder.root}: cannot be written ({attempt.reason})")
-        elif attempt.kind != "stopped":
-            again = attempt.kind != "input" and tries < _TRIES
-            if again:
-                self._folder.sweep(attempt.index)
-            else:
-                self._fail(attempt, tries)
+        self._done += attempt.kind == "done"
+        again = attempt.kind not in ("done", "input", "stopped") and tries < _TRIES
+        if again:
+            self._folder.sweep(attempt.index)
+        elif attempt.kind not in ("done", "stopped"):
+            self._fail(attempt, tries)
         with self._change:
             if again:
                 self._todo.append((attempt.index, tries + 1))
@@ -267,17 +255,19 @@ class _Pool:
             hopeless = not self._done and (len(self._refused) >= _VERDICT or not left)
         if hopeless and not self._folder.sealed():
             # The job itself is at fault: leave nothing behind.
-            self._folder.clear_failures([refused.index for refused in self._refused])
+            self._folder.clear_failures(refused.index for refused in self._refused)
             raise UserError("\n".join(sorted({refused.reason for refused in self._refused})))
 
 
 @contextmanager
-def _slots(engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None) -> Iterator[Sequence[Slot]]:
+def _slots(
+    engine: str, setup: Setup, workers: int, gpus: tuple[str, ...] | None
+) -> Iterator[Sequence[Child]]:
     """The slots of an engine; each of this machine's has one of `gpus` in turn, or all."""
     if engine == "local":
-        names = ["" if not gpus else gpus[k % len(gpus)] for k in range(workers)]
-        own = [{} if gpus is None else {"CUDA_VISIBLE_DEVICES": name} for name in names]
-        yield [Child(replace(setup, environment={**(setup.environment or {}), **one})) for one in own]
+        names = [] if gpus is None else [{"CUDA_VISIBLE_DEVICES": name} for name in gpus or ("",)]
+        own = islice(cycle(names or [{}]), workers)
+        yield [Child(replace(setup, environment={**setup.environment, **one})) for one in own]
         return
     from synth.engine import dask
 

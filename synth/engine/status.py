@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
 from synth.dataset import location, size_forecast
 from synth.dataset.folder import Folder
 from synth.dataset.size_forecast import Forecast
@@ -18,6 +16,7 @@ from synth.dataset.store import open_sequence
 from synth.engine.journal import FILE, RunProgress
 from synth.errors import UserError
 from synth.system import checked_file, file_lock
+from synth.system.config_file import validated
 from synth.system.terminal import clock
 
 
@@ -39,8 +38,7 @@ class Status:
 def read_status(root: Path) -> Status:
     """The status of the dataset in `root`. UserError if there is none."""
     folder = Folder(root)
-    job, done = folder.job(), folder.sealed()
-    failures = folder.failures()
+    job, done, failures = folder.job(), folder.sealed(), folder.failures()
     todo = max(0, job.sequences - len(done) - len(set(failures) - set(done)))
     progress = _progress(folder)
     stages = _stages(root, size_forecast.pilot(done))
@@ -78,10 +76,9 @@ def lines(status: Status) -> list[str]:
         ahead = status.ahead
         basis = f"from {ahead.pilot} finished" if ahead.pilot else "estimated"
         time = f", {clock(ahead.cpu_s)} of one core" if ahead.cpu_s is not None else ""
+        needed, free = map(size_forecast.amount, (ahead.bytes, status.disk_free))
         found.append(
-            f"remaining: {ahead.sequences} sequences, "
-            f"{size_forecast.amount(ahead.bytes)}{time} ({basis}); "
-            f"the disk has {size_forecast.amount(status.disk_free)} free"
+            f"remaining: {ahead.sequences} sequences, {needed}{time} ({basis}); the disk has {free} free"
         )
     return found
 
@@ -90,10 +87,9 @@ def _progress(folder: Folder) -> RunProgress | None:
     """Progress of the current run; None if there is none."""
     if not file_lock.is_held(folder.state / "lock"):
         return None
-    try:
-        return TypeAdapter(RunProgress).validate_python(checked_file.read_json(folder.state / FILE))
-    except (UserError, ValidationError):  # it has just begun, or is of another version
-        return RunProgress()
+    with suppress(UserError):  # it has just begun, or is of another version
+        return validated(RunProgress, checked_file.read_json(folder.state / FILE), FILE)
+    return RunProgress()
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

@@ -1,8 +1,6 @@
-"""The process that computes sequences, one after another, and reports its progress on a pipe.
+"""The process that computes sequences: `python -m synth.engine.worker FD`, which reports on the pipe FD.
 
-Run as `python -m synth.engine.worker FD`, where FD is the pipe to write to. It reads lines of JSON from
-standard input: first the setup, then one index at a time. Its output and that of its libraries goes to the
-sequence's log.
+It reads JSON lines: the setup, then one index at a time. All that is printed goes to the sequence's log.
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import location
+from synth.dataset.folder import Folder
 from synth.errors import UserError
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal sent to this process when the engine dies
@@ -32,34 +31,34 @@ def main(pipe: int) -> None:
     """Computes sequences until standard input ends."""
     _die_with_parent()
     setup = json.loads(sys.stdin.readline())
+    folder = Folder(Path(setup["folder"]))
     # Libraries that write files to the working directory must not share it, nor use the user's folder.
-    with tempfile.TemporaryDirectory(dir=setup["scratch"]) as scratch:
+    with tempfile.TemporaryDirectory(dir=folder.scratch) as scratch:
         os.chdir(scratch)
-        _log_to(Path(setup["logs"]) / f"worker-{os.getpid()}.log")
-        _serve(pipe, setup)
+        _log_to(folder.logs / f"worker-{os.getpid()}.log")
+        _serve(pipe, setup, folder)
 
 
-def _serve(pipe: int, setup: dict[str, Any]) -> None:
-    folder, render, settled = Path(setup["folder"]), None, False
+def _serve(pipe: int, setup: dict[str, Any], folder: Folder) -> None:
+    render, settled = None, False
     for line in sys.stdin:
         index = int(line)
-        log = Path(setup["logs"]) / f"{index:06d}.log"
+        log = folder.logs / f"{index:06d}.log"
         _log_to(log)
         try:
             # It exists already if a cluster lost the result of an attempt that had just sealed it.
-            if not location.store(folder, index).exists():
+            if not location.store(folder.root, index).exists():
                 if render is None:
                     _send(pipe, stage="start", done=0, of=1)
                     render = _prepare(setup)
-                render(index, folder, lambda stage, done, of: _send(pipe, stage=stage, done=done, of=of))
+                render(index, folder.root, lambda stage, done, of: _send(pipe, stage=stage, done=done, of=of))
         except UserError as error:
             _send(pipe, failed="input", reason=str(error))
         except Exception as error:  # any error fails this sequence only, not the run
             traceback.print_exc()
-            kind, first = "error", (str(error).splitlines() or [""])[0]
-            if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-                kind = "disk"
-            elif isinstance(error, MemoryError):
+            full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+            kind, first = "disk" if full else "error", (str(error).splitlines() or [""])[0]
+            if isinstance(error, MemoryError):
                 kind, first = "memory", "out of memory"
             _send(pipe, failed=kind, reason=f"{type(error).__name__}: {first}")
         else:
@@ -67,9 +66,7 @@ def _serve(pipe: int, setup: dict[str, Any]) -> None:
             _send(pipe, sealed=index)
         gc.collect()
         if render is not None and not settled:
-            # Libraries hold a million permanent objects: scanning them in three collections per sequence
-            # took 0.7 s.
-            gc.freeze()
+            gc.freeze()  # libraries hold a million permanent objects, whose scanning took 0.7 s a sequence
             settled = True
 
 

@@ -62,11 +62,13 @@ class TissueFrame(NamedTuple):
 def fit_camera(given: Photograph) -> dict[str, Any]:
     """Sections of a job with the photograph's family and camera.
 
-    Frames of a default job of that family are rendered at the photograph's width, then recorded and
-    compressed with rising vignette, noise and blur, whose values are chosen so that the statistics of the
-    photograph are reproduced. Colours are fitted to the signal of that camera.
+    Frames of that family are recorded with rising vignette, noise and blur, of which those are chosen that
+    reproduce the photograph's statistics. Colours are fitted to the signal of that camera.
     """
-    theirs, family = measure(given.rgb, given.usable), nearest_family(given)
+    theirs, video = measure(given.rgb, given.usable), given.rgb[given.usable] / 255
+    small = min(_CHOOSING_PX, given.rgb.shape[1] // 4 * 4)
+    tissue = {name: render(name, small, given.mm_per_px, 0).light({}) for name in FAMILIES}
+    family = min(FAMILIES, key=lambda name: fit_colours(tissue[name], video)[1])  # the closest
     widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
     width = int(np.clip(widest, _SMALLEST_PX, _LARGEST_PX)) // 4 * 4
     frames = [render(family, width, given.mm_per_px, index) for index in range(_ANATOMIES)]
@@ -84,7 +86,7 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
         keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
     here = keys | {"vignette": keys["vignette"] * reach**2}
     light = np.concatenate([one.light(here) for one in frames])
-    keys |= fit_colours(light, given.rgb[given.usable] / 255)[0]._asdict()
+    keys |= fit_colours(light, video)[0]._asdict()
     rate = given.compression.bitrate_mbps(frames[0].record(keys))
     sensor = {name: np.round(value, 4).tolist() for name, value in keys.items()}
     sensor["blur_px"] = sensor.pop("blur")
@@ -96,35 +98,27 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     return sections
 
 
-def nearest_family(given: Photograph) -> Family:
-    """The family whose tissue, with fitted colours, is closest to the photograph's."""
-    video, width = given.rgb[given.usable] / 255, min(_CHOOSING_PX, given.rgb.shape[1] // 4 * 4)
-    light = {name: render(name, width, given.mm_per_px, 0).light({}) for name in FAMILIES}
-    return min(FAMILIES, key=lambda name: fit_colours(light[name], video)[1])
-
-
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
     """A frame of a default job without instruments: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
-    appearance = {"anatomy": {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}}
+    anatomy = {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8]}
-    job = Job.model_validate(
-        {**appearance, "appearance": {"families": [family]}, "render": view, "fem": {"instrument": "none"}}
-    )
+    drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}}
+    job = Job.model_validate({"anatomy": anatomy, "render": view, **drawn})
     scene = at_rest(job, index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
-    drawn = scene.scenario.appearance.sensor
-    return TissueFrame(radiance, usable, replace(_USUAL, white=drawn.white, exposure=drawn.exposure))
+    sensor = scene.scenario.appearance.sensor
+    return TissueFrame(radiance, usable, replace(_USUAL, white=sensor.white, exposure=sensor.exposure))
 
 
 def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     """The matrix, rows of sum 1, and rising curves with the least sliced Wasserstein distance, and the cost.
 
-    Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011). Directions in
-    which the photograph varies little have more weight, as lightness would dominate hue. `light`: (N, 3) of
-    rendered tissue, as of `TissueFrame.light`; `video`: (M, 3) levels of the photograph's tissue, 0 to 1.
+    Pixels are projected on random directions, sorted, and subtracted (J. Rabin et al., 2011); directions in
+    which the photograph varies little have more weight, as lightness would dominate hue. `light`: (N, 3) as
+    of `TissueFrame.light`; `video`: (M, 3) levels of the photograph's tissue, 0 to 1.
     """
     rng, plain = np.random.default_rng(0), np.array(PLAIN.curves)
     ours, theirs = rng.choice(light, _PIXELS)[None], rng.choice(video, _PIXELS)

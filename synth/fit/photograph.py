@@ -79,15 +79,13 @@ class Photograph(NamedTuple):
 
     @property
     def cortex_mm2(self) -> float:
-        """Area of the usable cortex."""
         return float(self.usable.sum()) * self.mm_per_px**2
 
 
 def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograph:
     """The photograph at the scale of a default job's pictures, or at its own if that is coarser.
 
-    `width_mm` is its width at the cortex; `mask` a picture of the same size, white on usable cortex, which is
-    detected if it is None. UserError if it cannot be used.
+    `width_mm`: at the cortex; `mask`: white on usable cortex, else it is detected. UserError: unusable.
     """
     rgb = np.ascontiguousarray(np.asarray(checked_file.read_picture(path), np.uint8)[..., ::-1])
     if min(rgb.shape[:2]) < _SMALLEST_PX:
@@ -114,10 +112,10 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
 def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     """Statistics by which a photograph can be compared with a rendered frame of another cortex.
 
-    `vignette`: loss of light in the corners, a logarithm. `noise`: standard deviation in grey levels where
+    `vignette`: logarithmic loss of light in the corners. `noise`: standard deviation in grey levels where
     tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave relative to two
-    octaves coarser, both without the noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue, without
-    instruments; `reach`: width of this picture, the centre of a photograph, relative to the photograph's.
+    octaves coarser, without noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to
+    the photograph's.
     """
     tissue, clear = (usable & ~mask_detection.glare(rgb, grown) for grown in (2, 4))
     levels = np.arange(256, dtype=np.float32) / 255
@@ -133,12 +131,8 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
         left = (1 / fine**2 + 1 / coarse**2 - 4 / (fine**2 + coarse**2)) / (4 * np.pi)
         energy.append(max(float(band[clear].var()) - left * noise**2, 0.01))
     red = decoded[rgb[..., 0]] / np.median(decoded[rgb[tissue, 0]])
-    found = {
-        "noise": noise,
-        "sharpness": np.sqrt(energy[0] / energy[1]),
-        "vignette": _vignette(red, tissue, reach),
-    }
-    return {name: float(value) for name, value in found.items()}
+    sharpness = np.sqrt(energy[0] / energy[1])
+    return {"noise": float(noise), "sharpness": float(sharpness), "vignette": _vignette(red, tissue, reach)}
 
 
 def _vignette(red: Map, tissue: Mask, reach: float) -> float:

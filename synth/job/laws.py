@@ -1,8 +1,4 @@
-"""Material laws that a job can name, the loads up to which each is valid, and the choice made by `auto`.
-
-Numbers and plug-ins only, so that reading a job needs no compiler; the laws themselves are in
-`synth.fem.laws`.
-"""
+"""Material laws that a job can name, their valid loads, and the choice of `auto`: without a compiler."""
 
 from __future__ import annotations
 
@@ -98,12 +94,11 @@ def check_load_range(law: str, loads: LoadRange, young_kpa: float, label: str) -
 
 
 def check_load(law: str, load: float, what: str, per_load: float = 1.0) -> None:
-    """Raises InvalidValue for a load P = F/(E a^2) above the largest at which the law is valid.
+    """Raises InvalidValue, which begins with `what`, for a load P = F/(E a^2) above the law's largest.
 
-    `what` begins the message; `per_load` converts the largest valid load to the unit of the message.
+    `per_load`: from loads to the unit of the message.
     """
-    largest = largest_load(law)
-    if load > largest * (1 + 1e-9):  # a force turned into a load may be off by rounding
+    if load > (largest := largest_load(law)) * (1 + 1e-9):  # a force as a load is rounded
         valid = f"the largest valid value is {largest * per_load:.4g}"
         raise InvalidValue(f"{what} past the range of the {law} law; {valid}")
 

@@ -16,7 +16,6 @@ class Section(BaseModel):
 
 
 def _pair(value: Any) -> Any:
-    """A range; a single number is both of its ends."""
     return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 

@@ -15,24 +15,19 @@ from synth.job.schema import Job
 from synth.system.config_file import section_of
 
 _WIDTH = 100
+_HEAD = """\
+# A job: all settings of a dataset. Every key may be left out; these are the defaults.
+# Render it:            synth render THIS_FILE -o OUT
+# Override keys:         synth render THIS_FILE -o OUT render.spp=8 sequences=100
+# Help in editors:      synth schema > job.schema.json
+# yaml-language-server: $schema=job.schema.json
+
+"""
 
 
 def commented(job: Job | None = None) -> str:
-    """A job file with every key, its meaning and its range, and the values of `job` (default: the defaults).
-
-    Reading it returns the same job.
-    """
-    job = job or Job()
-    lines = [
-        "# A job: all settings of a dataset. Every key may be left out; these are the defaults.",
-        "# Render it:            synth render THIS_FILE -o OUT",
-        "# Override keys:         synth render THIS_FILE -o OUT render.spp=8 sequences=100",
-        "# Help in editors:      synth schema > job.schema.json",
-        "# yaml-language-server: $schema=job.schema.json",
-        "",
-    ]
-    lines += section_lines(job)
-    return "\n".join(lines).rstrip() + "\n"
+    """A job file with every key, its meaning, its range and its value; reading it returns the same job."""
+    return _HEAD + "\n".join(section_lines(job or Job())).rstrip() + "\n"
 
 
 def schema() -> dict[str, Any]:
@@ -89,15 +84,13 @@ def limits(model: type[BaseModel], key: str) -> str:
 
 def scalar(value: Any) -> str:
     """A value as YAML in one line; empty for None."""
-    if value is None:
-        return ""
     if isinstance(value, Path) or (isinstance(value, str) and not value.replace("-", "_").isidentifier()):
         return json.dumps(str(value), ensure_ascii=False)
     if isinstance(value, bool):
-        return "true" if value else "false"
+        return str(value).lower()
     if isinstance(value, BaseModel):
         given = {name: getattr(value, name) for name in type(value).model_fields}
         return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in given.items() if one is not None)}}}"
     if isinstance(value, tuple):
         return f"[{', '.join(scalar(item) for item in value)}]"
-    return str(value)
+    return "" if value is None else str(value)

@@ -123,12 +123,9 @@ def template(name: str) -> Any:
     """A template of this package; values are escaped in HTML."""
     import jinja2
 
-    return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        trim_blocks=True,
-        undefined=jinja2.StrictUndefined,
-        autoescape=name.endswith(".html.jinja"),
-    ).get_template(name)
+    loader, escaped = jinja2.FileSystemLoader(Path(__file__).parent), name.endswith(".html.jinja")
+    strict: Any = {"trim_blocks": True, "undefined": jinja2.StrictUndefined}
+    return jinja2.Environment(loader=loader, autoescape=escaped, **strict).get_template(name)
 
 
 def _range(rows: list[dict[str, Any]], quantity: index.IndexColumn) -> list[str]:

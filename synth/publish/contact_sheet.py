@@ -36,10 +36,9 @@ _GROWTH = 0.92  # power of the number of pixels; measured from 320 x 240 to 640 
 def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dict[str, float]]:
     """The picture (H, W, 3) of `count` scenarios spread over the job, and the job's CPU time by stage [s].
 
-    Each is drawn just before its load: nothing is deformed, the sheet shows anatomy, appearance, light, view
-    and instrument; those of `mechanics.source` are drawn under their largest load. Wide pictures are drawn
-    smaller, with fewer vertices. The cost is estimated from three frames of one sequence in that size, and
-    from its deformation alone. UserError: an impossible job.
+    Each is drawn just before its load, or those of `mechanics.source` under their largest. Wide pictures are
+    drawn smaller, with fewer vertices; the cost is estimated from some frames of one sequence in that size.
+    UserError: an impossible job.
     """
     chosen = np.unique(np.linspace(0, job.sequences - 1, count).round().astype(int)).tolist()
     width, height = job.render.size
@@ -81,10 +80,7 @@ def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
 
 
 def _measure_cost(job: Job, index: int, size: tuple[int, int]) -> dict[str, float]:
-    """Processor time [s] of sequence `index` by stage, without the start of workers.
-
-    Computed are the rest frame, that of the largest load and the last, in pictures of `size`.
-    """
+    """Processor time [s] of sequence `index` by stage, from a few frames in pictures of `size`."""
     longer, watch = Stopwatch(), Stopwatch()
     first: dict[str, float] = {}  # spent on a stage before the first frame after rest
 
@@ -115,8 +111,7 @@ def _measure_cost(job: Job, index: int, size: tuple[int, int]) -> dict[str, floa
 
 
 def _simulate(job: Job, index: int, count: int, watch: Stopwatch) -> Scene:
-    """`count` frames of the sequence, with the instruments' motion in the job's own frames: rest, largest
-    load, last, and others between. UserError with the numbers of those frames."""
+    """`count` of the sequence's frames: rest, largest load, last, and others between. May raise UserError."""
     if job.mechanics.source is not None:
         return simulate(job.model_copy(update={"frames": min(count, job.frames)}), index, watch=watch)
     case = scenario.draw_scenario(job, index)

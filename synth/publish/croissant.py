@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
@@ -22,14 +21,7 @@ _TYPES = {pa.int64(): "sc:Integer", pa.float64(): "sc:Float", pa.string(): "sc:T
 
 
 def write_croissant(folder: Folder) -> Path:
-    """Writes `croissant.json` next to the index. Returns its path."""
-    path = folder.root / NAME
-    write_whole(path, json.dumps(describe(folder), indent=1, ensure_ascii=False) + "\n")
-    return path
-
-
-def describe(folder: Folder) -> dict[str, Any]:
-    """The description, JSON-LD, from the dataset and the card in its job."""
+    """Writes `croissant.json`, from the index and the card in the job; returns its path."""
     facts = card.facts(folder, index.read_index(folder.root).to_pylist())
     job, about, (width, height) = facts["job"], facts["card"], facts["job"].render.size
     summary = (
@@ -53,7 +45,7 @@ def describe(folder: Folder) -> dict[str, Any]:
     creators = [{"@type": "sc:Person", "name": name} for name in about.authors]
     stated = {"creator": creators, "license": about.licence}
     fields = "; ".join(f"{field.name} [{field.unit}]: {field.meaning}" for field in FIELDS.values())
-    return {
+    described = {
         **base,
         "name": "".join(letter if letter.isalnum() else "-" for letter in about.title.lower()),
         "alternateName": about.title,
@@ -66,3 +58,6 @@ def describe(folder: Folder) -> dict[str, Any]:
             f"Anatomies: {facts['anatomies']}."
         ],
     }
+    path = folder.root / NAME
+    write_whole(path, json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    return path

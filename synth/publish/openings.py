@@ -50,8 +50,7 @@ class Opening:
 def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = False) -> list[Opening]:
     """At most `count` separate openings, the most even first; each has been meshed as in a job.
 
-    `fill_holes`: as `anatomy.fill_holes`. UserError if the file cannot be used, or no opening of that radius
-    works.
+    UserError: the file cannot be used, or no opening of that radius works.
     """
     chosen: list[Opening] = []
     why = "the surface is too small or too steep"
@@ -161,10 +160,9 @@ def _judge(points: Floats, tree: cKDTree, point: Floats, out: Floats, radius_mm:
 
 
 def _height_map(placed: Floats, half: float) -> tuple[Floats, Floats, Floats]:
-    """x, y and greatest height (n, n) mm in each pixel of a square; NaN where there is no point.
+    """x, y and greatest height (n, n) mm in each pixel of a square, NaN without a point.
 
-    As in the renderer, points deeper than three quarters of the square's side belong to the far side of the
-    brain.
+    Points deeper than 3/4 of the square's side are of the brain's far side, as in the renderer.
     """
     across, down, up = placed[placed[:, 2] > -1.5 * half].T
     edges = np.linspace(-half, half, 1 + int(np.ceil(2 * half / _PIXEL_MM)))

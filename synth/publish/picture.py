@@ -23,8 +23,7 @@ _WIDE_PX = 480
 def flow_colours(flow: NDArray[np.floating], largest_px: float) -> Rgb:
     """Flow (H, W, 2) px as colour: hue is direction, saturation is length, full at `largest_px`; white is 0.
 
-    The convention of Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011),
-    with the hues of HSV instead of their colour wheel.
+    As in Baker et al., "A Database and Evaluation Methodology for Optical Flow" (IJCV 2011), with HSV's hues.
     """
     length = np.hypot(flow[..., 0], flow[..., 1]) / max(largest_px, 1e-9)
     angle = np.arctan2(flow[..., 1], flow[..., 0]) % (2 * np.pi)
@@ -96,9 +95,9 @@ def side_by_side(sequence: Sequence_, t: int) -> Rgb:
 
 
 def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
-    """Picture (h, w, 3) of some frames of a sequence on common scales, a row each.
+    """Picture (h, w, 3) of frames on common scales, a row each: the frame, flow and traction on the rest
+    frame.
 
-    A row is the frame, its flow from the rest frame, and the traction if it is known, both on the rest frame.
     UserError if a frame is not in the sequence.
     """
     for t in frames:

@@ -42,10 +42,7 @@ def save_recording(sequence: Sequence, path: Path) -> None:
 
 
 def show_sequence(sequence: Sequence, *, web: bool) -> None:
-    """Opens a sequence in the viewer and returns when it is closed; it listens on this machine only.
-
-    `web`: in a browser. UserError if rerun is not installed or cannot start.
-    """
+    """Shows a sequence in the viewer, or a browser (`web`), until it is closed. UserError: it can't start."""
     print("rerun sends anonymous usage data to its makers until `rerun analytics disable`", file=sys.stderr)
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "sequence.rrd"
@@ -74,7 +71,7 @@ def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:
         young = "unknown" if attrs["young_kpa"] is None else f"{attrs['young_kpa']:.3g} kPa"
         bright = "" if strongest is None else f"\n\ntraction: brightest is {strongest:.3g} kPa\n"
         about = (
-            f"# Sequence {sequence.index}\n\n{name_gestures(attrs.get('scenario') or {})}, "
+            f"# Sequence {sequence.index}\n\n{name_gestures(attrs)}, "
             f"E = {young}, {attrs['scale_mm_per_px']:.3g} mm/px\n\nflow: hue is direction; full colour is "
             f"{longest:.3g} px{bright}"
         )

@@ -36,13 +36,12 @@ def write_preview(root: Path) -> None:
     width = drawing.side_by_side(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
     step = max(1, -(-width // _PREVIEW_PX))
 
-    def compose(t: int) -> Rgb:
-        return drawing.tile(
-            [drawing.side_by_side(one, min(t, one.frames - 1))[::step, ::step] for one in sequences]
-        )
+    def small(one: Sequence, t: int) -> Rgb:
+        return drawing.side_by_side(one, min(t, one.frames - 1))[::step, ::step]
 
-    frames = range(max(one.frames for one in sequences))
-    encode_video(root / "preview.mp4", map(compose, frames), float(sequences[0].attrs["fps"]))
+    count = max(one.frames for one in sequences)
+    frames = (drawing.tile([small(one, t) for one in sequences]) for t in range(count))
+    encode_video(root / "preview.mp4", frames, float(sequences[0].attrs["fps"]))
 
 
 def write_videos(
@@ -53,14 +52,12 @@ def write_videos(
 ) -> None:
     """Writes `NNNNNN.mp4` per sequence, with some of `OVERLAYS`; `interval_s`: first and last time [s].
 
-    `overlays`: flow, and force where it is known, if None.
-
-    Raises UserError for an unknown overlay, no frame in the interval, or a sequence without the field.
+    `overlays`: flow, and force where it is known, if None. UserError: an unknown overlay, no frame in the
+    interval, or a sequence without the field.
     """
     if overlays is None:
         overlays = ["flow", "force"] if "force" in dataset[0] else ["flow"]
-    unknown = [name for name in overlays if name not in OVERLAYS]
-    if unknown:
+    if unknown := [name for name in overlays if name not in OVERLAYS]:
         raise UserError(f"{unknown[0]}: is not one of {', '.join(OVERLAYS)}")
     for sequence in dataset:
         drawn = draw_video(sequence, overlays, interval_s)
@@ -110,10 +107,7 @@ def _overlaid(sequence: Sequence, t: int, tissue: Mask, largest: dict[str, float
 
 
 def warp_to_frame(values: NDArray[np.floating], flow: NDArray[np.floating]) -> Map:
-    """Values (H, W) on the rest frame's pixels, warped to a frame by its flow from there (H, W, 2) px.
-
-    The flow is inverted by fixed-point iteration, which converges for smooth motion.
-    """
+    """Values (H, W) of the rest frame, warped by the flow (H, W, 2) px, inverted by fixed-point iteration."""
     height, width = values.shape
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
     flow = flow.astype(np.float32)

@@ -6,6 +6,7 @@ import io
 import re
 import zlib
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,19 +74,16 @@ def histogram(values: NDArray[np.floating], title: str, unit: str, bins: int = 2
 def _slim(text: str) -> str:
     """The SVG at half its size: no prologue, comments and metadata, numbers rounded to a tenth of a point.
 
-    Rounding is offset from round numbers, as the layout's last bits differ from run to run. Names of parts
-    are derived from the content, so that several pictures can be on one page.
+    Rounded off round numbers, as last bits differ from run to run; parts are named by the content, so that
+    several pictures can be on one page.
     """
     text = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)
     text = re.sub(r' transform="rotate\(-0 [^"]*"|(?<=<g) id="[^"]*"', "", text)
-    text = re.sub(r"<[^>]+>", lambda tag: _LONG.sub(_short, tag[0]), text)
+    short = partial(_LONG.sub, lambda number: f"{float(number[0]) + 0.0123:.1f}".removesuffix(".0"))
+    text = re.sub(r"<[^>]+>", lambda tag: short(tag[0]), text)
     text = re.sub(r"\s*\n\s*", "\n", text)
     parts = dict.fromkeys(re.findall(r' id="(\w+)"', text))
     mark = f"{zlib.crc32(re.sub('|'.join(parts) or '$', '', text).encode()):x}"
     for k, part in enumerate(parts):
         text = text.replace(part, f"p{mark}-{k}")
     return text
-
-
-def _short(number: re.Match[str]) -> str:
-    return f"{float(number[0]) + 0.0123:.1f}".removesuffix(".0")

@@ -22,21 +22,17 @@ LIMIT_BYTES = 512 * 1024**2  # of the renderer's compiled kernels; the least rec
 
 @functools.cache
 def folder(name: str) -> Path:
-    """The cache folder of that name, created if necessary.
+    """The cache folder of that name: in `SULCUS_CACHE`, else in the user's cache, else in the temporary
+    folder.
 
-    It is in `SULCUS_CACHE`, else in the user's cache (`XDG_CACHE_HOME`, else ~/.cache); if neither is
-    writable (no home, read-only), in the system's temporary folder. Cached code is executed: where others own
-    the folder or may write to it, it is `user-UID` inside. OSError: no folder is writable, or others own or
-    may write to the user's own.
+    Cached code is executed: where others own the folder or may write to it, it is `user-UID` inside. OSError:
+    no folder is writable, or others own or may write to the user's own.
     """
     user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
-    places = [
-        Path(os.environ["SULCUS_CACHE"]) if "SULCUS_CACHE" in os.environ else None,
-        Path(user) / "sulcus" if user else Path(home) / ".cache" / "sulcus" if home else None,
-    ]
-    user_id = f"user-{os.getuid()}"
+    places = [Path(os.environ["SULCUS_CACHE"])] if "SULCUS_CACHE" in os.environ else []
+    places += [Path(user or f"{home}/.cache") / "sulcus"] if user or home else []
     mine = Path(tempfile.gettempdir()) / f"sulcus-{os.getuid()}"
-    for inside in (*(one for place in filter(None, places) for one in (place, place / user_id)), mine):
+    for inside in (*(one for place in places for one in (place, place / f"user-{os.getuid()}")), mine):
         with suppress(OSError):
             (inside / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             (inside / name).mkdir(mode=0o700, exist_ok=True)
@@ -65,8 +61,8 @@ def cached(
 ) -> T:
     """The result of `make`, from this user's cache if possible; concurrent calls of one key compute it once.
 
-    `file`: folder and suffix in the cache, `compliance/npy`; `key` identifies all inputs of `make`; `faults`:
-    exceptions of `load` for a corrupted file; `most`: number of files to store, older ones are deleted.
+    `file`: folder and suffix in the cache, `compliance/npy`; `key`: all inputs of `make`; `faults`:
+    exceptions of `load` for a corrupted file; `most`: number of files to store.
     """
     name, ending = file.split("/")
     word = hashlib.sha256(key).hexdigest()[:32]

@@ -1,7 +1,7 @@
 """Camera calibrations as programs write them: one pinhole camera, or a stereo pair.
 
-Read are OpenCV's FileStorage (YAML, XML, JSON) with the usual names, `camera_info` of ROS, Kalibr's camchain,
-and other YAML, JSON or INI with matrices, or with fx, fy, cx, cy and k1, k2, p1, p2, k3.
+OpenCV's FileStorage (YAML, XML, JSON), `camera_info` of ROS, Kalibr's camchain, and other YAML, JSON or INI
+with matrices, or with fx, fy, cx, cy and k1, k2, p1, p2, k3.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import configparser
 import json
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
@@ -45,9 +46,8 @@ LARGEST_FILE = 1 << 20  # bytes
 def read_lens(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
     """The only or the left camera, for pictures of a size (width, height) [px] with the same field of view.
 
-    Returns K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (4, 5, 8, 12 or 14,)
-    k1, k2, p1, p2, k3, ... Raises UserError if the file can't be read, is of another camera model, or was
-    made from pictures of another shape.
+    K (3, 3) px, with the centre of the top-left pixel at (0, 0), and distortion (4, 5, 8, 12 or 14,) k1, k2,
+    p1, p2, k3, ... UserError: unreadable, another camera model, or made from pictures of another shape.
     """
     return _load(path)[0].lens(size)
 
@@ -55,10 +55,9 @@ def read_lens(path: Path, size: tuple[int, int]) -> tuple[Floats, Floats]:
 def read_pair(
     path: Path, size: tuple[int, int]
 ) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats], Floats, Floats, float | None]:
-    """The left and the right camera, as `read_lens`, of which x_right = R x_left + T.
+    """The left and the right camera, as `read_lens`, R (3, 3) and T (3,) of x_right = R x_left + T.
 
-    Also returns R (3, 3), T (3,), and the millimetres per unit of T if the format has a unit. Raises as
-    `read_lens`, and UserError for an R or T that is missing or invalid.
+    Last the millimetres per unit of T if the format has a unit. UserError also for a missing or wrong R or T.
     """
     left, right, _ = _load(path)
     lenses = left.lens(size), right.lens(size, shifted=True)
@@ -66,16 +65,12 @@ def read_pair(
 
 
 def find_baseline_mm(path: Path) -> float:
-    """Distance of the two cameras of a pair, with T in mm if the format has no unit; 0 for a single camera,
-    and for a file that can't be read."""
-    try:
+    """Distance of a pair's cameras, with T in mm if the format has no unit; 0: no pair, or unreadable."""
+    with suppress(UserError):  # reported by those that read the cameras
         left, right, is_pair = _load(path)
         _, translation, unit = _pose(left, right)
-    except UserError:
-        return 0.0  # reported by those that read the cameras
-    if not is_pair:  # R and T are the pose of a single camera
-        return 0.0
-    return float(np.linalg.norm(translation)) * (unit or 1.0)
+        return is_pair * float(np.linalg.norm(translation)) * (unit or 1.0)  # R and T of one are its pose
+    return 0.0
 
 
 def _pose(left: _Values, right: _Values) -> tuple[Floats, Floats, float | None]:
@@ -157,8 +152,7 @@ class _Values(NamedTuple):
 
 
 def _load(path: Path) -> tuple[_Values, _Values, bool]:
-    """The values of the left and of the right camera, each with those of none, and whether there is a right
-    one. UserError for a camera that is described twice, as in two resolutions."""
+    """Values of the left and right camera, each with those of none, and whether there is a right one."""
     return _parsed(path, checked_file.read_text(path, LARGEST_FILE, "utf-8-sig").strip())
 
 

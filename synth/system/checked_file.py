@@ -24,8 +24,7 @@ from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError, as_user_error, first_line
 
-LARGEST_JSON, LARGEST_PICTURE, LARGEST_YAML = 64 << 20, 512 << 20, 200_000
-"""Size limits of files by kind [bytes]."""
+LARGEST_PICTURE, LARGEST_YAML = 512 << 20, 200_000  # bytes
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
@@ -63,7 +62,7 @@ def read_text(path: Path, largest: int, encoding: str = "utf-8") -> str:
         return data.decode(encoding)
 
 
-def read_json(path: Path, largest: int = LARGEST_JSON) -> Any:
+def read_json(path: Path, largest: int = 64 << 20) -> Any:
     """The values of a JSON file. UserError if it is not JSON."""
     text = read_text(path, largest)
     with as_user_error(f"{path}: is not JSON"):
@@ -102,8 +101,7 @@ def read_tensors(path: Path) -> dict[str, Any]:
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
-    """A still image read by OpenCV: (H, W, 3) uint8 BGR, upright, or as set by `flags` (cv2.IMREAD_...).
-    UserError: not a regular file, not a picture, or larger than 40 megapixels."""
+    """A picture by OpenCV: (H, W, 3) uint8 BGR, upright, or as of `flags`. UserError: none, or too large."""
     data = read_bytes(path, LARGEST_PICTURE)
     with as_user_error(f"{path}: not a readable picture"):
         return decode_picture(data, flags)
@@ -141,7 +139,7 @@ def read_yaml(path: Path) -> Any:
 def load_yaml(text: str, label: str, *, places: bool = False) -> Any:
     """The values of YAML 1.2, dates as text; with `places`, `ruamel.yaml`'s tree of them with their lines.
 
-    Raises UserError: `label:line:column: not YAML: ...`.
+    UserError: `label:line:column: not YAML: ...`.
     """
     yaml = YAML(typ="rt" if places else "safe", pure=True)
     if not places:
@@ -189,27 +187,10 @@ def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
 
 
 @contextmanager
-def part_of(path: Path) -> Iterator[Path]:
-    """A new file next to `path`, renamed to it if the block succeeds and else deleted.
-
-    It is created exclusively, so no existing link is followed. A link at `path` is replaced.
-    """
-    with _replacing(path, lambda part: part.touch(exist_ok=False)) as part:
-        yield part
-
-
-@contextmanager
-def folder_of(path: Path) -> Iterator[Path]:
-    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created."""
-    if os.path.lexists(path):
-        raise UserError(f"{path}: exists already")
-    make_folder(path.absolute().parent)
-    with _replacing(path, Path.mkdir) as part:
-        yield part
-
-
-@contextmanager
-def _replacing(path: Path, create: Callable[[Path], None]) -> Iterator[Path]:
+def part_of(
+    path: Path, create: Callable[[Path], None] = lambda part: part.touch(exist_ok=False)
+) -> Iterator[Path]:
+    """A new file next to `path`, renamed to it if the block succeeds, else deleted; follows no link."""
     part = path.with_name(f".{path.name}.{os.urandom(4).hex()}{PART}")
     create(part)
     try:
@@ -221,6 +202,16 @@ def _replacing(path: Path, create: Callable[[Path], None]) -> Iterator[Path]:
         else:
             part.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def folder_of(path: Path) -> Iterator[Path]:
+    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created."""
+    if os.path.lexists(path):
+        raise UserError(f"{path}: exists already")
+    make_folder(path.absolute().parent)
+    with part_of(path, Path.mkdir) as part:
+        yield part
 
 
 def make_folder(path: Path, space_bytes: int = 0) -> None:

@@ -9,13 +9,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 
 from synth.errors import UserError, did_you_mean, first_line
 from synth.system import checked_file
 
 Model = TypeVar("Model", bound=BaseModel)
+T = TypeVar("T")
 
 Loc = tuple[str | int, ...]  # path of a value in a configuration: keys and list positions
 
@@ -67,9 +68,8 @@ class ConfigFile:
         return out.getvalue()
 
     def validate(self, model: type[Model], further: Iterable[Mistake] = ()) -> Model:
-        """The validated model of the values. UserError: a line for each error and of the `further` ones, in
-        the order of the file: `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`
-        """
+        """The validated model. UserError: a line for each error, and `further` ones, in the file's order:
+        `job.yaml:12:3: render.sppp: unknown key; did you mean 'spp'?`"""
         mistakes, made = list(further), None
         try:
             made = model.model_validate(self.values)
@@ -97,10 +97,7 @@ class ConfigFile:
 
 
 def override(settings: Model, changes: Iterable[str]) -> Model:
-    """`settings` with `key=value` or `section.key=value` replaced, the value in YAML.
-
-    Raises UserError: one line for each error, `'batch=many': batch: Input should be a valid integer ...`.
-    """
+    """`settings` with `key=value` or `section.key=value` replaced. UserError: one line for each error."""
     config = ConfigFile("{}", "")
     config.values = settings.model_dump(exclude_unset=True)
     config.change(changes)
@@ -111,6 +108,14 @@ def first_mistake(error: ValidationError) -> str:
     """The first error in a file that a program wrote, in one line."""
     found = error.errors(include_url=False)[0]
     return first_line(Mistake(found["loc"], found["msg"]))
+
+
+def validated(kind: type[T], values: Any, label: str, context: object = None) -> T:
+    """`values` as a model or dataclass. UserError: `label`, with the first mistake in parentheses."""
+    try:
+        return TypeAdapter(kind).validate_python(values, context=context)
+    except ValidationError as error:
+        raise UserError(f"{label} ({first_mistake(error)})") from None
 
 
 def _find_mistakes(
@@ -146,10 +151,8 @@ def _meant(at: Loc, model: type[BaseModel]) -> str:
 
 def section_of(annotation: Any) -> type[BaseModel] | None:
     """The model in a field's type (also if optional), if any."""
-    for option in (annotation, *typing.get_args(annotation)):
-        if isinstance(option, type) and issubclass(option, BaseModel):
-            return option
-    return None
+    options = (annotation, *typing.get_args(annotation))
+    return next((one for one in options if isinstance(one, type) and issubclass(one, BaseModel)), None)
 
 
 def places(model: type[BaseModel], at: Loc = ()) -> list[Loc]:

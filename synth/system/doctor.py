@@ -14,8 +14,7 @@ from synth.system import cache, gpu, llvm, packages
 from synth.system.checked_file import folder_bytes
 from synth.system.terminal import hang
 
-_LEAST_FREE_GB = 5.0
-_LEAST_MEMORY_GB = 4.0
+_LEAST_FREE_GB, _LEAST_MEMORY_GB = 5.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -31,22 +30,16 @@ class Diagnosis:
 def diagnose(folder: Path) -> list[Diagnosis]:
     """All lines of the report; `folder` is where datasets are to be written."""
     machine, library = packages.machine(), llvm.find()
+    enough = float(machine["memory_gb"]) >= _LEAST_MEMORY_GB
+    renders = library or "none works: scalar_rgb renders, at half the speed"
+    smaller = "use --workers 1 and a smaller render.size"
+    newer = "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH"
     return [
         Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
         Diagnosis("cores", str(machine["cores"])),
-        Diagnosis(
-            "memory",
-            f"{machine['memory_gb']} GB",
-            float(machine["memory_gb"]) >= _LEAST_MEMORY_GB,
-            "use --workers 1 and a smaller render.size",
-        ),
+        Diagnosis("memory", f"{machine['memory_gb']} GB", enough, smaller),
         _disk(folder),
-        Diagnosis(
-            "LLVM",
-            library or "none works: scalar_rgb renders, at half the speed",
-            library is not None,
-            "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH",
-        ),
+        Diagnosis("LLVM", renders, library is not None, newer),
         _cuda(),
         *_lacking(),
         _kernels(),
@@ -67,14 +60,12 @@ def lines(found: Sequence[Diagnosis]) -> list[str]:
 def _lacking() -> Iterator[Diagnosis]:
     """A system library that the renderer is linked to but the loader doesn't find."""
     spec = importlib.util.find_spec("drjit")
-    threads = Path(spec.origin or "").parent / "libnanothread.so" if spec else Path()
-    if not threads.is_file():
-        return
-    try:
-        ctypes.CDLL(str(threads))
-    except OSError as error:
-        advice = "install it (Debian: apt-get install libatomic1): the renderer needs it"
-        yield Diagnosis("renderer's libraries", str(error), False, advice)
+    for threads in Path(spec.origin or "").parent.glob("libnanothread.so") if spec else ():
+        try:
+            ctypes.CDLL(str(threads))
+        except OSError as error:
+            advice = "install it (Debian: apt-get install libatomic1): the renderer needs it"
+            yield Diagnosis("renderer's libraries", str(error), False, advice)
 
 
 def _kernels() -> Diagnosis:
@@ -87,9 +78,7 @@ def _kernels() -> Diagnosis:
 
 
 def _disk(folder: Path) -> Diagnosis:
-    place = folder.resolve()
-    while not place.exists():
-        place = place.parent
+    place = next(one for one in (folder.resolve(), *folder.resolve().parents) if one.exists())
     free, writable = shutil.disk_usage(place).free / 1e9, os.access(place, os.W_OK)
     found = f"{free:.1f} GB free at {place}{'' if writable else ', not writable'}"
     return Diagnosis("disk", found, writable and free >= _LEAST_FREE_GB, "choose another folder with -o")

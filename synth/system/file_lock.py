@@ -11,6 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from synth.errors import UserError
+from synth.system.checked_file import open_file
+
 _NONE = errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP
 _WAIT_S = 5.0
 _LEASE_S = 30.0  # after which a silent process of another machine has ended; refreshed three times as often
@@ -22,14 +25,12 @@ class Locked(Exception):
 
 @contextmanager
 def hold(path: Path) -> Iterator[int]:
-    """Holds the lock of a file, which is created; yields its descriptor.
+    """Holds the lock of a file, which is created; yields its descriptor, by which child processes hold it
+    too.
 
-    Processes that inherit the descriptor hold it too. Without locks of the file system a file next to it
-    states this process and is refreshed: a dead process's is taken at once, that of another machine after
-    half a minute. Where some machines have locks and others none, those with locks see the others' file, but
-    not the other way round. If it is lost, as after a suspension, this process is interrupted.
-
-    Raises `Locked` after some seconds.
+    Without locks of the file system a file next to it is refreshed: a dead process's is taken at once,
+    another machine's after half a minute; machines with locks see it, but not the other way round. If it is
+    lost, as after a suspension, this process is interrupted. Raises `Locked` after some seconds.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     until = time.monotonic() + _WAIT_S
@@ -60,14 +61,9 @@ def hold(path: Path) -> Iterator[int]:
 
 def is_held(path: Path) -> bool:
     """Whether a process holds the lock of a file; one that ended without notice counts for a minute."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    except FileNotFoundError:
-        return False
-    try:
-        return _try_lock(descriptor, fcntl.LOCK_SH) is False or _is_leased(path)
-    finally:
-        os.close(descriptor)
+    with suppress(UserError), open_file(path, 1 << 20) as file:
+        return _try_lock(file.fileno(), fcntl.LOCK_SH) is False or _is_leased(path)
+    return False
 
 
 def _try_lock(descriptor: int, how: int) -> bool | None:

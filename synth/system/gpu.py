@@ -7,12 +7,12 @@ import functools
 import os
 import re
 import subprocess
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 _LEAST_DRIVER = 535
-_BROKEN_DRIVERS = range(565, 570)
-"""Releases whose OptiX compiler fails on Dr.Jit's kernels (Dr.Jit's notes on versions)."""
+_BROKEN_DRIVERS = range(565, 570)  # OptiX's compiler fails on Dr.Jit's kernels (Dr.Jit's notes)
 _LEAST_CAPABILITY = (7, 5)
 _MAJOR, _MINOR = 75, 76  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_*
 
@@ -52,10 +52,9 @@ def probe() -> Gpu | None:
 
 
 def _library(name: str) -> ctypes.CDLL | None:
-    try:
+    with suppress(OSError):
         return ctypes.CDLL(name)
-    except OSError:
-        return None
+    return None
 
 
 def obstacle(gpu: Gpu | None) -> str | None:
@@ -67,8 +66,8 @@ def obstacle(gpu: Gpu | None) -> str | None:
             "the driver's OptiX (libnvoptix.so.1) is missing: install libnvidia-gl, or start the container "
             "with NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics"
         )
-    release = int(gpu.driver.split(".")[0]) if gpu.driver else None
-    if release is not None and (release < _LEAST_DRIVER or release in _BROKEN_DRIVERS):
+    release = int(gpu.driver.split(".")[0] or _LEAST_DRIVER)
+    if release < _LEAST_DRIVER or release in _BROKEN_DRIVERS:
         return f"driver {gpu.driver}: {_LEAST_DRIVER} or newer is needed, other than 565 to 569"
     if gpu.capability < _LEAST_CAPABILITY:
         return f"compute capability {'.'.join(map(str, gpu.capability))}: 7.5 or more is needed"
@@ -76,9 +75,7 @@ def obstacle(gpu: Gpu | None) -> str | None:
 
 
 def _driver() -> str:
-    try:
-        text = Path("/proc/driver/nvidia/version").read_text("utf-8")
-    except OSError:
-        return ""
-    found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", text)
-    return found[0] if found else ""
+    with suppress(OSError):
+        found = re.search(r"\b\d{3}\.\d+(\.\d+)?\b", Path("/proc/driver/nvidia/version").read_text("utf-8"))
+        return found[0] if found else ""
+    return ""

@@ -15,13 +15,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def compiled(function: F, **how: str) -> F:
-    """Compiles with numba and its options `how`, once per machine rather than once per process.
+    """Compiles with numba and its options `how`, cached where numba does, else in `synth.system.cache`.
 
-    The cache is in `NUMBA_CACHE_DIR` if it is this user's alone; without that next to the package, else in
-    the user's cache folder (numba's own order); else in ours (`synth.system.cache`), if it is writable.
-
-    numba detects changes only in the file of the function itself. Hence the rule of this package: a compiled
-    function only calls compiled functions of its own file.
+    `NUMBA_CACHE_DIR` is used only if it is this user's alone. numba detects changes only in the function's
+    file: hence the rule of this package that a compiled function only calls compiled ones of its own file.
     """
     before = numba.config.CACHE_DIR
     with suppress(RuntimeError):  # no writable folder: a read-only installation without a home
@@ -37,8 +34,5 @@ def compiled(function: F, **how: str) -> F:
 
 
 def vectorised(function: F) -> F:
-    """As `compiled`, for loops over pixels: a division by zero gives inf or nan, as in NumPy.
-
-    Python's rule, an exception, would add a branch to every division and prevent vectorisation.
-    """
+    """As `compiled`, for loops over pixels: x / 0 is inf or nan; Python's exception would prevent vectors."""
     return compiled(function, error_model="numpy")

@@ -19,11 +19,9 @@ _PROBE = (
 
 @functools.cache
 def find() -> str | None:
-    """Path of a libLLVM that works with the fast renderer on this machine, or None.
+    """Path of a libLLVM that works with the fast renderer on this machine, tested in a subprocess, or None.
 
-    Only `DRJIT_LIBLLVM_PATH` is tried if it is set; else the libraries known to the linker and those in the
-    usual folders, newest version first. Each is tested in a subprocess; the result is cached in this process.
-    `SULCUS_LLVM` (a path, or empty for none) passes the result of a parent process to a worker.
+    Of `SULCUS_LLVM` (a parent process's result, empty for none), else `DRJIT_LIBLLVM_PATH`, else the newest.
     """
     given = os.environ.get("SULCUS_LLVM")
     if given is not None:

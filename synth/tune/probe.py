@@ -1,9 +1,8 @@
 """One probe sequence of a job: the force error of settings against full fidelity, and their cost.
 
-The error is the dual-weighted residual of goal-oriented error control (Becker and Rannacher, Acta Numerica
-10, 2001) with the force as the goal. The sequence simulated with an instrument's force and with a little less
-of it shows how the displacement u changes with the force's size s; its place, footprint and direction are
-known. Least squares on du/ds turns other displacement of a frame into the force error that explains it.
+The dual-weighted residual of goal-oriented error control (Becker and Rannacher, Acta Numerica 10, 2001), with
+the force as the goal. Simulated with a little less of an instrument's force, the sequence shows how the
+displacement changes with it; least squares turns a frame's other displacement into a force error.
 """
 
 from __future__ import annotations
@@ -47,8 +46,8 @@ class Probe:
     def measure(self, job: Job) -> list[float]:
         """The sequence with the settings of `job`. UserError if they cannot carry it out.
 
-        Returns the force error of the true displacement, and of the recovered one (the true one where none
-        is), as parts of the force; CPU-s a frame of physics, scene, rendering and flow, all above 0.
+        Parts of the force: its error of the true, and of the recovered displacement (the true one where none
+        is); CPU-s a frame of physics, scene, rendering and flow, all above 0.
         """
         at_rest(job)  # grows the surface, which stays in memory for other settings: it counts for none
         watch = Stopwatch()

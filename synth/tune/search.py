@@ -1,9 +1,7 @@
 """Goal-oriented fidelity: the cheapest job whose force error is within a budget of full fidelity's.
 
-On a few probe sequences, one parameter at a time is changed of the job as given, or of full fidelity if that
-job misses the budget. What changes do to the error adds up at most, their costs multiply stage by stage. That
-only orders the candidates: the cheapest that is predicted to keep the budget is measured as a whole, on
-further sequences too, and given up for a more careful one if it misses.
+One parameter at a time is changed on a few probe sequences: errors add up at most, costs multiply stage by
+stage. In that order whole jobs are measured, on further sequences too.
 """
 
 from __future__ import annotations
@@ -57,10 +55,7 @@ class Evaluation:
 
 
 class Measurements:
-    """Measurements of a job's settings on sequences like its own, none of which is one of them.
-
-    They are stored in the user's cache: a run that was stopped goes on.
-    """
+    """Measurements of settings on sequences like a job's own, stored in the user's cache: a run can go on."""
 
     def __init__(self, job: Job) -> None:
         self.job, self.grid = job, list_settings(job)
@@ -133,8 +128,7 @@ def tune(measurements: Measurements, budget: float, probes: int, checks: int) ->
     """Finds the cheapest settings that let the force error grow by at most a budget, a part of the force.
 
     Every setting is measured on `probes` sequences, whole jobs on `checks` more. The answer never costs more
-    than the job as given, unless that misses the budget by more than its margin. UserError if a sequence
-    cannot be carried out at full fidelity.
+    than the job, unless that misses the budget by more than its margin. UserError: full fidelity fails.
     """
     grid, some, every = measurements.grid, range(probes), range(probes + checks)
     full = measurements.evaluate(measurements.full, every)
@@ -168,10 +162,8 @@ def list_settings(job: Job) -> dict[str, list[Any]]:
     """Settings by key, finest first and the job's own among them; only keys with more than one."""
     fem, (width, height), vertices = job.fem, job.render.size, job.anatomy.vertices
     law = fem.chosen_law[0]
-    grid: dict[str, list[Any]] = {
-        "fem.law": [law],
-        "fem.tets": sorted({fem.tets, 4000, 2500, 1600, 800}, reverse=True),
-    }
+    tets = sorted({fem.tets, 4000, 2500, 1600, 800}, reverse=True)
+    grid: dict[str, list[Any]] = {"fem.law": [law], "fem.tets": tets}
     if law in CHEAPEST_FIRST:  # a plug-in's is another tissue, not a dearer way to the same one
         linear = ["linear"] if fem.largest_load <= LARGEST_LOAD["linear"] else []
         grid["fem.law"] = list(dict.fromkeys(["neo-hookean", *linear, law]))

@@ -28,9 +28,9 @@ def find_stills(folder: Path, suffixes: Collection[str] = (".png",)) -> list[Pat
 
 
 def number_files(paths: Collection[Path]) -> dict[int, Path]:
-    """Files by the last number in their names that increases from file to file, else by their position.
+    """Files by the last number in their names that rises from file to file, else by position.
 
-    Raises UserError for several series of names, as of two cameras or two formats.
+    UserError for several series of names, as of two cameras or two formats.
     """
     ordered = sorted(paths, key=natural_order)
     series = Counter(re.sub("[0-9]+", "*", path.name) for path in ordered).most_common(3)
@@ -52,12 +52,11 @@ def number_files(paths: Collection[Path]) -> dict[int, Path]:
 def match_numbers(
     numbers: Collection[int], frames: Collection[int], name: str, notes: list[str]
 ) -> dict[int, int]:
-    """The frame of each number, of files or rows called `name`: that of the same number, unless the two are
-    counted differently.
+    """The frame of each number of files or rows called `name`: the same one, unless they are counted
+    differently.
 
-    `frames`: of the video, empty if unknown; `notes` receives a line if there are as many numbers as frames,
-    equally spaced, but not equal. UserError: some are not frames, and neither the first nor the last ones
-    agree.
+    `frames`: of the video, empty if unknown; `notes` receives a line if as many numbers, equally spaced,
+    differ. UserError: some are not frames, and neither the first nor the last ones agree.
     """
     own, video = np.unique(list(numbers)), np.unique(list(frames))
     same = dict(zip(own.tolist(), own.tolist(), strict=True))

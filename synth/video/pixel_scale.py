@@ -1,13 +1,13 @@
 """Millimetres per pixel, given or unknown: one rule for `learn predict`, `bench score` and `bench live`.
 
-Force is proportional to a power of the scale and to E: without either it is known up to a factor. For an
-unknown scale a width of the picture is assumed and E is treated as unknown too, so estimates are right up to
-one factor.
+Force is proportional to a power of the scale and to E. For an unknown scale a width of the picture is assumed
+and E is treated as unknown too: estimates are right up to one factor.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Literal
 
 from synth.errors import UserError
@@ -16,25 +16,18 @@ StatedScale = float | Literal["unknown"]  # mm per pixel
 
 ASSUMED_WIDTH_MM = 32.0  # of a picture of unknown scale: a typical field of view of a microscope on cortex
 
-UNKNOWN_NOTE = (
-    f"scale unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide; estimates are right up to "
-    "a factor"
-)
+_ASSUMED = f"the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
+UNKNOWN_NOTE = f"scale unknown: {_ASSUMED}; estimates are right up to a factor"
 
 
 def read_scale(text: str | None) -> StatedScale | None:
     """Parses `--scale`; None if it is not given. UserError if it is neither positive nor `unknown`."""
-    if text is None:
-        return None
-    if text == "unknown":
-        return "unknown"
-    try:
-        scale = float(text)
-    except ValueError:
-        scale = math.nan
-    if not 0 < scale < math.inf:
-        raise UserError(f"--scale {text}: give mm per pixel, or unknown")
-    return scale
+    if text is None or text == "unknown":
+        return None if text is None else "unknown"
+    with suppress(ValueError):
+        if 0 < float(text) < math.inf:
+            return float(text)
+    raise UserError(f"--scale {text}: give mm per pixel, or unknown")
 
 
 def pixel_mm(stated: StatedScale, width: int) -> float:

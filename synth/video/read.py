@@ -36,11 +36,8 @@ _WIDEST = 4.0  # largest aspect ratio of a pixel: a larger one is a damaged head
 _LABELS = 8  # most levels of a mask of class numbers; more are a soft edge
 
 # Formats that FFmpeg may open: others could make it read further files and addresses.
-_CONTAINERS = {
-    "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,asf,ogg,flv",
-    "protocol_whitelist": "file",
-    "max_pixels": str(LARGEST_PIXELS),
-}
+_FORMATS = "mov,matroska,webm,avi,mpegts,mpeg,asf,ogg,flv"
+_CONTAINERS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file", "max_pixels": str(LARGEST_PIXELS)}
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,8 @@ class Picture:
 def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
     """Decodes frame by frame; times are the container's presentation times from its start, else of `fps`.
 
-    The orientation stated in the file is applied, and pixels stated not to be square are resampled in width.
-    Of a truncated file the frames before the cut are returned. UserError: not a video, no video stream, or
-    pictures larger than 40 megapixels.
+    Pictures are upright, with square pixels; those before a cut are returned. UserError: not a video, no
+    video stream, or pictures larger than 40 megapixels.
     """
     with _open_video(path) as container:
         if not container.streams.video:
@@ -163,21 +159,15 @@ def _open_video(path: Path) -> InputContainer:
 
 
 def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:
-    """Still images by their numbers, in the given order, without times. UserError if their sizes differ.
-
-    16-bit ones are reduced to 8 by the range that all of them use.
-    """
-    size: tuple[int, ...] | None = None
-    bits: int | None = None
+    """Still images by number, without times; 16 bits reduced to the 8 in use. UserError: sizes differ."""
+    size, bits = None, None
     for index, path in paths.items():
         stored = _read_colours(path)
         if bits is None and stored.dtype == np.uint16:
             bits = count_bits(map(_read_colours, paths.values()))
         rgb = np.ascontiguousarray(as_8_bits(stored, bits or 16)[..., ::-1])
-        if size is not None and rgb.shape != size:
-            is_ = f"is {rgb.shape[1]} x {rgb.shape[0]}"
-            raise UserError(f"{path}: {is_}, but the frames before are {size[1]} x {size[0]}")
-        size = rgb.shape
+        size = size or rgb.shape[:2]
+        _refuse_other_size(path, rgb.shape[:2], size, "the frames before are")
         yield Picture(index, None, rgb)
 
 
@@ -205,8 +195,7 @@ def as_8_bits(picture: Array, bits: int) -> Array:
 def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     """The mask (H, W) of a picture: above half of its maximum, or not 0 if it holds class numbers.
 
-    The opacity of a picture of one colour is its mask. UserError: unreadable, or not of `size` (height,
-    width).
+    Of one colour, its opacity. UserError: unreadable, or not of `size` (height, width).
     """
     picture = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
     levels = np.atleast_3d(picture)
@@ -218,10 +207,13 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
     brightest = levels.max(axis=2)
     few = np.count_nonzero(np.bincount(brightest.ravel())) <= _LABELS
     mask = brightest > (0 if few else brightest.max() / 2)
-    if mask.shape != size:
-        is_ = f"is {mask.shape[1]} x {mask.shape[0]}"
-        raise UserError(f"{path}: {is_}, but the video is {size[1]} x {size[0]}")
+    _refuse_other_size(path, mask.shape, size, "the video is")
     return np.asarray(mask, bool)
+
+
+def _refuse_other_size(path: Path, found: tuple[int, ...], size: tuple[int, ...], what: str) -> None:
+    if found != size:
+        raise UserError(f"{path}: is {found[1]} x {found[0]}, but {what} {size[1]} x {size[0]}")
 
 
 def shrink_picture(picture: NDArray[A], shrink: int) -> NDArray[A]:

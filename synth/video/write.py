@@ -25,8 +25,7 @@ def encode_video(
 ) -> Path:
     """Writes (H, W, 3) uint8 sRGB frames as an MP4 (H.264, 4:2:0, BT.601) that browsers can play.
 
-    An odd last row or column is cropped, as the codec requires. `quality`: x264's constant rate factor,
-    smaller is better and larger; `group`: distance of key frames.
+    An odd last row or column is cropped. `quality`: x264's rate factor; `group`: distance of key frames.
     """
     import av
 
@@ -52,9 +51,8 @@ def encode(
 ) -> None:
     """Encodes frames, (H, W, 3) uint8 sRGB, with H.264 as the only stream of an open file.
 
-    `pixels`: FFmpeg's name of the format; where it subsamples chroma, H and W are even. `options`: x264's,
-    which set the bitrate without `bits_per_s`; `times_s`: (T,) rising, by the rate if None. UserError: frames
-    of different sizes, or without pixels.
+    `pixels`: FFmpeg's format; where it subsamples chroma, H and W are even. `options`: x264's; `times_s`:
+    (T,) rising, by the rate if None. UserError: frames of different sizes, or without pixels.
     """
     import av
 

@@ -16,6 +16,9 @@ from synth.job.schema import Job
 from synth.publish import card
 
 HERE = Path(__file__).resolve().parent
+_BEFORE = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+# Workers import the stand-in.
+os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*_BEFORE, str(HERE), str(HERE.parents[1])]))
 
 
 class Silent(Watcher):
@@ -32,12 +35,7 @@ class Silent(Watcher):
 
 
 def options(work: str, **more: object) -> Options:
-    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(HERE), str(HERE.parents[1])]))
-    return Options(
-        work=f"fake_work:{work}",
-        environment={"PYTHONPATH": path},
-        **{"workers": 1, "mix_versions": True, **more},
-    )  # type: ignore[arg-type]
+    return Options(work=f"fake_work:{work}", **{"workers": 1, "mix_versions": True, **more})  # type: ignore[arg-type]
 
 
 def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:

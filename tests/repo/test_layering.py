@@ -100,11 +100,3 @@ def test_learn_loads_no_renderer_through_another_module() -> None:
     assert {"torch", "synth.dataset.store", "synth.job.schema"} <= found
     assert not [name for name in found if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
     assert "synth.sequence.pipeline" in reached("bench") | reached("synth"), "the walk finds no modules"
-
-
-def test_only_the_adapter_imports_mitsuba_at_the_top() -> None:
-    """Mitsuba must be loaded after its variant and LLVM are chosen, never by an import of another module."""
-    for path in sources(*PACKAGES):
-        for node in parsed(path).body:
-            if isinstance(node, ast.Import) and any(alias.name == "mitsuba" for alias in node.names):
-                assert path.parent.name == "mitsuba", path
