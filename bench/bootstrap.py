@@ -14,10 +14,10 @@ LEVEL = 0.95
 
 
 def block_length(x: Floats) -> float:
-    """Mean block length for the stationary bootstrap of the mean of `x`, in samples.
+    """Mean block length, in samples, for the stationary bootstrap of the mean of `x` (T,).
 
     Politis and White, "Automatic block-length selection for the dependent bootstrap" (Econometric Reviews
-    2004), with the correction of Patton, Politis and White (2009). `x`: (T,) finite.
+    2004), with the correction of Patton, Politis and White (2009).
     """
     n = len(x)
     centred = x - x.mean()
@@ -37,18 +37,17 @@ def block_length(x: Floats) -> float:
     taper = np.clip(2 * (1 - np.abs(lag) / reach), 0, 1)
     cov = autocov[np.abs(lag)]
     g = float((taper * np.abs(lag) * cov).sum())
-    spectrum = float((taper * cov).sum())
+    spectrum, longest = float((taper * cov).sum()), float(min(n / 3, 3 * np.sqrt(n)))
     if spectrum <= 0:
-        return float(min(n / 3, 3 * np.sqrt(n)))
+        return longest
     length = (2 * g**2 / (2 * spectrum**2)) ** (1 / 3) * n ** (1 / 3)
-    return float(np.clip(length, 1.0, min(n / 3, 3 * np.sqrt(n))))
+    return float(np.clip(length, 1.0, longest))
 
 
 def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) -> Floats:
-    """Counts of each of `n` samples in each stationary bootstrap resample, (resamples, n).
+    """Counts of each of `n` samples in each resample, (resamples, n), of blocks of geometric length.
 
-    Politis and Romano, "The stationary bootstrap" (JASA 1994): blocks of geometric length from uniform
-    starts on the circle of samples.
+    Politis and Romano, "The stationary bootstrap" (JASA 1994).
     """
     drawn = np.empty((resamples, n), np.int64)
     drawn[:, 0] = rng.integers(0, n, resamples)
@@ -63,7 +62,5 @@ def counts(n: int, mean_block: float, resamples: int, rng: np.random.Generator) 
 def interval(values: Floats) -> Interval:
     """The middle 95% of resampled values (R,); those that are not finite are left out."""
     values = values[np.isfinite(values)]
-    if len(values) == 0:
-        return (float("nan"), float("nan"))
-    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return (float(low), float(high))
+    low, high = np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2]) if len(values) else (np.nan, np.nan)
+    return float(low), float(high)

@@ -31,8 +31,9 @@ app = typer.Typer(
 Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
-Masks = Annotated[
-    str, Option(help="auto, none, glare, tool, both, or a folder of tool masks NNNNNN.png or mask.png.")
+Masks = Annotated[str, Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png.")]
+ModelFolder = Annotated[
+    Path | None, Option("--model", "-m", help="Model folder of `learn train`, mono or stereo.")
 ]
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
@@ -40,31 +41,18 @@ Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 @app.command(epilog="Example: bench score recording --model model --also other=other-model")
 def score(
     recording: Annotated[Path, Argument(help="Recording folder: meta.yaml, video or frames, force.csv.")],
-    model: Annotated[
-        Path | None,
-        Option("--model", "-m", help="Model folder of `learn train`, mono or stereo (`learn models`)."),
-    ] = None,
-    out: Annotated[
-        Path | None, Option("--out", "-o", help="Folder for score.json and report.html; default NAME-score.")
-    ] = None,
+    model: ModelFolder = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder to write; default NAME-score.")] = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[
-        int, Option(min=0, max=8, help="Compute flow on frames this many times smaller; 0: 320 columns.")
-    ] = 0,
+    shrink: Annotated[int, Option(min=0, max=8, help="Shrink frames first; 0: to 320 columns.")] = 0,
     rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
-    pulse: Annotated[
-        bool, Option(help="Remove heartbeat and breathing from the motion before estimating force.")
-    ] = True,
+    pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     title: Annotated[str, Option(help="Heading of the report.")] = "",
-    train: Annotated[
-        Path | None, Option(help="The model's training data, to fit the baselines on it too.")
-    ] = None,
+    train: Annotated[Path | None, Option(help="The model's training data, to fit baselines too.")] = None,
     also: Annotated[list[str] | None, Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
-    region: Annotated[
-        str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part of the picture.")
-    ] = "",
+    region: Annotated[str, Option(help="LEFT,TOP,WIDTH,HEIGHT [px]: track only this part.")] = "",
     json: Json = False,
 ) -> None:
     """Estimates force from a recording's video and scores it against the sensor: score.json, report.html.
@@ -156,9 +144,7 @@ def init(recording: Annotated[Path, Argument(help="Recording folder; it may exis
 def check(
     recording: Annotated[Path, Argument(help="Recording folder.")],
     phantom: Phantom = False,
-    picture: Annotated[
-        Path | None, Option(help="PNG to write: tissue, masks and flow on five frames.")
-    ] = None,
+    picture: Annotated[Path | None, Option(help="PNG to write: tissue, masks, flow of five frames.")] = None,
     json: Json = False,
 ) -> None:
     """Reports what of a recording is usable and what is missing. Exits with code 2 if it can't be used."""
@@ -207,9 +193,7 @@ def import_(
             "alternating; add ,right-first if so."
         ),
     ] = None,
-    newtons: Annotated[
-        float, Option(min=1e-6, help="Newtons per unit of force in the source: 0.001 for mN.")
-    ] = 1.0,
+    newtons: Annotated[float, Option(min=1e-6, help="Newtons per unit of force: 0.001 for mN.")] = 1.0,
     json: Json = False,
 ) -> None:
     """Converts another system's recording into a recording folder."""
@@ -249,7 +233,7 @@ def from_dataset(
     ] = None,
     footage: Annotated[Literal["png", "mp4"], Option(help="Lossless pictures or H.264.")] = "png",
     instrument: Annotated[
-        int | None, Option(help="The sensor measures this instrument alone, from 1; else the total force.")
+        int | None, Option(help="Force of this instrument alone, from 1; else of all.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -290,20 +274,14 @@ def live(
         Path,
         Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
     ],
-    model: Annotated[
-        Path | None, Option("--model", "-m", help="Model folder, mono or stereo: forces too.")
-    ] = None,
-    scale: Annotated[
-        str | None, Option(help="mm per pixel of the video, or unknown; needed with a model.")
-    ] = None,
+    model: ModelFolder = None,
+    scale: Annotated[str | None, Option(help="mm per pixel, or unknown; needed with a model.")] = None,
     young: Young = None,
     flow: Backend = "tvl1",
     shrink: Annotated[int, Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
     every: Annotated[bool, Option("--every", help="Process every frame, however late.")] = False,
-    out: Annotated[
-        Path | None, Option("--out", "-o", help="Folder for live.json: latencies and the machine.")
-    ] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder for live.json, with latencies.")] = None,
     json: Json = False,
 ) -> None:
     """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""

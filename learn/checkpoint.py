@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -37,8 +38,7 @@ _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequenc
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
-USED = ("fit", "select", "intervals")
-"""Parts of `ModelCard.split` that the model must not be scored on."""
+USED = ("fit", "select", "intervals")  # parts of `ModelCard.split` that the model must not be scored on
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def write_card(folder: Path, card: ModelCard) -> None:
     """Writes config.json into a model's folder, whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     tree = {"format": _FORMAT, "format_version": MODEL, **_CARD.dump_python(card, mode="json")}
-    tree["seal"] = _hash(identity.canonical(tree))
+    tree["seal"] = identity.digest(tree)
     _write(folder / "config.json", (json.dumps(tree, indent=1) + "\n").encode())
 
 
@@ -96,7 +96,7 @@ def write_model(folder: Path, card: ModelCard, state: Mapping[str, Tensor]) -> M
     """Writes weights and card atomically and returns the card with the weights' hash."""
     folder.mkdir(parents=True, exist_ok=True)
     data = safetensors.save({k: v.contiguous() for k, v in state.items()})
-    card = replace(card, weights_hash=_hash(data))
+    card = replace(card, weights_hash=_digest(data).hexdigest())
     _write(folder / _NEXT, data)
     write_card(folder, card)
     os.replace(folder / _NEXT, folder / _WEIGHTS)
@@ -111,7 +111,7 @@ def read_card(folder: Path) -> ModelCard:
     data = checked_file.read_bytes(file, _LARGEST_BYTES)
     try:
         tree = json.loads(data)
-        if tree.pop("seal", None) != _hash(identity.canonical(tree)):
+        if tree.pop("seal", None) != identity.digest(tree):
             raise UserError(f"{file}: edited or damaged: its seal does not match")
         if tree.pop("format") != _FORMAT:
             raise UserError(f"{file}: not a Sulcus model")
@@ -131,17 +131,12 @@ def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
 
 
 def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
-    """The trained network, in evaluation mode on the CPU, and its card.
-
-    Raises UserError if card or weights are damaged, edited, or don't belong together.
-    """
+    """The trained network, in evaluation mode on the CPU, and its card. UserError: damaged or edited."""
     card = read_card(folder)
     file = _find_weights(folder, card)
     with as_user_error(f"{file}: corrupt weights"):
         state = safetensors.load(checked_file.read_bytes(file, _LARGEST_WEIGHTS))
-    with torch.device("meta"):  # without memory
-        expected = {name: value.shape for name, value in D2FNet(card.settings.arch).state_dict().items()}
-    if expected != {name: value.shape for name, value in state.items()}:
+    if _shapes(card.settings.arch) != {name: value.shape for name, value in state.items()}:
         raise UserError(f"{file}: the weights are not those of the network in config.json")
     if not all(torch.isfinite(v).all() for v in state.values()):
         raise UserError(f"{file}: the weights hold NaN or infinity")
@@ -152,12 +147,16 @@ def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
 
 def disk_needed(folder: Path, arch: Architecture) -> int:
     """Upper bound of the bytes that training `arch` still adds to `folder`."""
-    with torch.device("meta"):
-        numbers = sum(int(value.numel()) for value in D2FNet(arch).state_dict().values())
+    numbers = sum(math.prod(shape) for shape in _shapes(arch).values())
     # Weights, and last.pt with them and two moments of each; all twice during replacement. And logs.
     needed = 2 * 4 * 4 * numbers + 2_000_000
     written = (folder / name for name in (_WEIGHTS, "last.pt"))
     return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
+
+
+def _shapes(arch: Architecture) -> dict[str, torch.Size]:
+    with torch.device("meta"):  # without memory
+        return {name: value.shape for name, value in D2FNet(arch).state_dict().items()}
 
 
 def _find_weights(folder: Path, card: ModelCard) -> Path:
@@ -175,7 +174,3 @@ def _find_weights(folder: Path, card: ModelCard) -> Path:
 def _write(file: Path, data: bytes) -> None:
     with as_user_error(f"{file}: cannot be written"):
         write_whole(file, data)
-
-
-def _hash(data: bytes) -> str:
-    return str(_digest(data).hexdigest())

@@ -117,11 +117,10 @@ def _split_arguments(first: str, words: Sequence[str]) -> tuple[Path, dict[str, 
     return Path(datasets[0]), settings
 
 
-def _read(datasets: Iterable[Path], grid: Grid, wanted: Iterable[str], cache: Path | None) -> list[Clip]:
+def _read(datasets: Iterable[Path], grid: Grid, wanted: Sequence[str], cache: Path | None) -> list[Clip]:
     from learn.data.clips import load_clips
 
     clips: list[Clip] = []
-    wanted = tuple(wanted)
     for one in datasets:
         with counting("Reading sequences") as progress:
             clips += load_clips(one, grid, wanted, cache=cache, report=progress)
@@ -135,6 +134,10 @@ def _describe(found: Intervals) -> str:
 def _log(numbers: Mapping[str, float]) -> None:
     score = f"loss {numbers['loss']:.4f}, select R² {numbers['select_r2']:.3f}"
     _console.print(f"epoch {numbers['epoch']:.0f}: {score}")
+
+
+def _note(text: str) -> None:
+    _console.print(f"note: {text}", style="yellow", markup=False, highlight=False)
 
 
 @app.command("eval", epilog="Example: learn eval model out --against other-model")
@@ -163,26 +166,25 @@ def eval_command(
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
-    other = None if against is None else load_model(against)
-    if other is not None:
+    others = [load_model(one) for one in (against,) if one is not None]
+    for other in others:
         other.readable(source)
         if other.grid != predictor.grid:
             raise UserError(f"{against}: differs from {model} in its grid; choose another --against")
-    cards = [one.card for one in (predictor, other) if one is not None]
+    cards = [one.card for one in (predictor, *others)]
     chosen = choose_unseen(clips, dataset, cards, _console.print)
     for note in {note for card in cards for clip in chosen for note in card.doubt(clip.recovered_by)}:
-        _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+        _note(note)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
-        second = None if other is None else evaluate(other, chosen, source, progress)
-    pairs = {} if second is None else compare(second, report)
+        pairs = [compare(evaluate(other, chosen, source, progress), report) for other in others]
     covered = cover(predictor, chosen, source) if predictor.card.intervals and (all or json) else []
     if json:
         found = {"model": str(model), "input": source, **report.as_dict()}
         if covered:
             found["coverage"] = [one.as_dict() for one in covered]
-        if second is not None:
-            found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in pairs.items()}}
+        for one in pairs:
+            found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in one.items()}}
         print(json_.dumps(found))
         return
     screen = Console(markup=False)  # "[mN]" is a unit
@@ -190,8 +192,8 @@ def eval_command(
     screen.print(score_table(report, title, all))
     if covered and all:
         screen.print(coverage_table(covered))
-    if second is not None:
-        screen.print(paired_table(pairs, f"against {against}, paired by sequence", all))
+    for one in pairs:
+        screen.print(paired_table(one, f"against {against}, paired by sequence", all))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")
@@ -243,7 +245,7 @@ def predict_command(
             what = "no frame has a force" if one.peak_mn is None else f"peak force {one.peak_mn:.3g} mN"
             _console.print(f"{one.name}: {one.frames} frames, {what}")
             for note in one.notes:
-                _console.print(f"note: {note}", style="yellow", markup=False, highlight=False)
+                _note(note)
     if json:
         notes, peaks = {one.name: one.notes for one in found}, {one.name: one.peak_mn for one in found}
         print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
@@ -313,10 +315,10 @@ def export_command(
 def models_command(json: Json = False) -> None:
     """List the pretrained networks."""
     from learn.checkpoint import read_card
-    from learn.inference.shipped import describe, hash_data, shipped
+    from learn.inference.shipped import MODELS, NAMES, describe, hash_data
     from synth.system.checked_file import folder_bytes
 
-    found = {name: (folder, read_card(folder)) for name, folder in shipped().items()}
+    found = {name: (MODELS / name, read_card(MODELS / name)) for name in NAMES}
     if json:
         rows = [
             {"name": name, "folder": str(folder), "bytes": folder_bytes(folder), "data": hash_data(card)}

@@ -1,18 +1,14 @@
 """Training losses: squared error, R², and a penalty on off-target force.
 
-Prediction and target are force density at a reference stiffness of 1 kPa [mN/mm²], as are two constants of
-the training data: `unit`, the target's 99.9th percentile, against which a force is low; `spread`, its root
-mean square over tissue cells, by which errors are divided. The squared-error and the R² term are then of
-similar size. (In the published code the squared error is in (3 N)², about 1e-4, and R² takes nearly all of
-the gradient.)
+`unit` and `spread` are constants of the training data: the target's 99.9th percentile, against which a force
+is low, and its root mean square over tissue cells, by which errors are divided so that the squared-error and
+the R² term are of similar size. (In the published code R² takes nearly all of the gradient.)
 
-Off-target force is force on contact-free tissue. Heraoui et al. penalise it by a larger weight on the squared
-error, their loss `antighost`; but the gradient of a squared penalty fades with the false force, so small ones
-remain. The loss `off-target` adds a linear penalty: for one component with squared error alone, where the
-conditional mean is q (in units of `spread`) on tissue that is free with probability p, the minimum is at
-q − p·OFF_TARGET/2, at least 0.
-Cells in certain contact (p = 0) don't change. The penalty costs R² on weak presses, whose forces are of its
-size; R² by frame makes up for that, as it divides an error by its own frame's force.
+Off-target force is force on contact-free tissue. Heraoui et al. weight its squared error more (`antighost`),
+but the gradient of a square fades with the false force, so small ones remain. `off-target` adds a linear
+penalty: with squared error alone, where the conditional mean is q (in units of `spread`) on tissue that is
+free with probability p, the minimum is at q − p·OFF_TARGET/2, at least 0. It costs R² on weak presses, whose
+forces are of its size; R² by frame makes up for that, as it divides an error by its own frame's force.
 """
 
 from __future__ import annotations
@@ -83,8 +79,7 @@ def unexplained(
 ) -> Tensor:
     """1 − R² = SSE/SST over the batch's masked cells, each component about its own mean.
 
-    `by_frame`: the mean of the frames' ratios. SST is at least a tenth of the training data's mean square, so
-    that frames at rest don't divide by zero.
+    `by_frame`: the mean of the frames' ratios. SST is at least a tenth of the training data's mean square.
     """
     over = (2, 3) if by_frame else (0, 2, 3)
     cells = mask.sum(over)

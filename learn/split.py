@@ -17,10 +17,8 @@ from synth.dataset.index import read_split
 from synth.dataset.split import SIDES, DatasetSplit, find_crossings, join_groups
 from synth.errors import UserError
 
-Note = Callable[[str], None]
-"""Receives warnings about a split."""
-Unit = Literal["anatomy", "opening", "sequence"]
-"""What is never on two sides of a split."""
+Note = Callable[[str], None]  # receives warnings about a split
+Unit = Literal["anatomy", "opening", "sequence"]  # what is never on two sides of a split
 _SEQUENCE = "/"  # between anatomy and sequence in a group's name; never in the name of an anatomy or opening
 _OPENING = " at "  # between anatomy and place of the craniotomy
 LEAST_SELECTED = 3  # brains that the error model needs
@@ -43,8 +41,8 @@ def divide(
     """The clips with their groups, and their division by the datasets' splits.
 
     Of a group on different sides in two datasets only the sequences on the later side (train, validation,
-    test) are used, so that no brain of a test side is trained on. `seed`: for the draw of the interval part.
-    Raises UserError for a dataset with too few groups to split, or an empty fit or select part.
+    test) are used. `seed`: of `keep_back`. UserError for too few groups to split, or an empty fit or select
+    part.
     """
     splits, where = [read_split(one) for one in datasets], " ".join(map(str, datasets))
     if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
@@ -69,17 +67,15 @@ def divide(
 
 
 def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
-    """The split with half of the select part's brains, drawn at random, moved to the interval part.
-
-    If half are too few for 90% intervals, the split is returned unchanged.
-    """
+    """The split with a random half of the select part's brains, if enough, moved to the interval part."""
     number = groups(clips)
     names = np.unique([number[i] for i in split.select])
     if len(names) < 2 * conformal.least_units(LEVELS[0]):
         return split
     drawn = np.random.default_rng([seed, 0x1E7]).permutation(names)[: len(names) // 2]
-    calibration = tuple(i for i in split.select if number[i] in drawn)
-    select = tuple(i for i in split.select if i not in calibration)
+    select, calibration = (
+        tuple(i for i in split.select if (number[i] in drawn) == taken) for taken in (False, True)
+    )
     return replace(split, select=select, intervals=calibration)
 
 
@@ -100,10 +96,7 @@ def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]
 def choose_unseen(
     clips: list[Clip], dataset: Path, cards: Sequence[ModelCard], note: Note = lambda text: None
 ) -> list[Clip]:
-    """Sequences to score models on: those that none was trained on; of a training dataset, of its test side.
-
-    Raises UserError if there are none.
-    """
+    """Sequences that no model was trained on; of a training dataset, of its test side. UserError: none."""
     split, candidates = read_split(dataset, required=False), clips
     known = {name for card in cards for part in card.split.values() for name in part}
     if split.sides and any(clip.content_hash in known for clip in clips):
@@ -131,8 +124,8 @@ def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], fr
     """Division of a dataset's sequences for fitting a trained model's intervals, by brains.
 
     The interval part is the card's; else every brain that is neither in the card nor in a test; with
-    `from_test` a random half of the test brains. If the select part has fewer brains than the error model
-    needs, the missing ones are drawn from the interval part. `test`: hashes of further test sequences.
+    `from_test` a random half of the test brains. What the select part lacks for the error model is drawn from
+    it. `test`: hashes of further test sequences.
     """
     number = groups(clips)
 
@@ -158,18 +151,13 @@ def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], fr
 
 
 def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:
-    """Why intervals can't be fitted; empty if they can.
-
-    `selection`: sequences for the error model; `calibration`: for the factors.
-    """
+    """Why intervals can't be fitted on these sequences (error model, factors); empty if they can."""
     least = conformal.least_units(LEVELS[0])
-    parts = (
+    for what, part, needed in (
         ("left for intervals", calibration, least),
         ("left to choose the epoch and to fit the error model", selection, LEAST_SELECTED),
-    )
-    for what, part, needed in parts:
-        found = len(set(groups(part)))
-        if found < needed:
+    ):
+        if (found := len(set(groups(part)))) < needed:
             brains = "brain is" if found == 1 else "brains are"
             return (
                 f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
@@ -179,10 +167,7 @@ def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str
 
 
 def regroup(clips: Sequence[Clip], unit: Unit) -> list[Clip]:
-    """The clips grouped by anatomy, by place of the craniotomy, or not at all.
-
-    In the last two cases one brain may be on several sides, and scores don't apply to other brains.
-    """
+    """The clips grouped by anatomy, by place of the craniotomy, or not at all."""
     if unit == "opening":
         return [replace(c, group=c.opening or c.group) for c in clips]
     if unit == "sequence":

@@ -29,7 +29,7 @@ _LEGEND = "green: tissue; magenta: masked; arrows: trusted motion"
 
 
 def check_recording(folder: Path, phantom: bool = False, picture: Path | None = None) -> list[Finding]:
-    """Findings on a recording, errors first: its pictures are decoded and a few tracked. Raises no UserError.
+    """Findings on a recording, errors first, from all pictures and a few tracked ones. No UserError.
 
     `phantom`: as in `open_recording`. `picture`: PNG of what is tracked, written if tracking works.
     """
@@ -63,10 +63,9 @@ def _track_some(recording: Recording, mm_per_px: float, picture: Path | None) ->
 
 
 def _draw_tracking(frames: Sequence[FrameMotion], tissue: Mask, shrink: int) -> Rgb:
-    """The rest frame, the frame with the largest motion and three others, in order: (H, W, 3).
+    """The rest frame, which is the first, the frame with the largest motion and three others: (H, W, 3).
 
-    `frames`: the rest frame first; `tissue`: (h, w) of the rest frame; `shrink`: factor by which the frames
-    are smaller than the video; lengths are in the video's pixels.
+    `tissue`: (h, w); `shrink`: factor by which frames are smaller than the video; lengths are in its pixels.
     """
     trusted = [tissue & (one.confidence > LOW_CONFIDENCE) for one in frames]
     lengths = [np.linalg.norm(one.flow, axis=-1) * where for one, where in zip(frames, trusted, strict=True)]
@@ -93,12 +92,11 @@ def _draw_tracking(frames: Sequence[FrameMotion], tissue: Mask, shrink: int) -> 
         caption = f"{most[k] * shrink:.1f} px at most, arrows x{gain}" if k else "rest frame"
         caption = caption if frame.trusted else "tracking lost"
         panels.append(framed(picture, f"frame {frame.index}{time}: {caption}"))
-    legend = framed(np.full_like(picture, 255), _LEGEND)
-    return tile([*panels, legend])
+    return tile([*panels, framed(np.full_like(picture, 255), _LEGEND)])
 
 
 def _decode(recording: Recording) -> TrackedRecording:
-    """Numbers, times and size of the pictures up to the first unreadable one."""
+    """The pictures up to the first unreadable one."""
     found = TrackedRecording()
     with suppress(UserError):  # tracking reports it
         for picture in recording.frames():

@@ -1,10 +1,9 @@
 """What contradicts the video: the sensor's force against the leading method's, and the causes that fit best.
 
 Each hypothesis on the recording is a transformation of the sensor's force after which it should equal the
-estimate up to a gain. Within the stated interval a gain needs no explanation. A residual r has the Laplace
+estimate up to a gain, which within the stated interval needs no explanation. A residual r has the Laplace
 likelihood, which spikes hardly change: n log(mean |r|) over n independent frames, where mean |r| counts from
-the noise on; a hypothesis that is one of N of its kind pays log N. Magnitudes and, if their axes are known,
-components count separately. Tested by `tests/bench/scoring/test_judgement.py`.
+the noise on; one of N of a kind pays log N. Magnitudes and, if axes are known, components count separately.
 """
 
 from __future__ import annotations
@@ -117,8 +116,7 @@ def independent(curve: Floats) -> float:
 
 
 def _estimate(sensor: SensorMotion) -> tuple[Floats, tuple[float, float]]:
-    """The video's force (T, 3) and the range of the sensor's gain that its interval allows; without E the
-    motion, and any gain."""
+    """The video's force (T, 3), and the sensor's gains that its interval allows; without E motion and any."""
     if sensor.leading_mn is None:
         return np.pad(sensor.moved[:, None], ((0, 0), (0, 2))), (0.0, np.inf)
     size = np.linalg.norm(sensor.leading_mn, axis=1)
@@ -230,7 +228,7 @@ def _named_gain(one: Hypothesis, gain: float) -> Hypothesis:
 
 
 def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
-    """Possible faults of the clock, the frames' times (T,) [s] that follow, and their number of the kind."""
+    """Faults of the clock, the frames' times (T,) [s] that follow, and the number of their kind."""
     time_s = sensor.time_s
     frame, since = float(np.median(np.diff(time_s))), time_s - time_s[0]
     yield "the clocks: the video runs backwards", time_s[-1] - since, 1
@@ -244,10 +242,8 @@ def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
         if k:
             yield f"the sensor's clock: add {k * frame:+.2f} s (sync.offset_s)", time_s - k * frame, len(lags)
         for rate in rates:
-            what = (
-                f"the sensor's clock runs {1 / rate:.2f} times as fast"
-                + f" (add {k * frame:+.2f} s too)" * bool(k)
-            )
+            too = f" (add {k * frame:+.2f} s too)" if k else ""
+            what = f"the sensor's clock runs {1 / rate:.2f} times as fast{too}"
             yield what, time_s[0] + since * rate - k * frame, len(lags) * len(rates)
     starts = time_s[_PART : -_PART : max(1, 2 * len(time_s) // _TRIED)]
     for k in lags:

@@ -1,8 +1,4 @@
-"""The list of all checks, and the findings of a recording by it, for `bench check` and `bench score`.
-
-A new check is a function in the file of its subject and an entry in one of these lists. Findings on pictures
-come with the tracked video (`synth.recording_flow.picture_faults`) and pass through `check_pictures`.
-"""
+"""The list of all checks, and the findings of a recording by it, for `bench check` and `bench score`."""
 
 from __future__ import annotations
 
@@ -14,6 +10,7 @@ from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.recording_flow.finding import Finding, by_severity, first_fault
 
+# Of the files alone.
 RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     files.check_notes,
     scale.check_stiffness,
@@ -21,8 +18,7 @@ RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     sensor.check_samples,
     sensor.check_free_spans,
 )
-"""Checks of the files alone."""
-
+# Of the pictures, of which a few or all are tracked.
 TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ...] = (
     files.check_pictures,
     files.check_tool,
@@ -38,23 +34,17 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     sensor.check_rest_frame,
     sensor.check_start,
 )
-"""Checks of the pictures, of which a few or all are tracked."""
-
+# Of the aligned sensor against motion and forces in all tracked frames.
 SENSOR_CHECKS: tuple[Callable[[SensorMotion], list[Finding]], ...] = (
     contradiction.check_contradiction,
     sensor.check_constant,
 )
-"""Checks of the aligned sensor against the motion and the methods' forces in all tracked frames."""
 
 
 def judge(
     recording: Recording, tracked: TrackedRecording, sensor: SensorMotion | None = None
 ) -> list[Finding]:
-    """Findings of every check, errors first.
-
-    `tracked`: if tracking failed, with the decoded pictures only; `sensor`: sensor and motion at the tracked
-    frames, if there is a sensor and methods were applied.
-    """
+    """Findings of every check, errors first. `tracked`: if that failed, with the decoded pictures only."""
     found = [one for check in RECORDING_CHECKS for one in check(recording)]
     found += [one for check in TRACKED_CHECKS for one in check(recording, tracked)]
     # Forces that are not valid contradict any sensor.

@@ -1,8 +1,4 @@
-"""Checks of the sensor alone: its samples, load where there should be none, constant or saturated force.
-
-Loads are of raw samples, because a tare would hide them. For the sensor against the video's force see
-`bench.checks.contradiction`.
-"""
+"""Checks of the sensor alone: its raw samples, load where there should be none, constant force."""
 
 from __future__ import annotations
 
@@ -104,12 +100,11 @@ def check_start(recording: Recording, tracked: TrackedRecording) -> list[Finding
 
 
 def find_other_rest(time_s: Floats, moved: Floats) -> tuple[float, bool] | None:
-    """When tissue comes to rest in another state than the rest frame's, and whether it never rests in that.
+    """When [s] tissue comes to rest in another state than the rest frame's; whether it never rests in that.
 
     Tissue that was loaded in the rest frame rests when the load has gone. Under a contact that lasts to the
     end it does so too, but mostly after it has rested in the rest frame. None: it rests there only.
-
-    `time_s`: (T,) times of the frames [s]; `moved`: (T,) mean motion since the rest frame, any unit.
+    `moved`: (T,) mean motion since the rest frame, any unit.
     """
     share = moved / max(float(moved.max()), 1e-12)
     calm = np.abs(np.diff(share, prepend=share[0])) < _CALM
@@ -165,10 +160,7 @@ def find_sensor_motion(
     sensor: AlignedSensor,
     scored: Mask,
 ) -> SensorMotion | None:
-    """Sensor and motion in the frames (T,) to be scored; None without a sensor, motion or enough frames.
-
-    `main`: name of the leading method.
-    """
+    """Sensor and motion in the frames (T,) to be scored; None without a sensor, motion or enough frames."""
     moved = next((name for name, one in methods.items() if isinstance(one, FlowSize)), None)
     if sensor.axes_mn is None or moved is None:
         return None
@@ -182,9 +174,8 @@ def find_sensor_motion(
         alone = [n for n, one in methods.items() if not isinstance(one, (FlowSize, Fusion))]
         every = [np.nan_to_num(tracked.force_mn[name]) for name in alone]
         forces = [force[known] for force in every if force.any()]
-        leading = (
-            None if isinstance(methods[main], FlowSize) else np.nan_to_num(tracked.force_mn[main])[known]
-        )
+        if not isinstance(methods[main], FlowSize):
+            leading = np.nan_to_num(tracked.force_mn[main])[known]
     axes = 3 if recording.has_stereo else 2  # one camera does not show motion along the optical axis
     if np.isnan(np.array(tracked.force_mn[main])[known, 1:axes]).any():  # the method states magnitudes only
         axes = 0

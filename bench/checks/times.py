@@ -1,7 +1,4 @@
-"""Checks of the frames' times, of the sensor's against them, and of the spans for calibration.
-
-For the sensor's clock see `bench.checks.contradiction`.
-"""
+"""Checks of the frames' times, of the sensor's against them, and of the spans for calibration."""
 
 from __future__ import annotations
 
@@ -32,15 +29,14 @@ def check_times(recording: Recording, tracked: TrackedRecording) -> list[Finding
     found = [Finding("ok", "times", f"{t[-1] - t[0]:.2f} s at {rate:.4g} frames per second")]
     timeless = sum(time_s is None for _, time_s in tracked.decoded)
     back = len(tracked.decoded) - timeless - len(t)
+    doubts = []
     if timeless or back:
-        message = f"{timeless} frames without a time, {back} backwards in time"
-        found.append(Finding("warning", "times", message))
+        doubts.append(f"{timeless} frames without a time, {back} backwards in time")
     if gaps := int((steps > _GAP * np.median(steps)).sum()):
-        found.append(Finding("warning", "times", f"{gaps} gaps, the longest {steps.max():.3g} s"))
+        doubts.append(f"{gaps} gaps, the longest {steps.max():.3g} s")
     if not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
-        message = f"{rate:.3g} frames per second: are the times in seconds?"
-        found.append(Finding("warning", "times", message))
-    return found
+        doubts.append(f"{rate:.3g} frames per second: are the times in seconds?")
+    return found + [Finding("warning", "times", doubt) for doubt in doubts]
 
 
 def check_spans(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

@@ -23,10 +23,9 @@ _COMMON_NAMES = {
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a file: frames (T, H, W[, C]), their times (T,), force (N, 3 or 6), its times (N,).
+    """Opens a file: frames (T, H, W[, C]), times (T,), force (N, 3 or 6), its times (N,) or the frames'.
 
-    Arrays are found by common names anywhere in the file, or named by `use`. A force array without times has
-    those of the frames. Raises UserError if an array is missing, ambiguous or of the wrong shape.
+    Arrays are found by common names, or named by `use`. UserError if one is missing, ambiguous or misshapen.
     """
     import h5py
 
@@ -62,7 +61,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
 
 
 def _refuse_odd(source: Path, role: str, array: Any) -> None:
-    """Raises UserError for an array in other files, without numbers or too long, before it is read."""
+    """UserError for an array in other files, without numbers or too long, before it is read."""
     if array.external or array.is_virtual:
         raise UserError(f"{source}: {array.name} is stored in other files, which are not opened")
     if array.dtype.kind not in "fiu" or array.ndim == 0:

@@ -15,18 +15,12 @@ from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 
 _LONGEST_LINE = 65536
-
-Fields = dict[str, dict[int, str]]  # text of a field by name and frame
-
 _FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+Fields = dict[str, dict[int, str]]  # text of a field by name and frame
 
 
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a sequence.
-
-    `Timestamp` is the frame's time, `Force` (one or three numbers) its force. Raises UserError for another
-    format, or no times.
-    """
+    """Opens a sequence with the fields `Timestamp` and `Force`. UserError for another format, or no times."""
     import SimpleITK
 
     _refuse_elsewhere(source)

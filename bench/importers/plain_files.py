@@ -32,9 +32,9 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a video, a folder of pictures or stacks of them, a stack, or an .npy of (T, H, W[, C]).
 
     Times come from `--use frame_time=TABLE.csv`, from `--use fps=RATE` and the numbers in the names, or from
-    the video. `--use frames=GLOB` and `right=GLOB` choose among a folder's pictures. Forces come from `--use
-    force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n, fz_n. Raises UserError for no
-    times, a table without the columns, or not as many times as pictures.
+    the video; forces from `--use force=TABLE.csv`, in the columns that ROS tools write or t_s, fx_n, fy_n,
+    fz_n. `--use frames=GLOB` and `right=GLOB` choose among a folder's pictures. UserError for no times, a
+    table without the columns, or not as many times as pictures.
     """
     notes: list[str] = []
     pictures, numbers, times = _open(source, use.get("frames"), notes)
@@ -46,9 +46,8 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             raise UserError(f"--use fps={use['fps']}: give pictures per second")
         times = (np.array(numbers) - numbers[0]) / rate
         if numbers[-1] - numbers[0] != len(numbers) - 1:
-            notes.append(
-                f"{source}: {len(numbers)} numbers from {numbers[0]} to {numbers[-1]}: times follow them"
-            )
+            span = f"{numbers[0]} to {numbers[-1]}"
+            notes.append(f"{source}: {len(numbers)} numbers from {span}: times follow them")
     if times is None or not np.isfinite(times).all():
         raise UserError(f"{source}: pictures without times; add --use frame_time=TABLE.csv or --use fps=RATE")
     second = None

@@ -1,8 +1,4 @@
-"""`bench import`: recordings of other systems, converted into recording folders.
-
-PLUS/IGSIO sequences (.mha, .igs.mha), ROS bags (.bag, .mcap, .db3, ROS 2 folders) and HDF5 files are read by
-the libraries made for these formats; the result has the layout that `bench.recording` reads.
-"""
+"""`bench import`: recordings of other systems, converted into recording folders."""
 
 from __future__ import annotations
 
@@ -27,8 +23,7 @@ from synth.video import read as video
 from synth.video import stereo_layout
 from synth.video.file_numbers import find_stills
 
-ROLES = ("frames", "frame_time", "force", "force_time")
-"""Parts of a source; `--use ROLE=NAME` names one."""
+ROLES = ("frames", "frame_time", "force", "force_time")  # parts of a source; `--use ROLE=NAME` names one
 PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")
 """Of loose files: `fps` is the rate of pictures without times; `frames` and `right` may be patterns."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
@@ -79,10 +74,8 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     """Opens a source.
 
     `use`: role → name in the source, where the choice is ambiguous. `layout`: of two cameras in its pictures,
-    as of `stereo_layout.LAYOUTS`, with `,right-first` if so.
-
-    Raises UserError for an unknown format, a library that is not installed, no usable contents, or an
-    ambiguous choice.
+    as of `stereo_layout.LAYOUTS`, with `,right-first` if so. UserError for an unknown format, a library that
+    is not installed, no usable contents, or an ambiguous choice.
     """
     use = dict(use or {})
     if not source.is_dir():
@@ -225,10 +218,8 @@ def write_recording(
 
 
 def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
-    """The name for a role: the requested one, else the only one, else None.
-
-    Raises UserError if the requested one is missing, or there are several and none is requested.
-    """
+    """The name for a role: the requested one, else the only one, else None. UserError if it is missing, or
+    there are several and none is requested."""
     if wanted is not None:
         if wanted not in names:
             raise UserError(f"--use {role}={wanted}: no such {what}; there are {', '.join(names) or 'none'}")

@@ -38,10 +38,8 @@ _Pictures = Callable[..., Iterator[Array]]
 def read_source(source: Path, use: dict[str, str]) -> Intake:
     """Opens a bag: its only topic of pictures and of forces, or those named by `use`.
 
-    Times are the messages' header stamps; if a topic's stamps are all zero, the bag's times. Each picture of
-    the topic `right` or `depth` is assigned to the nearest frame, at most half a frame interval away.
-
-    Raises UserError for no pictures, several topics of a kind, an unknown encoding, an unusable calibration.
+    Times are the messages' header stamps; if a topic's stamps are all zero, the bag's times. Raises UserError
+    for no pictures, several topics of a kind, an unknown encoding, an unusable calibration.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -118,10 +116,8 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
 
 
 def partners(times_s: Floats, frames_s: Floats) -> Ints:
-    """The frame of each picture of another camera, (M,), mutually nearest in time; -1: none.
-
-    `times_s`: (M,) times of the pictures [s]; `frames_s`: (T,) times of the frames [s].
-    """
+    """The frame (T,) of each picture (M,) of another camera: mutually nearest in time [s] and at most half a
+    frame interval away; -1: none."""
     apart, frame = KDTree(frames_s[:, None]).query(times_s[:, None])
     picture = KDTree(times_s[:, None]).query(frames_s[:, None])[1]
     step = float(np.median(np.diff(np.sort(frames_s)))) if len(frames_s) > 1 else np.inf
@@ -253,11 +249,8 @@ class _Lens:
 
 
 def _read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> _Lens:
-    """The camera of a calibration message `info` of ROS 1 or 2.
-
-    `pictures`: the topic of the camera's pictures, of width and height `size` [px]; those named
-    `image_rect...` are already rectified. Raises UserError for no calibration, or one for another size.
-    """
+    """The camera of a calibration message of ROS 1 or 2, for a topic of pictures of width and height `size`;
+    those named `image_rect...` are rectified. UserError for no calibration, or one for another size."""
     K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
     if (info.width, info.height) != size:
         calibrated = f"{info.width} x {info.height}"
@@ -269,9 +262,8 @@ def _read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> _
     if _image_name(pictures).startswith("image_rect"):
         return _Lens(P[:, :3], np.zeros(5), np.eye(3), shift_mm)
     if D.any() and len(D) not in _TERMS.get(info.distortion_model, ()):
-        raise UserError(
-            f"{topic}: distortion {info.distortion_model} with {len(D)} terms is not one of OpenCV's models"
-        )
+        model = f"{info.distortion_model} with {len(D)} terms"
+        raise UserError(f"{topic}: distortion {model} is not one of OpenCV's models")
     return _Lens(K, D if D.any() else np.zeros(5), R.reshape(3, 3), shift_mm)
 
 
@@ -286,10 +278,7 @@ def _info_name(topic: str) -> str:
 
 
 def _join_pair(left: _Lens, right: _Lens) -> dict[str, Floats]:
-    """K1, D1, K2, D2, R, T [mm] as in OpenCV's `stereoCalibrate`: x_right = R x_left + T.
-
-    Raises UserError if the baseline is 0.
-    """
+    """K1, D1, K2, D2, R, T [mm]: x_right = R x_left + T. UserError if the baseline is 0."""
     baseline = right.shift_mm - left.shift_mm
     if not baseline:
         raise UserError("the calibrations have no baseline (P[0, 3] of the right camera's camera_info)")

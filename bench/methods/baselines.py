@@ -1,8 +1,4 @@
-"""Baselines fitted on the same sequences as the network.
-
-Their input is a grid of displacement in millimetres, and force is normalised by E alone: for a linear solid
-force over E is a function of displacement.
-"""
+"""Baselines fitted on the network's sequences: of a linear solid displacement gives the force over E."""
 
 from __future__ import annotations
 
@@ -26,8 +22,8 @@ if TYPE_CHECKING:
     from learn.data.clips import Clip
 
 Rule = Callable[[Field, Field, Field], Floats]
-"""Displacement (2, N, N) mm, mask (N, N) 0/1, confidence (N, N) → force over E, (3,) mN/kPa; NaN: magnitude
-only, in x. In stereo displacement is (3, N, N) mm and confidence (2, N, N), lateral and in depth."""
+"""Displacement (2 or, in stereo, 3, N, N) mm, mask (N, N) 0/1, confidence (N, N) or (2, N, N), lateral and in
+depth → force over E, (3,) mN/kPa; NaN: magnitude only, in x."""
 
 RIDGE = "ridge on PCA of flow"
 GRID = Grid(48)
@@ -68,11 +64,8 @@ class Linear:
         return np.asarray(self.matrix @ _rows(moved[None], mask[None])[0], np.float64)
 
 
-def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Linear]:
-    """Rules fitted on the network's own fit sequences `clips`, on `GRID`, for a fair comparison.
-
-    `source`: the displacement: `recovered` or `ideal`, in stereo `motion` or `motion-ideal`.
-    """
+def fit_ridge(clips: Sequence[Clip], source: str) -> Linear:
+    """`RIDGE` fitted on the network's own fit sequences, on `GRID`, with displacement from `source`."""
     moved = np.concatenate([clip.displacement[source] for clip in clips])
     mask = np.concatenate([np.broadcast_to(clip.mask, (clip.frames, *clip.mask.shape)) for clip in clips])
     force = np.concatenate([clip.force / clip.young_kpa for clip in clips])
@@ -83,7 +76,7 @@ def fitted_rules(clips: Sequence[Clip], source: str) -> dict[str, Linear]:
     names = sorted({clip.group for clip in clips})
     fold = np.concatenate([np.full(clip.frames, names.index(clip.group) % 4) for clip in clips])
     strengths = np.geomspace(1e-4, 1e2, 13)
-    return {RIDGE: Linear(ridge(features, force, fold, strengths).coef_ @ basis.components_)}
+    return Linear(ridge(features, force, fold, strengths).coef_ @ basis.components_)
 
 
 def _rows(moved: Field, mask: Field) -> Floats:
@@ -92,11 +85,7 @@ def _rows(moved: Field, mask: Field) -> Floats:
 
 
 def ridge(
-    x: Floats,
-    y: Floats,
-    fold: NDArray[np.intp],
-    strengths: Floats,
-    parts: Sequence[slice] = (slice(None),),
+    x: Floats, y: Floats, fold: NDArray[np.intp], strengths: Floats, parts: Sequence[slice] = (slice(None),)
 ) -> Ridge:
     """Ridge regression without intercept (no motion is no force), its strength by cross-validation.
 

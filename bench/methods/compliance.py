@@ -1,13 +1,11 @@
 """The compliance: observed surface displacement under unit loads, the linear map that physics inverts.
 
-Computed by `synth.fem` on a procedural block viewed from straight above, with a mesh of its own. A recording
-does not determine the camera's pose or the brain's shape, so the compliance does not depend on them. For the
-tissue (`TissueKind`) there is a small grid of compliances, cached on disk.
+Computed by `synth.fem` on a procedural block viewed from straight above, as a recording determines neither
+the camera's pose nor the brain's shape; for each `TissueKind` once, in a cache on disk.
 """
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import Delaunay
 
+from bench.methods.matrix_cache import cached_matrix
 from synth.arrays import Floats, Map
 from synth.dataset import provenance
 from synth.fem import surface_embedding
@@ -25,12 +24,10 @@ from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
-from synth.system import cache
 
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
-# A recording does not determine the brain's shape: that of the default job.
 _ANATOMY = schema.AnatomySection()
 OPENING_MM = _ANATOMY.craniotomy.radius_mm
 _OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))  # no skull near
@@ -101,10 +98,7 @@ def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
 
 
 def build(components: int, tissue: TissueKind) -> Compliance:
-    """The compliance: one linear problem per node and axis with one factorisation (4 CPU-s), or the cache.
-
-    `components`: of the observed displacement: 2 monocular, 3 stereo.
-    """
+    """The compliance (4 CPU-s, or the cache) of 2 or, in stereo, 3 components of displacement."""
     points, nodes = _lattices()
     matrix = _stored(tissue)[: components * len(points)]
     flat = np.column_stack([nodes, np.zeros(len(nodes))])
@@ -116,20 +110,8 @@ def build(components: int, tissue: TissueKind) -> Compliance:
 def _stored(tissue: TissueKind) -> Map:
     """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
-    return cache.cached(
-        "compliance/npy",
-        code + f"{tissue}".encode(),
-        lambda: _solved(tissue).astype(np.float32),
-        _dumped,
-        lambda data: np.asarray(np.load(io.BytesIO(data), allow_pickle=False), np.float32),
-        (ValueError, EOFError),
-        _STORED,
-    )
-
-
-def _dumped(matrix: Map) -> bytes:
-    np.save(held := io.BytesIO(), matrix)
-    return held.getvalue()
+    key = code + f"{tissue}".encode()
+    return cached_matrix("compliance", key, lambda: _solved(tissue).astype(np.float32), _STORED)
 
 
 def _lattices() -> tuple[Floats, Floats]:
@@ -138,6 +120,7 @@ def _lattices() -> tuple[Floats, Floats]:
 
 
 def _solved(tissue: TissueKind) -> Floats:
+    """The matrix: one linear problem per node and axis, with one factorisation."""
     block, (points, nodes) = ElasticBlock.build(_TETS, tissue), _lattices()
     observed, loaded = block.embed(points), block.embed(nodes)
     columns = np.empty((len(nodes), 3, 3, len(points)))

@@ -1,8 +1,4 @@
-"""Baselines that use only the magnitude of the tissue's motion.
-
-A force estimator that follows the sensor no better than the mean length of the flow has learnt nothing from
-where the tissue moves. A length is not a force: scoring finds the one gain between the two.
-"""
+"""Baselines that use only the magnitude of the tissue's motion, to which scoring fits a gain."""
 
 from __future__ import annotations
 
@@ -21,8 +17,7 @@ PEAK_PERCENTILE = 98.0  # for the largest displacement, without outliers of flow
 class FlowSize:
     """A statistic of the flow's length over the tissue [mm], in place of a force.
 
-    It includes masked tissue, where flow is filled in smoothly: leaving out a mask that covers moving tissue
-    in some frames only would change the statistic more.
+    Masked tissue, where flow is filled in, counts: a mask in some frames only would change it more.
     """
 
     measure: Callable[[Floats], float]  # the statistic [mm] of at least one length, (P,) mm

@@ -73,10 +73,9 @@ def mix(parts: Sequence[ForceMixture], weight: Floats, worlds: Sequence[int]) ->
 def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[float, float]:
     """90% interval of the force's magnitude, in its unit, by reproducible draws.
 
-    It holds the interval under each assumption on the tissue, however unlikely: evidence between them is
-    not reliable. `gain`: relative standard deviation of all forces. An interval starts at 0 if 0 is in the
-    90% region; with one camera it then ends at the 98th percentile, because pressing along the optical axis,
-    which hardly shows in the picture, is a small part of the distribution.
+    It holds the interval under each assumption on the tissue, as evidence between them is not reliable.
+    `gain`: relative standard deviation of all forces. It starts at 0 if 0 is in the 90% region; with one
+    camera it then ends at the 98th percentile, as pressing along the optical axis hardly shows.
     """
     if found.world is not None and len(worlds := np.unique(found.world)) > 1:
         size = float(np.linalg.norm(found.mean))

@@ -1,9 +1,8 @@
 """Fusion of network and physics, each weighted by its stated error.
 
-The estimate of physics is a mixture over contacts and tissues. The network's estimate is a further
-observation of the same force: it shifts each component, and components that contradict it lose weight. What
-physics can't exclude the network can't exclude either, as it knows no more of the tissue: the interval of
-physics stays in that of the fusion.
+The network's estimate is a further observation of the force of which physics gives a mixture over contacts
+and tissues: it shifts each component, and components that contradict it lose weight. As it knows no more of
+the tissue, the interval of physics stays in that of the fusion.
 """
 
 from __future__ import annotations
@@ -43,11 +42,9 @@ class Fusion:
         cameras: int,
         known_mn: Floats | None = None,
     ) -> list[ForceEstimate]:
-        """Forces of a video's frames from the estimates by name of all other methods.
+        """Forces of a video's frames from the other methods' estimates; the network's where one has no error.
 
-        The network's estimate alone where one of the two states no error. `cameras`: 1 monocular, 2 stereo;
-        `known_mn`: (T,) the force where it is known, in free spans and a separate press, else NaN: a method
-        whose interval fails there loses weight.
+        `known_mn`: (T,) where it is known (free spans, press), else NaN: what fails there loses weight.
         """
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         known = np.full(len(estimates), np.nan) if known_mn is None else known_mn

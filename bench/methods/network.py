@@ -21,10 +21,7 @@ class Model:
     """A model of `learn train`. Without a known E its forces are those of tissue of 1 kPa."""
 
     def __init__(self, model: Path | Predictor, recovered_by: str = "") -> None:
-        """`model`: the model itself, or its folder, loaded as an optimised graph. UserError if unreadable.
-
-        `recovered_by`: `name_motion` of the recording's motion.
-        """
+        """`model`: itself, or its folder, loaded as an optimised graph. `recovered_by`: of `name_motion`."""
         self._recovered_by = recovered_by
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._estimator: tuple[MethodContext, ForceEstimator] | None = None

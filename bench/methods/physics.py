@@ -1,8 +1,7 @@
 """Physics as a method: `posterior` on every frame, with tissue parameters weighted by the whole video.
 
-Frames are estimated at the end of the video: spans without contact give the tissue's own motion, the frames
-with the largest motion its edge, membrane and Poisson's ratio. A force map requested earlier uses the frame
-with the largest motion so far.
+At its end spans without contact give the tissue's own motion, the frames with the largest motion its edge,
+membrane and Poisson's ratio; a force map requested earlier uses the frame with the largest motion so far.
 """
 
 from __future__ import annotations
@@ -109,9 +108,7 @@ class Physics:
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
         if contact_free.any() or not self._scene.living or not any(self._trusted):
             free = [self._frames[k] for k in np.flatnonzero(contact_free)]
-            own_mm = posterior.own_motion(
-                basis, [one for one in free if one.size_mm > 0]
-            )  # not the rest frame
+            own_mm = posterior.own_motion(basis, [f for f in free if f.size_mm > 0])  # not the rest frame
         else:
             tracked = np.flatnonzero(self._trusted)
             frames = [self._frames[k] for k in tracked]
@@ -131,10 +128,9 @@ class Physics:
         sizes = ", ".join(f"{one:.2g}" for one in self._weights.own_mm)
         own = f"the tissue's own motion is {sizes} mm along x, y, z"
         if not self._contact_free:
-            own = (
-                "no span without contact is given on the video's clock (sensor.free_s, or pulse.free_s where "
-                f"clocks are found by correlation): {'by its quietest frames, ' * self._scene.living}{own}"
-            )
+            given = "(sensor.free_s, or pulse.free_s where clocks are found by correlation)"
+            own = f"{'by its quietest frames, ' * self._scene.living}{own}"
+            own = f"no span without contact is given on the video's clock {given}: {own}"
         return [describe(self._weights, self._scene), own]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
@@ -152,11 +148,10 @@ class Physics:
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         known, view = basis.known, self._view
         step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
-        at = np.rint(known.nodes / step).astype(int)
-        lattice = np.zeros((2 * at.max() + 1,) * 2)
-        lattice[at[:, 1] + at.max(), at[:, 0] + at.max()] = (
-            np.linalg.norm(found.load, axis=1) / known.node_area
-        )
+        column, row = np.rint(known.nodes / step).astype(int).T
+        most = max(column.max(), row.max())
+        lattice = np.zeros((2 * most + 1,) * 2)
+        lattice[row + most, column + most] = np.linalg.norm(found.load, axis=1) / known.node_area
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
@@ -214,10 +209,8 @@ def weigh_tissues(
         return TISSUES.temper * sum(posterior.infer(basis, one, own_mm).evidence for one in strongest)
 
     tissues = list(candidate_tissues(scene))
-    score = [
-        evidence(one) + np.log(prior)
-        for one, prior in zip(tissues, _prior(tissues, scene.membrane), strict=True)
-    ]
+    prior = _prior(tissues, scene.membrane)
+    score = [evidence(one) + np.log(share) for one, share in zip(tissues, prior, strict=True)]
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
@@ -262,10 +255,8 @@ def _places() -> Floats:
 
 
 def observe(moved: Field, spread: Field, mask: Field) -> Observation:
-    """Samples displacement and its deviation, (C, N, N) mm on `GRID`, at the compliance's points.
-
-    `mask`: (N, N) of the tissue; outside it the deviation is infinite.
-    """
+    """Samples displacement and its deviation, (C, N, N) mm on `GRID`, at the compliance's points; outside the
+    tissue's mask (N, N) the deviation is infinite."""
     at = _places()
     inside = map_coordinates(mask, at, order=1, mode="constant") > 0.5
     values = [

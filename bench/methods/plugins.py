@@ -65,10 +65,7 @@ class Plugged:
 
 
 def installed() -> dict[str, Method]:
-    """New methods of installed packages, by name.
-
-    Raises UserError if one can't be loaded or called.
-    """
+    """New methods of installed packages, by name. UserError if one can't be loaded or called."""
     methods: dict[str, Method] = {}
     for name in METHODS.names():
         method, label = METHODS.load(name), METHODS.label(name)

@@ -4,9 +4,8 @@
 
 d: displacement at P points, C: the compliance. Loads f are smooth loads spread over the opening, plus one
 contact of unknown position and width. N a is the tissue's own motion: the six monomials up to degree 2 per
-component, with given prior standard deviations. e has the flow's stated deviations, enlarged because its
-errors are correlated, and a model error in proportion to the local displacement, since the compliance is that
-of a generic shape, not of the tissue's own.
+component. e has the flow's stated deviations, enlarged because its errors are correlated, and a model error
+in proportion to the local displacement, since the compliance is that of a generic shape.
 
 Everything is Gaussian except position, width and prior standard deviations of the loads, which are
 marginalised over a grid by each frame's likelihood (Bishop, Pattern Recognition and Machine Learning, 2006,
@@ -117,14 +116,11 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     motion = smooth @ (vectors[:, :rank] / size)
     loads = np.tensordot(root, vectors.reshape(count, 3, -1), (1, 0)).reshape(3 * count, -1)
     total = loads.reshape(count, 3, -1).sum(axis=0)
-    shares = []
     within = np.hypot(*known.nodes.T) <= MODEL.reach_mm
-    for radius in MODEL.radii_mm:
-        share = np.clip(1 - apart / radius**2, 0, None) ** 2 * known.node_area[:, None]
-        shares.append((share / share.sum(axis=0))[:, within])
-    shares_of = np.concatenate(shares, axis=1)
+    spread = [np.clip(1 - apart / r**2, 0, None) ** 2 * known.node_area[:, None] for r in MODEL.radii_mm]
+    shares = np.concatenate([(one / one.sum(axis=0))[:, within] for one in spread], axis=1)
     by_load = (motion.T @ known.matrix).reshape(rank, count, 3)
-    contacts = np.einsum("rka,kh->rha", by_load, shares_of, optimize=True)
+    contacts = np.einsum("rka,kh->rha", by_load, shares, optimize=True)
     near = np.square(known.points[:, None] - known.points[None]).sum(axis=-1)
     near = np.exp(-near / (2 * MODEL.around_mm**2))
     own = np.kron(np.eye(components), polynomials(known.points))
@@ -135,7 +131,7 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
         np.square(total[:, rank:]).sum(axis=1),
         contacts.astype(np.float32),
         loads[:, :rank] / size,
-        shares_of,
+        shares,
         near / near.sum(axis=1, keepdims=True),
         known,
     )
@@ -148,10 +144,8 @@ def polynomials(points: Floats) -> Floats:
 
 
 def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
-    """Size of the tissue's own motion, (C,) mm, from the polynomials' coefficients in frames without contact.
-
-    The contribution of flow's errors is subtracted (a moment estimate); without frames it is 0.
-    """
+    """Size of the tissue's own motion, (C,) mm: a moment estimate from the polynomials' coefficients in
+    frames without contact, 0 without frames."""
     components = len(basis.motion) // len(basis.known.points)
     found = np.zeros(components)
     terms = polynomials(basis.known.points)
@@ -169,10 +163,7 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
 
 
 def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
-    """The posterior of a frame's loads.
-
-    `own_mm`: (C,) size of the tissue's own motion.
-    """
+    """The posterior of a frame's loads, with the tissue's own motion of size (C,) mm."""
     rank, count = len(basis.size), basis.contacts.shape[1]
     sizes = np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))
     levels, score = _weigh(basis, frame, own_mm, sizes)
@@ -207,11 +198,8 @@ def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
 def _weigh(
     basis: LoadBasis, frame: Observation, own_mm: Floats, sizes: Floats
 ) -> tuple[list[_Level], Floats]:
-    """The smooth loads of each size, and the log evidence of every hypothesis, (L (S H + 1),).
-
-    Evidence is ordered by size of the smooth loads; within one by size of the contact (`sizes`, (S, 3)) and
-    its position, and last the hypothesis without a contact.
-    """
+    """The smooth loads of each size, and the log evidence of every hypothesis, (L (S H + 1),): by size of the
+    smooth loads, of the contact (`sizes`, (S, 3)) and its position, last the one without a contact."""
     rank = len(basis.size)
     moved = frame.moved.ravel()
     # Over neighbours: a point's own square would reduce the weight of points that err upwards.

@@ -63,9 +63,8 @@ class ForceEstimate:
 def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) -> list[ForceEstimate]:
     """Extends the intervals of a video's small forces, below a share of its largest one, to 0 and that share.
 
-    Tissue creeps: after a press it still moves without a force; and a slight touch moves it less than flow
-    resolves. The share, a twentieth, is set by hand; docs/results/learn/foreign has the coverage on videos of
-    other simulators and renderers.
+    After a press tissue creeps without a force, and a slight touch moves it less than flow resolves. The
+    share is set by hand; docs/results/learn/foreign has the coverage on videos of other simulators.
     """
     least = share * max((one.size_mn for one in estimates), default=0.0)
     return [

@@ -13,12 +13,10 @@ _SLOW_VIDEO_S = 1.0
 
 
 def find_other_unit(frame_s: Floats, force_s: Floats) -> str:
-    """Describes which of two clocks seems not to be in seconds; empty if neither does or it can't be decided.
+    """Which clock, of frames (T,) or sensor (N,), seems not to be in seconds, in words; empty if none does.
 
     A sensor may run for hours next to a short video. So the longer record must be far longer, and sampled
     more slowly than such devices are: a fast sensor in milliseconds looks as if sampled about once a second.
-
-    `frame_s`: (T,) times of the frames [s]; `force_s`: (N,) times of the sensor [s].
     """
     if min(len(frame_s), len(force_s)) < 2 or min(np.ptp(frame_s), np.ptp(force_s)) <= 0:
         return ""
@@ -31,8 +29,6 @@ def find_other_unit(frame_s: Floats, force_s: Floats) -> str:
         if longer >= _TIMES_AS_LONG and step >= slow:
             unit = min((abs(np.log(longer * size)), unit) for unit, size in _UNITS.items())[1]
             other = "video" if name == "force" else "force"
-            return (
-                f"the {name}'s times span {longer:.3g} times those of the {other}, {step:.3g} s apart: "
-                f"they look like {unit}, not seconds"
-            )
+            span = f"the {name}'s times span {longer:.3g} times those of the {other}"
+            return f"{span}, {step:.3g} s apart: they look like {unit}, not seconds"
     return ""

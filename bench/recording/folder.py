@@ -82,10 +82,7 @@ class Recording:
         return _numbers(self.footage)
 
     def frames(self) -> Iterator[Picture]:
-        """Upright frames in order, with times: from frames.csv if it exists, else the video, else `fps`.
-
-        Raises UserError for an unreadable video or picture.
-        """
+        """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""
         first, fps = next(iter(self.numbers()), 0), self.meta.fps
         for picture in _pictures(self.footage):
             time_s = picture.time_s
@@ -140,8 +137,8 @@ def _numbers(files: Video) -> Collection[int]:
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
     """Reads everything but the pictures. Times since 1970 are counted from the recording's start.
 
-    `phantom`: whether it shows a phantom, whatever meta.yaml states. Raises UserError for no folder, a bad
-    meta.yaml, neither or both of video and frames, or an unusable CSV.
+    `phantom`: whether it shows one, whatever meta.yaml states. UserError for no folder, a bad meta.yaml,
+    neither or both of video and frames, or an unusable CSV.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: no recording folder; `bench import` converts other systems' files")
@@ -168,18 +165,10 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     right, depths = _find_stereo(folder, about)
     right_frame = file_numbers.match_numbers(_numbers(right), frames, "right", notes)
     depth_frame = file_numbers.match_numbers(depths, frames, "depth/", notes)
+    by_frame = {depth_frame[number]: path for number, path in depths.items()}
+    none = MaskFiles({}, None)
     found = Recording(
-        folder,
-        about,
-        footage,
-        times,
-        force,
-        MaskFiles({}, None),
-        tissue,
-        tuple(notes),
-        right=right,
-        right_frame=right_frame,
-        depths={depth_frame[number]: path for number, path in depths.items()},
+        folder, about, footage, times, force, none, tissue, tuple(notes), None, right, right_frame, by_frame
     )
     return found.within(MaskFiles.find(folder / "masks", folder), None)
 
@@ -262,15 +251,12 @@ def _frame_times(path: Path, frames: Collection[int], notes: list[str]) -> dict[
 
 
 def _rising(time: Floats) -> Mask:
-    """Rows (N,) to keep so that times rise: those later than all before, or earlier than all after.
-
-    Whichever keeps more rows: a single wrong time must not exclude all that follow.
-    """
+    """Rows (N,) later than all before, or earlier than all after, whichever are more: times that rise, and a
+    single wrong one excludes no other."""
     if len(time) == 0:
         return np.zeros(0, bool)
     forward = np.append(True, time[1:] > np.maximum.accumulate(time)[:-1])
-    reverse = time[::-1]
-    backward = np.append(True, reverse[1:] < np.minimum.accumulate(reverse)[:-1])[::-1]
+    backward = np.append(time[:-1] < np.minimum.accumulate(time[::-1])[-2::-1], True)
     return np.asarray(forward if forward.sum() >= backward.sum() else backward, bool)
 
 

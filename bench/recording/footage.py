@@ -61,8 +61,8 @@ def _depth(recording: Recording, unit_mm: float, frame: FrameMotion, size: Size)
             found = np.load(path, allow_pickle=False)
     else:
         found = checked_file.read_picture(path, cv2.IMREAD_UNCHANGED)
-    if found.ndim == 3 and found.shape[2] == 3 and found.dtype.kind == "f":
+    if found.shape[2:] == (3,) and found.dtype.kind == "f":
         found = found[..., 2]
-    if found.ndim != 2 or found.shape != size or found.dtype.kind not in "uif":
+    if found.shape != size or found.dtype.kind not in "uif":
         raise UserError(f"{path}: {found.shape} {found.dtype}, but the video is {size}")
     return np.asarray(found.astype(np.float32) * np.float32(unit_mm), np.float32)

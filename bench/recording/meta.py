@@ -35,9 +35,7 @@ def _must_not_fall(span: tuple[float, float]) -> tuple[float, float]:
     return span
 
 
-Span = Annotated[tuple[FiniteFloat, FiniteFloat], AfterValidator(_must_run_forward)]
-
-
+Span = Annotated[Point, AfterValidator(_must_run_forward)]
 LEAST_INTERVALS, LEAST_TURNING = 20, 20
 """Least frame intervals in `sync.calibration_s` to align the clocks, least frames in `sensor.turn_s`."""
 
@@ -225,10 +223,7 @@ def commented() -> str:
 
 
 def read_meta(path: Path) -> Meta:
-    """The recording's `meta.yaml`.
-
-    Raises UserError: no such file, not YAML, or wrong fields, one line each.
-    """
+    """The recording's `meta.yaml`. UserError: no such file, not YAML, or wrong fields, one line each."""
     if not os.path.lexists(path):
         raise UserError(f"{path}: missing; a recording needs at least scale_mm_per_px in it")
     text = checked_file.read_text(path, checked_file.LARGEST_YAML)

@@ -34,10 +34,8 @@ class PixelScale:
 
 
 def find_scale(meta: Meta, folder: Path) -> PixelScale:
-    """The recording's scale, stated or calibrated by `meta.yaml`.
-
-    Raises UserError for no checkerboard found, points that coincide, or, for an unknown scale, no picture.
-    """
+    """The recording's scale, stated or calibrated by `meta.yaml`. UserError for no checkerboard found, points
+    that coincide, or, for an unknown scale, no picture."""
     if meta.scale_mm_per_px == "unknown":
         wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
         source = f"unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
@@ -71,10 +69,7 @@ def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float
 
 
 def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> PixelScale:
-    """Scale by the mean length of the squares' sides, with their spread as its error.
-
-    On a flat board perpendicular to the optical axis all sides are equal; tilt and distortion add spread.
-    """
+    """Scale by the mean length of the squares' sides; their spread, by tilt and distortion, is its error."""
     columns, rows = corners
     grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
     found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
@@ -82,8 +77,7 @@ def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> Pix
         raise UserError(f"{path}: no checkerboard of {columns} x {rows} inner corners found")
     grid = np.asarray(points, np.float64).reshape(rows, columns, 2)
     sides = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)]
-    lengths = np.concatenate(sides)
-    middle = float(lengths.mean())
+    middle = float((lengths := np.concatenate(sides)).mean())
     # Under tilt sides along rows and columns differ: half that difference is a systematic error.
     tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
     error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle

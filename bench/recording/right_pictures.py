@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -97,27 +98,32 @@ class RightPictures:
         if self._last is None:
             return 0.0
         *pair, tissue = self._last
-        left, right = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
-        try:
-            return rest.match(left, right, rectified.flags(tissue, 0), np.ones_like(tissue)).epipolar_px
-        except UserError:  # too little in common
-            return 0.0
+        found = _match(rectified, pair, rectified.flags(tissue, 0), np.ones_like(tissue), refine=True)
+        return 0.0 if found is None else found.epipolar_px
 
     def _tool_behind_px(self, rectified: Rectified) -> float:
         if self._tool is None:
             return 0.0
         tool, *pair = self._tool
-        left, right = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
         everywhere = np.ones(tool.shape, bool)
-        try:
-            found = rest.match(left, right, everywhere, everywhere, refine=False)
-        except UserError:  # too little in common
+        found = _match(rectified, pair, everywhere, everywhere, refine=False)
+        if found is None:
             return 0.0
         inner = found.found & rectified.flags(cv2.erode(tool.astype(np.uint8), np.ones((3, 3))) > 0, 0)
         around = found.found & ~rectified.flags(tool, 0) & (cv2.dilate(inner.astype(np.uint8), _NEAR) > 0)
         if min(inner.sum(), around.sum()) < _LEAST_TOOL / 2:
             return 0.0
         return float(np.median(found.disparity[around]) - np.median(found.disparity[inner]))
+
+
+def _match(
+    rectified: Rectified, pair: list[Pixels], left: Mask, right: Mask, *, refine: bool
+) -> rest.Rest | None:
+    """`rest.match` of two pictures; None: too little in common."""
+    one, other = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
+    with suppress(UserError):
+        return rest.match(one, other, left, right, refine=refine)
+    return None
 
 
 def _sharpness(rgb: Pixels) -> float:

@@ -1,7 +1,6 @@
 """Lag of the right camera's pictures behind the left ones, from when the rows of both change.
 
-What moves, be it tissue or an instrument, stays in its rows of rectified pictures, whatever its depth. So the
-change of each row from picture to picture is compared with that of the left camera at other times.
+What moves stays in its rows of rectified pictures, whatever its depth.
 """
 
 from __future__ import annotations
@@ -30,9 +29,7 @@ class StereoTiming:
 
     def add(self, left: Pixels, right: Pixels, time_s: float) -> None:
         """Adds the next frame's pictures (H, W, 3)."""
-        greys = (
-            self._rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate((left, right))
-        )
+        greys = [self._rectified.picture(rgb @ image.GREY, k) for k, rgb in enumerate((left, right))]
         now = [cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX) for grey in greys]
         pairs = zip(now, self._last or now, strict=True)
         self._changes.append(np.array([np.abs(one - last).mean(axis=1) for one, last in pairs]))
@@ -49,10 +46,8 @@ class StereoTiming:
 
 
 def find_lag(left: Floats, right: Floats) -> tuple[float, int]:
-    """Lag of the right camera in frames (negative: early) and its first frame; 0.0: none, or unknown.
-
-    `left`, `right`: (T, H) change of each row since the picture before.
-    """
+    """Lag of the right camera in frames (negative: early) and its first frame, from the change of each row
+    since the picture before (T, H); 0.0: none, or unknown."""
     frames = np.arange(len(left))
     if len(frames) < 2 * _LEAST_FRAMES:
         return 0.0, 0

@@ -53,9 +53,8 @@ def write_storage(path: Path, matrices: Mapping[str, Floats]) -> None:
 def write_second(folder: Path, frames: Iterable[int], pictures: Iterable[Array]) -> None:
     """Writes right or depth pictures as FOLDER/NNNNNN.png by frame number, without those of no frame (-1).
 
-    `folder`: `right` or `depth` of the recording, which is created; `frames`: (M,); `pictures`: M of uint8
-    (H, W, 3), or of depth (H, W): uint16, or float32 as .npy. An odd last row or column is left out, as in
-    the video.
+    `folder`: is created; `frames`: (M,); `pictures`: M of uint8 (H, W, 3), or of depth (H, W): uint16, or
+    float32 as .npy. An odd last row or column is left out, as in the video.
     """
     folder.mkdir()
     for frame, picture in zip(frames, pictures, strict=True):

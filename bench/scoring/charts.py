@@ -27,9 +27,8 @@ _WIDE, _HALF, _HIGH = 1150, 560, 300  # points
 def draw_force(result: Result, others: bool = False) -> str:
     """Force over time: the sensor, the main method with its uncertainty, and thinner the `others`.
 
-    Lost frames are shaded gaps. Without a known E all curves are scaled to comparable heights. The axis
-    covers the sensor, networks and the dotted lengths of flow; other curves may exceed it. Without the others
-    it covers the main method's interval, up to twice its largest force.
+    Lost frames are shaded gaps. The axis covers the sensor, networks and the dotted lengths of flow; without
+    the others the main method's interval, up to twice its largest force.
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
@@ -68,12 +67,8 @@ def draw_force(result: Result, others: bool = False) -> str:
 
 
 def scale_curves(result: Result) -> tuple[Floats | None, dict[str, Floats], str]:
-    """Magnitudes of the sensor's and each method's force, (T,) each, and the axis label.
-
-    Without a known E forces are scaled: by the gain of a separate press, if there is one; else the sensor by
-    its largest value and each method by its best-fitting gain to the sensor; without a sensor each method by
-    its own largest value.
-    """
+    """Magnitudes (T,) of the sensor's and each method's force, and the axis label; without E by the gain of a
+    separate press, else by each method's best-fitting gain to the sensor, else over each one's largest."""
     sizes = {name: method.size_mn for name, method in result.methods.items()}
     if result.absolute:
         return result.sensor_mn, sizes, "force [mN]"
@@ -128,7 +123,7 @@ def draw_scatter(result: Result) -> str:
 
 
 def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
-    """Difference against mean, with bias and limits of agreement; `limits`: bias_mn, low_mn, high_mn."""
+    """Difference against mean, with the `limits` of agreement."""
     x, y = _scored_pairs(result)
 
     def draw(axes: Axes) -> None:

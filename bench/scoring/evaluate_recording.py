@@ -1,8 +1,4 @@
-"""Scoring of methods on a recording.
-
-The video is tracked and each method estimates the force of every frame; the sensor is aligned with the video
-and interpolated at the frames; all is checked; each method's curve is scored in the selected frames.
-"""
+"""Scoring of methods on a recording: tracking, alignment of the sensor, checks, scores of selected frames."""
 
 from __future__ import annotations
 
@@ -48,8 +44,7 @@ def evaluate_recording(
     """Tracks the recording and scores every method against its sensor.
 
     `methods`: by name, in the table's order, with `main`, which the report is about; `described`: their
-    properties. `progress`, `flow`: as of `track_recording`, whose UserError it raises, and that of
-    `force_sensor.process_force`.
+    properties. `progress`, `flow`, UserError: as of `track_recording`; UserError also of `process_force`.
     """
     # The lengths of flow are the least that a method should exceed.
     methods = {main: methods[main], **flow_sizes(), **methods}
@@ -136,8 +131,8 @@ def _score_methods(
 ) -> dict[str, Scored]:
     """Scores of each method by name, the main one first.
 
-    `against`: the result without methods; `press`: (T,) frames of the calibrating press, if there is one;
-    `in_camera_axes`: whether components of the sensor's force can be compared.
+    `against`: the result without methods; `press`: (T,) frames of the calibrating press; `in_camera_axes`: as
+    of `AlignedSensor`.
     """
     scored: dict[str, Scored] = {}
     for name, method in methods.items():
@@ -153,19 +148,13 @@ def _score_methods(
 
 
 def _fit_gain(size: Floats, first: Scored | None, against: Result, press: Mask | None) -> Gain:
-    """The gain from a length of flow, (T,) mm, to force.
-
-    Fitted on the press if there is one. Else in hindsight on the scored frames, which favours the baseline:
-    a method with a larger error may lack only a gain. Without a sensor it is fitted to the main method.
-    """
+    """The gain from a length of flow, (T,) mm, to force, as of `Gain.source`."""
     sensor = against.sensor_mn
     if sensor is None:
         target = size if first is None else first.size_mn
         return Gain(metrics.gain(target, size, np.ones(len(size), bool)), against.main)
-    if press is not None:
-        pressed = metrics.gain(sensor, size, press)
-        if math.isfinite(pressed):
-            return Gain(pressed, "press")
+    if press is not None and math.isfinite(pressed := metrics.gain(sensor, size, press)):
+        return Gain(pressed, "press")
     return Gain(metrics.gain(sensor, size, against.scored), "hindsight")
 
 

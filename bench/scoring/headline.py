@@ -38,11 +38,8 @@ class Headline:
 
 
 def headline(result: Result) -> Headline:
-    """The main method's most important scores for this recording.
-
-    First, scores after scaling by the gain found on `press_s`. Then those in newtons; if E is unknown, the
-    scale-invariant ones instead. There are none if too many frames were lost.
-    """
+    """The main method's most important scores for this recording: first after the gain found on `press_s`,
+    then those in newtons, or without E the scale-invariant ones. None if too many frames were lost."""
     doubts = tuple(one.message for one in result.findings if one.severity == "warning")
     if result.refused:
         return Headline(result.refused, (), doubts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,28 +45,22 @@ METRICS = {
 
 # Scores that are defined without a known stiffness.
 RELATIVE = tuple(key for key, metric in METRICS.items() if metric.relative)
-# Fields of `learn.evaluation.metrics.Agreement` and their keys here.
+# Names of `learn.evaluation.metrics.agreements` and their keys here.
 _AGREEMENT = {"mae": "mae_mn", "rmse": "rmse_mn", "bias": "bias_mn", "r": "r", "ccc": "ccc", "r2": "r2"}
 
 
 def agreement(sensor: Floats, predicted: Floats) -> dict[str, float]:
-    """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2 and gain over samples where both are finite.
-
-    `sensor`: (T,) mN; `predicted`: (T,) mN.
-    """
+    """Scores n, mae_mn, rmse_mn, bias_mn, r, ccc, r2, gain over samples (T,) mN where both are finite."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[both], predicted[both]
-    found = asdict(metrics.agreement(metrics.moments(x, y)))
+    found = metrics.agreement(metrics.moments(x, y))
     scores = {key: found[name] for name, key in _AGREEMENT.items()}
     return {"n": float(len(x)), **scores, "gain": metrics.line(x, y)[0]}
 
 
 def agreement_intervals(sensor: Floats, predicted: Floats, rng: np.random.Generator) -> dict[str, Interval]:
-    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2 by a block bootstrap of the samples.
-
-    The block length is the largest of those of the sensor, the prediction and their difference. Arguments as
-    in `agreement`; empty for fewer than eight samples.
-    """
+    """Intervals of mae_mn, rmse_mn, bias_mn, r, ccc and r2 by a block bootstrap of the samples, with the
+    largest block length of sensor, prediction and difference; empty for fewer than eight samples."""
     good = np.isfinite(sensor) & np.isfinite(predicted)
     x, y = sensor[good], predicted[good]
     if len(x) < bootstrap.LEAST_SAMPLES:
@@ -97,10 +90,8 @@ def gain(sensor: Floats, predicted: Floats, where: Mask) -> float:
 def lag(time_s: Floats, sensor: Floats, predicted: Floats) -> dict[str, float]:
     """The lag of `predicted` behind `sensor`, lag_s [s], and the correlation with it removed, r_at_lag.
 
-    It is only reported: scores are at lag 0. It is found on a uniform grid with a step of a quarter of the
-    median frame time, within half a second in both directions.
-
-    `time_s`: (T,) rising [s]; `sensor`: (T,) mN; `predicted`: (T,) mN.
+    Scores are at lag 0. It is found in steps of a quarter of the median frame time, within half a second in
+    both directions. `time_s`: (T,) rising [s]; others (T,) mN.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
@@ -152,11 +143,8 @@ def events(time_s: Floats, contact: Mask, shortest_s: float = 0.15) -> list[slic
 def per_event(
     time_s: Floats, sensor: Floats, predicted: Floats, spans: list[slice]
 ) -> list[dict[str, float]]:
-    """A row per contact: peaks [mN], impulses [mN s] (trapezoidal) and their errors.
-
-    Times, peak and impulse are those of the sensor. Errors are over the samples with a prediction, and NaN
-    for fewer than two.
-    """
+    """A row per contact: times, peak [mN] and impulse [mN s] (trapezoidal) of the sensor, and the errors over
+    the samples with a prediction, NaN for fewer than two."""
     rows = []
     for part in spans:
         known = np.isfinite(sensor[part])
@@ -177,11 +165,7 @@ def per_event(
 
 
 def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> dict[str, float]:
-    """Scores of contact detection.
-
-    contact_f1; false_positive_rate: share of contact-free samples where contact is predicted; background_mn:
-    mean predicted force in contact-free samples.
-    """
+    """Scores of contact detection, as `METRICS` describes them."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
     truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
     free, background = ~truth, np.abs(predicted[both][~truth])
@@ -201,9 +185,8 @@ def compute_all(
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """All scores of a predicted curve against a sensor's, and the table of its contacts.
 
-    `time_s`: (T,) rising [s]; `sensor`, `predicted`: (T,) mN, NaN where unknown; `noise_floor_mn`: standard
-    deviation of the sensor without contact; `used`: (T,) samples that are scored; None: all. A contact ends
-    at samples that are not.
+    `time_s`: (T,) rising [s]; `sensor`, `predicted`: (T,) mN, NaN where unknown; `noise_floor_mn`: of the
+    sensor without contact; `used`: (T,) samples that are scored; None: all. A contact ends at others.
     """
     used = np.ones(len(time_s), bool) if used is None else used
     sensor, predicted = np.where(used, sensor, np.nan), np.where(used, predicted, np.nan)
@@ -240,13 +223,11 @@ def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
 
 
 def limits_of_agreement(difference: Floats, group: NDArray[np.integer]) -> dict[str, float]:
-    """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, for samples in groups of correlated error.
+    """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, of differences (T,) mN, NaN left out, in
+    groups (T,) of correlated error: contacts, and spans between them.
 
     Bland and Altman, "Agreement between methods of measurement with multiple observations per individual" (J.
     Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
-
-    `difference`: (T,) predicted minus sensor [mN]; NaN are left out; `group`: (T,) index of the contact, or
-    span between contacts, of each sample.
     """
     good = np.isfinite(difference)
     d, names = difference[good], np.unique(group[good], return_inverse=True)[1]

@@ -1,8 +1,4 @@
-"""Pooled scores of several recordings: means over recordings, intervals over specimens.
-
-Networks are identified by their weights' hash: networks with one name and different weights are different
-methods, and networks with the same weights are one method, whatever their names.
-"""
+"""Pooled scores of several recordings: means over recordings, intervals over specimens."""
 
 from __future__ import annotations
 
@@ -40,10 +36,8 @@ _CALIBRATED = {
 
 
 def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
-    """The score.json of each path (a file, or a folder of `bench score`), in their order.
-
-    Raises UserError for no path, a file of another kind, a recording twice, or main methods that differ.
-    """
+    """The score.json of each path (a file, or a folder of `bench score`). UserError for no path, a file of
+    another kind, a recording twice, or main methods that differ."""
     found = []
     for path in paths:
         try:
@@ -70,10 +64,7 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def pool(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Means over recordings with 95% intervals over specimens, for methods that all recordings have.
-
-    Recordings that were not scored (no sensor, clocks not aligned, too many lost frames) are left out.
-    """
+    """Means over the scored recordings, with 95% intervals over specimens, for methods that all have."""
     every, found = found, [tree for tree in found if not _fault(tree)]
     specimens = [tree["settings"]["meta"].get("specimen") or tree["recording"] for tree in found]
     main = found[0]["main"]
@@ -126,8 +117,7 @@ def _fault(tree: dict[str, Any]) -> str:
     lost = tree.get("lost") or {}
     if (lost.get("share") or 0.0) > lost.get("most", MOST_LOST):
         return f"{100 * lost['share']:.0f}% of its frames were lost"
-    refused = (tree.get("sync") or {}).get("refused")
-    if refused:
+    if refused := (tree.get("sync") or {}).get("refused"):
         return f"clocks not aligned: {refused}"
     return "" if tree["scores"] else "no sensor"
 

@@ -128,10 +128,8 @@ def shown(value: float | None, unit: str = "") -> str:
 
 
 def pictures(result: Result) -> tuple[list[dict[str, str | None]], float, float]:
-    """The selected frames, and the flow [px of the panel] and density [kPa] at full colour.
-
-    Of each frame the caption and, as data URIs, the picture, flow, force map and motion in depth.
-    """
+    """The selected frames, with pictures as data URIs, and flow [px of the panel] and density [kPa] at full
+    colour."""
     chosen = select_frames(result)
     done = result.tracked
     if not chosen or done.rest is None or done.tissue is None:

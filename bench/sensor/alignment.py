@@ -39,11 +39,10 @@ class AlignedSensor:
 def align_sensor(
     recording: Recording, time_s: Floats, speed: Floats, surface: SurfaceMotion | None
 ) -> AlignedSensor:
-    """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames.
+    """Finds the clocks' offset and the sensor's rotation, and interpolates the sensor at the frames (T,) [s].
 
-    `time_s`: (T,) times of the frames [s]; `speed`: (T,) mean speed of the tissue since the frame before
-    [mm/s], NaN where unknown; `surface`: the tissue's motion over `sensor.turn_s`, None without that span.
-    Raises UserError as `force_sensor.process_force`.
+    `speed`: (T,) mean speed of the tissue since the frame before [mm/s], NaN where unknown; `surface`: its
+    motion over `sensor.turn_s`, None without that span. UserError as `force_sensor.process_force`.
     """
     force, sensor = recording.force, recording.meta.sensor
     if force is None:
@@ -68,9 +67,8 @@ def align_sensor(
     refused = list[Finding]()
     if found is not None and found.refused:
         scored = f"scored with the stated offset of {offset_s:g} s"
-        refused = [
-            Finding("warning", "clocks", f"the clocks could not be aligned ({found.refused}): {scored}")
-        ]
+        why = f"the clocks could not be aligned ({found.refused}): {scored}"
+        refused = [Finding("warning", "clocks", why)]
     about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
     return AlignedSensor(axes if covered else None, *about, tuple(refused))
 
@@ -90,9 +88,8 @@ def _find_offset(
         return sync.offset_s, None
     inside = (time_s >= sync.calibration_s[0]) & (time_s <= sync.calibration_s[1])
     smooth = force_sensor.process_force(force, sensor, 0.0)
-    found = clock_sync.find_offset(
-        time_s[inside], speed[inside], smooth.time_s, smooth.force_mn, sync.search_s
-    )
+    samples = smooth.time_s, smooth.force_mn
+    found = clock_sync.find_offset(time_s[inside], speed[inside], *samples, sync.search_s)
     return sync.offset_s if found.refused else found.offset_s, found
 
 

@@ -1,8 +1,7 @@
 """Synchronisation of the sensor's clock with the video's: tissue moves when force changes.
 
-The change of the sensor's force in each frame interval is correlated with the tissue's motion in it, over the
-calibration span and for every candidate offset. The offset is fixed before anything is scored, and refused if
-the recording does not determine it.
+The change of force in each frame interval of the calibration span is correlated with the tissue's motion in
+it, for every candidate offset.
 """
 
 from __future__ import annotations
@@ -40,9 +39,8 @@ def find_offset(
     """The offset with the highest correlation between changes of force and motion.
 
     `frame_s`: (T,) times of the frames in the calibration span [s]; `speed`: (T,) mean speed of the tissue
-    over the interval that ends at each frame [mm/s], NaN are left out; `sensor_s`: (N,) the sensor's own
-    times [s]; `force_mn`: (N, 3) [mN], NaN rows are left out; `search_s`: largest offset that is tried, in
-    both directions [s].
+    over the interval that ends at each frame [mm/s]; `sensor_s`: (N,) the sensor's own times [s]; `force_mn`:
+    (N, 3) [mN]; NaN are left out; `search_s`: largest offset that is tried, in both directions [s].
 
     It is refused if there are too few intervals, the correlation is weak, its peak is at the end of the
     search, or fewer than 95% of block-bootstrap resamples have their peak within a frame of it.
@@ -50,24 +48,20 @@ def find_offset(
     good = np.isfinite(force_mn).all(axis=1)
     t, force = sensor_s[good], force_mn[good]
     widths = np.diff(frame_s)
+    few = f"frame intervals in the calibration span, {LEAST_INTERVALS} needed"
     if len(widths) < LEAST_INTERVALS:
-        return Offset(
-            refused=f"only {len(widths)} frame intervals in the calibration span, {LEAST_INTERVALS} needed"
-        )
+        return Offset(refused=f"only {len(widths)} {few}")
     frame = float(np.median(widths))
     step = frame / _STEPS_PER_FRAME
     offsets = np.arange(-round(search_s / step), round(search_s / step) + 1) * step
     change = np.stack([_change(frame_s - offset, t, force) / widths for offset in offsets])
     moved = speed[1:]
     usable = np.isfinite(change).all(axis=0) & np.isfinite(moved)
-    followed = int(np.isfinite(moved).sum())
-    if followed < LEAST_INTERVALS:
-        lacking = f"only {followed} of {len(widths)} frame intervals in the calibration span could be tracked"
-        return Offset(refused=f"{lacking}, {LEAST_INTERVALS} needed")
+    if (followed := int(np.isfinite(moved).sum())) < LEAST_INTERVALS:
+        return Offset(refused=f"only {followed} tracked of {len(widths)} {few}")
     if usable.sum() < LEAST_INTERVALS:
-        return Offset(
-            refused="the sensor doesn't cover the calibration span with the search's margin on both sides"
-        )
+        covered = "doesn't cover the calibration span with the search's margin on both sides"
+        return Offset(refused=f"the sensor {covered}")
     change, moved = change[:, usable], moved[usable]
     r = _correlations(np.ones((1, len(moved))), change, moved)[0]
     if not np.isfinite(r).any():
@@ -77,8 +71,6 @@ def find_offset(
     weights = bootstrap.counts(len(moved), bootstrap.block_length(moved), _RESAMPLES, rng)
     again = offsets[np.nanargmax(np.nan_to_num(_correlations(weights, change, moved), nan=-1.0), axis=1)]
     there = np.abs(again - offsets[best]) <= frame
-    zero = float(r[len(offsets) // 2])
-    deviation = float(again.std())
     refused = ""
     if best in (0, len(offsets) - 1):
         refused = f"the correlation still rises at the end of the search, {search_s:g} s"
@@ -87,7 +79,8 @@ def find_offset(
     elif there.mean() < _SAME_PEAK:
         refused = f"ambiguous: the peak is elsewhere in {100 * (1 - there.mean()):.0f}% of resamples"
     tried = tuple(zip(offsets.tolist(), r.tolist(), strict=True))
-    return Offset(_refined(offsets, r, best), float(r[best]), zero, deviation, refused, tried)
+    at_zero, deviation_s = float(r[len(offsets) // 2]), float(again.std())
+    return Offset(_refined(offsets, r, best), float(r[best]), at_zero, deviation_s, refused, tried)
 
 
 def _change(frame_s: Floats, sensor_s: Floats, force_mn: Floats) -> Floats:

@@ -31,10 +31,9 @@ class Processed:
 
 
 def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processed:
-    """Removes gravity, tare and drift, filters, and shifts the clock, in this order.
+    """Removes gravity, tare and drift, filters, and adds `offset_s` to the clock, in this order.
 
-    `force`: raw samples; `offset_s`: added to the sensor's times [s]. Raises UserError for a
-    contact-free span without samples, or a mass without a unit vector of gravity.
+    UserError for a contact-free span without samples, or a mass without a unit vector of gravity.
     """
     steps: list[str] = []
     values = _weightless(force, sensor, steps)
@@ -125,10 +124,7 @@ def _smooth(time_s: Floats, values: Floats, cut_hz: float | None, steps: list[st
 
 
 def _step(time_s: Floats) -> float:
-    """Sample interval [s]: the median of means over a few dozen samples.
-
-    The means make it correct for stamps in bursts, the median makes it independent of gaps.
-    """
+    """Sample interval [s]: the median, for gaps, of means over dozens of samples, for stamps in bursts."""
     across = min(_ACROSS, max(len(time_s) // 4, 1))
     return float(np.median(time_s[across:] - time_s[:-across])) / across
 

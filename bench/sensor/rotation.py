@@ -46,20 +46,17 @@ def find_rotation(moved: Floats, visible: Floats, force_mn: Floats) -> SensorRot
 
     `moved`: (T, P, 2) motion of P parts of the tissue in the picture (right, down) from rest, any unit;
     `visible`: (T, P) visible share of each part, in 0..1; `force_mn`: (T, 3) in the sensor's axes, tared;
-    frames with NaN are left out.
-
-    It is refused for fewer than `LEAST_TURNING` frames, forces in a plane, less than half of the motion
-    explained, or an angle with a standard deviation above 15°.
+    frames with NaN are left out. It is refused for few frames, forces in a plane, or a poor fit.
     """
     good = np.isfinite(force_mn).all(axis=1)
     if good.sum() < LEAST_TURNING:
         return SensorRotation(refused=f"only {good.sum()} tracked frames with force, {LEAST_TURNING} needed")
     force, shift = force_mn[good], _shift(moved[good], visible[good])
     spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)
-    if spread[2] < _FLAT * spread[0] or not shift.any():
-        return SensorRotation(
-            refused="the force stays in a plane or on a line" if shift.any() else "nothing moves"
-        )
+    if not shift.any():
+        return SensorRotation(refused="nothing moves")
+    if spread[2] < _FLAT * spread[0]:
+        return SensorRotation(refused="the force stays in a plane or on a line")
     every = np.ones(len(force))
     turn, explained, misfit = _fitted(force, shift, every, _STARTS)
     rng = np.random.default_rng(0)  # reproducible
@@ -86,10 +83,8 @@ def _shift(moved: Floats, visible: Floats) -> Floats:
 
 
 def _fitted(force: Floats, shift: Floats, weights: Floats, starts: Rotation) -> tuple[Rotation, float, float]:
-    """The best rotation over all starts, its share of explained variance, and its relative misfit.
-
-    The misfit is that of the unconstrained linear map. Both motion and force may have an offset.
-    """
+    """The best rotation over all starts, its share of explained variance, and its misfit relative to the
+    unconstrained linear map; motion and force may have an offset."""
     part = weights / weights.sum()
     force, shift = force - part @ force, shift - part @ shift
     moment = (force * part[:, None]).T @ force

@@ -1,8 +1,4 @@
-"""`bench live`: a video as a stream, masked and tracked frame by frame, with the latency of each stage.
-
-The clock of the video paces the stream: a frame that arrives while another is processed is dropped, as in the
-operating theatre. Masks, flow and model are those of `bench score`.
-"""
+"""`bench live`: a video as a stream, masked and tracked frame by frame, with the latency of each stage."""
 
 from __future__ import annotations
 
@@ -72,13 +68,10 @@ def stream_video(
 ) -> Stream:
     """Tracks a video as a stream; the first frame is the rest frame.
 
-    `settings`: a stream has no limit on the rate and no search for pulsation. `method`: estimates force from
-    flow; requires the scale. `scale_mm_per_px`: of the original pixels; "unknown": forces are correct up to a
-    factor, for any E. `young_kpa`: of the tissue, if known. `paced`: whether frames that arrive while another
-    is processed are dropped. `report`: called with the result of every frame. `flow`: as of
-    `track_recording`; another process also works while the next frame is masked.
-
-    Raises UserError for an unreadable video, fewer than two frames, or a model without a scale.
+    `settings`: without a limit on the rate and search for pulsation. `scale_mm_per_px`: of the original
+    pixels; "unknown": forces are correct up to a factor, for any E. `paced`: whether frames that arrive while
+    another is processed are dropped. `report`: called with every frame. `flow`: as of `track_recording`.
+    UserError for an unreadable video, fewer than two frames, or a method without a scale.
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model requires --scale (mm per pixel, or unknown): forces depend on it")

@@ -89,13 +89,11 @@ def track_recording(
 ) -> TrackedRecording:
     """Tracks the video and applies every method, with a few frames in memory.
 
-    `methods`: by name; of `pictured` the snapshots show the force map. `scale_mm_per_px`: of the original
-    pixels. `flow`: computes the flow and is closed by the caller; None: in this process. Another process
-    computes it while the methods are applied to the previous frame. `progress`: called after every frame;
-    `each`: with every tracked frame. `only`: numbers of the frames to track, with the rest frame; None: all.
-
-    Raises UserError for an unreadable video, no frame with a time, a rest frame beyond the end, and masks of
-    another size.
+    `scale_mm_per_px`: of the original pixels. `pictured`: the method whose force map the snapshots show.
+    `flow`: computes the flow, in another process while the methods are applied to the previous frame, and is
+    closed by the caller; None: in this process. `progress`: called after every frame; `each`: with every
+    tracked frame. `only`: numbers of the frames to track, with the rest frame; None: all. UserError for an
+    unreadable video, no frame with a time, a rest frame beyond the end, and masks of another size.
     """
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -35,8 +34,7 @@ FIELDS = {
 }
 """Store field of each displacement. `noisy`: true flow with the published noise. `motion`: recovered stereo
 motion in three components; `motion-ideal`: its ground truth."""
-UNKNOWN_YOUNG_KPA = 1.0
-"""E assumed where it is unknown: forces are then right up to a factor."""
+UNKNOWN_YOUNG_KPA = 1.0  # E assumed where it is unknown: forces are then right up to a factor
 _MIXED = {"mixed": ("ideal", "recovered"), "motion-mixed": ("motion-ideal", "motion")}
 _CURE = {
     "ideal": "render it anew",
@@ -102,11 +100,8 @@ def sources(wanted: Input) -> tuple[str, ...]:
 
 
 def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
-    """One store on the grid.
-
-    `wanted`: any of `FIELDS`. Raises UserError if the store lacks one of them or tissue, or if values don't
-    match their seal.
-    """
+    """One store on the grid, with displacements `wanted` of `FIELDS`. UserError if it lacks one of them or
+    tissue, or if values don't match their seal."""
     wanted = tuple(wanted)
     check_readable(sequence, wanted)
     young, scale = (float(sequence.attrs[name]) for name in ("young_kpa", "scale_mm_per_px"))
@@ -114,9 +109,12 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     view = GridView(tissue, scale, grid)
 
     def on_grid(field: str, prepare: Callable[[Any], Any]) -> Map:
-        """Means over the tissue of each frame of a field."""
-        frames = (prepare(values) for values in sequence.read_sealed(field))
+        frames = map(prepare, sequence.read_sealed(field))
         return np.stack([view.mean(frame) * view.mask for frame in frames])
+
+    def displacement(source: str) -> Map:
+        mm = 1.0 if has_depth(source) else scale
+        return on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1) * mm)
 
     confidence, spatial = np.ones((sequence.frames, grid.size, grid.size), np.float32), None
     if "recovered" in wanted and "flow_confidence" in sequence:
@@ -129,12 +127,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     return Clip(
         **_plain(sequence),
         mask=view.mask,
-        displacement={
-            source: on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1))
-            if has_depth(source)
-            else on_grid(FIELDS[source], lambda values: values.transpose(2, 0, 1) * scale)
-            for source in wanted
-        },
+        displacement={source: displacement(source) for source in wanted},
         confidence=confidence,
         density=density,
         force=force,
@@ -187,7 +180,7 @@ def load_clips(
     wanted = tuple(wanted)
     dataset = Dataset(root)
     clips = []
-    code = "" if cache is None else provenance.source("synth", "learn/data")
+    code = provenance.source("synth", "learn/data") if cache else ""
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
         packed = cache and _packed(sequence, grid, wanted, cache, code)
@@ -200,17 +193,14 @@ def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
     key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
-    file = cache / f"{hashlib.blake2b(identity.canonical(key), digest_size=16).hexdigest()}.safetensors"
+    file = cache / f"{identity.digest(key)}.safetensors"
     if not file.is_file():
         pack(read_clip(sequence, grid, wanted), file)
     return replace(unpack(file), **_plain(sequence))
 
 
 def pack(clip: Clip, file: Path) -> None:
-    """Writes a clip as one file of plain arrays (safetensors), atomically. UserError if it can't be written.
-
-    One file per clip: a process may have 65,530 mappings, a dataset has thousands of clips.
-    """
+    """Writes a clip as one file, as a process may have 65,530 mappings. UserError: can't be written."""
     arrays = {name: getattr(clip, name) for name in _ARRAYS if getattr(clip, name) is not None}
     arrays |= {f"displacement-{source}": values for source, values in clip.displacement.items()}
     arrays = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
@@ -238,7 +228,6 @@ def unpack(file: Path) -> Clip:
 
 
 def _checksum(arrays: Mapping[str, Array]) -> int:
-    """Of all values, in order of their names."""
     found = 0
     for name in sorted(arrays):
         found = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, found)
@@ -246,29 +235,20 @@ def _checksum(arrays: Mapping[str, Array]) -> int:
 
 
 def target(clip: Clip, frame: int, components: int) -> Map:
-    """Training target of a frame: force density, or with one component its length.
-
-    Returns (C, N, N) mN/mm² at E = 1 kPa.
-    """
+    """Training target of a frame (C, N, N): force density, or with one component its length."""
     density = np.asarray(clip.density[frame])
     if components == 3:
         return density
-    length: Map = np.sqrt(np.square(density).sum(0, keepdims=True))
-    return length
+    return np.asarray(np.sqrt(np.square(density).sum(0, keepdims=True)))
 
 
 def amount(clip: Clip, components: int, pitch_mm: float) -> Floats:
-    """True total force that a map of C components is compared with, (T, C) [mN at E = 1 kPa].
-
-    A vector map sums to the force on the tissue. In a map of lengths two jaws that pull against each other
-    add up, so it is compared with the sum of lengths, which is the force's size where all of it points one
-    way.
-    """
+    """True total force that a map of C components is compared with, (T, C) [mN at E = 1 kPa]: for lengths
+    their sum, in which two jaws that pull against each other add up."""
     if components == 3:
         return clip.force / clip.young_kpa
     length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
-    total: Floats = length.sum((1, 2))[:, None] * pitch_mm**2
-    return total
+    return np.asarray(length.sum((1, 2))[:, None] * pitch_mm**2)
 
 
 def assumed_young(young_kpa: float | None) -> float:

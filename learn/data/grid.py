@@ -19,11 +19,10 @@ from synth.errors import UserError, as_positive
 from synth.job.types import MembraneState, Positive
 
 CHANNELS = ("dx", "dy", "magnitude", "mask", "divergence")
-SMOOTHING_MM = 0.5
-"""Standard deviation of the Gaussian under the derivative [mm]; physical, so that resolutions agree."""
-HALF_SURE_MM = 0.04
-"""Standard deviation of motion at which its confidence is a half [mm]: the error of depth motion that force
-estimates tolerate."""
+SMOOTHING_MM = (
+    0.5  # standard deviation of the Gaussian under the derivative; in mm, so that resolutions agree
+)
+HALF_SURE_MM = 0.04  # deviation of depth motion that force estimates tolerate; its confidence is a half
 
 
 @dataclass(frozen=True)
@@ -68,18 +67,14 @@ def check_scale(scale_mm_per_px: float) -> float:
 class GridView:
     """The grid on the pictures of one video: its tissue, and the resampling of arrays of pixels to cells.
 
-    `mean` is an average over tissue (for displacement), `sum` preserves the total (for force). Both weight
-    pixels by hat functions as wide as the coarser of pixel and cell: two small sparse matrices, for rows and
-    columns.
+    Pixels are weighted by hat functions as wide as the coarser of pixel and cell, by two sparse matrices.
     """
 
     def __init__(
         self, tissue: Mask, scale_mm_per_px: float, grid: Grid, centre_px: tuple[float, float] | None = None
     ) -> None:
-        """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid.
-
-        Raises UserError for another shape, an invalid scale, or a grid without tissue.
-        """
+        """`tissue`: (H, W); `centre_px`: (x, y) of the grid's centre; None: the tissue's centroid. UserError
+        for another shape, an invalid scale, or a grid without tissue."""
         if tissue.ndim != 2:
             raise UserError(f"tissue mask: expected (H, W), got {tissue.shape}")
         self.tissue, self.grid, self.shape = tissue.astype(bool), grid, (tissue.shape[0], tissue.shape[1])
@@ -96,27 +91,20 @@ class GridView:
             raise UserError(f"at {scale_mm_per_px:g} mm/px the tissue covers no cell of the network's grid")
 
     def mean(self, values: NDArray[np.floating]) -> Map:
-        """Mean over the tissue in each cell; 0 where there is none.
-
-        `values`: (..., H, W). Returns (..., N, N) float32 in their unit.
-        """
+        """Mean (..., N, N) over the tissue in each cell of values (..., H, W); 0 where there is none."""
         over = self._each(values * self.tissue.astype(np.float32), self._rows, self._cols)
         good = self._share > 1e-6
         return np.where(good, over / np.where(good, self._share, 1.0), 0.0).astype(np.float32)
 
     def sum(self, values: NDArray[np.floating]) -> Map:
-        """Totals over each cell, which preserve the sum inside the grid.
-
-        `values`: (..., H, W), amount per pixel. Returns (..., N, N) float32, amount per cell.
-        """
+        """Totals (..., N, N) of amounts per pixel (..., H, W), with the same sum inside the grid."""
         return self._each(values, _partition(self._rows), _partition(self._cols)).astype(np.float32)
 
     def to_image(self, values: NDArray[np.floating]) -> Map:
-        """See `to_image`: (N, N) → (H, W) float32."""
+        """The function of this name."""
         return to_image(values, self.shape, self.centre_px, self.scale_mm_per_px, self.grid.pitch_mm)
 
     def matches(self, tissue: Mask, scale_mm_per_px: float, centre_px: tuple[float, float] | None) -> bool:
-        """Whether it was made from these arguments."""
         same = (centre_px, float(scale_mm_per_px)) == (self._centred_on, self.scale_mm_per_px)
         return same and np.array_equal(self.tissue, tissue)
 
@@ -137,11 +125,8 @@ def to_image(
     scale_mm_per_px: float,
     pitch_mm: float,
 ) -> Map:
-    """Values of a grid's cells at a picture's pixels, bilinear, 0 outside the grid.
-
-    `values`: (N, N); `shape`: (H, W) of the picture; `centre_px`: x, y of the grid's centre in it. Returns
-    (H, W) float32.
-    """
+    """Values (N, N) of a grid's cells at the pixels of a picture of `shape` (H, W), bilinear, 0 outside the
+    grid; `centre_px`: x, y of the grid's centre in it."""
     ratio, middle = scale_mm_per_px / pitch_mm, (len(values) - 1) / 2
     axes = [(np.arange(n) - at) * ratio for n, at in zip(shape, centre_px[::-1], strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"))
@@ -152,7 +137,6 @@ def to_image(
 def settled(amount: Map, mask: Map) -> Map:
     """Moves amounts outside the mask to the nearest cell inside, which preserves the total.
 
-    A cell at the tissue's edge may hold force though it is mostly not tissue.
     `amount`: (C, N, N) per cell; `mask`: (N, N) 0/1, not empty. Returns (C, N, N), 0 outside the mask.
     """
     inside = mask > 0
@@ -192,9 +176,8 @@ def _partition(hats: sparse.csr_array) -> sparse.csr_array:
 def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
     """∂dx/∂x + ∂dy/∂y of the smoothed displacement, dimensionless, 0 outside the mask.
 
-    Smoothing and differences use only masked cells (normalised convolution; at the mask's edge the
-    difference is one-sided), so that the tissue's edge causes no strain.
-    `displacement`: (B, 2 or 3, N, N) mm, dz unused; `mask`: (B, 1, N, N) 0/1. Returns (B, 1, N, N).
+    Only masked cells are used (at the mask's edge the difference is one-sided), so that the edge causes no
+    strain. `displacement`: (B, 2 or 3, N, N) mm, dz unused; `mask`: (B, 1, N, N) 0/1. Returns (B, 1, N, N).
     """
     sigma = SMOOTHING_MM / pitch_mm
     smooth = _smooth(displacement[:, :2] * mask, sigma) / _smooth(mask, sigma).clamp_min(1e-6)
@@ -206,18 +189,16 @@ def _difference(values: Tensor, mask: Tensor, dim: int) -> Tensor:
     n = values.shape[dim]
     step = values.narrow(dim, 1, n - 1) - values.narrow(dim, 0, n - 1)
     both = mask.narrow(dim, 1, n - 1) * mask.narrow(dim, 0, n - 1)
-    ahead = (0, 1, 0, 0) if dim == 3 else (0, 0, 0, 1)
-    behind = (1, 0, 0, 0) if dim == 3 else (0, 0, 1, 0)
+    ahead, behind = ((0, 1), (1, 0)) if dim == 3 else ((0, 0, 0, 1), (0, 0, 1, 0))
     step = step * both
     count = F.pad(both, ahead) + F.pad(both, behind)
     return (F.pad(step, ahead) + F.pad(step, behind)) / count.clamp_min(1)
 
 
 def _smooth(values: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian-smoothed planes (..., N, N): zero outside, cut at 3 sigma.
+    """Gaussian-smoothed planes (..., N, N), zero outside, by a matrix cut at 3 sigma, block by block.
 
-    Products with a banded matrix, block by block along the band. A depthwise convolution of this width takes
-    five times as long on a CPU (8 ms for two planes of 256²), the whole matrix three times.
+    A depthwise convolution takes five times as long on a CPU, the whole matrix three times.
     """
     n, reach = values.shape[-1], _reach(sigma_px)
     band = _smoother(n, sigma_px).to(values)
@@ -279,10 +260,7 @@ def channels(
 
 
 def certainty(deviation_mm: Map) -> Map:
-    """Confidence in 0..1 of motion across and along the optical axis, (2, ...).
-
-    `deviation_mm`: (..., 3), standard deviation of the motion [mm].
-    """
+    """Confidence in 0..1 of motion of deviation (..., 3) mm across and along the optical axis, (2, ...)."""
     across = np.sqrt(np.square(deviation_mm[..., :2]).mean(axis=-1))
     spread = np.stack([across, deviation_mm[..., 2]])
     return np.asarray(1 / (1 + np.square(spread / HALF_SURE_MM)), np.float32)

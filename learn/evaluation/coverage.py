@@ -26,16 +26,14 @@ class Coverage:
     shares: dict[str, Interval]
     """Share of frames with `size`, `x`, `y` or `z` of the force within: means with 95% BCa intervals."""
     values: dict[str, float]
-    """`width_mn`: mean width of the interval of the force's size [mN]; `width_of_peak`: the same over the
-    sequence's largest force; `width_x_mn`, `_y_` and `_z_`: of the components. `out_of_distribution`: share
-    of moving frames further from the training data than 99% of held-out frames; `distance`: median distance
-    of moving frames, as a multiple of that."""
+    """`width_mn`, `width_x_mn`, ...: mean widths [mN]; `width_of_peak`: of the size's, over the sequence's
+    largest force. `out_of_distribution`: share of moving frames further from the training data than 99% of
+    held-out frames; `distance`: median distance of moving frames, as a multiple of that."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
         ends = {name: {"mean": s.mean, "low": s.low, "high": s.high} for name, s in self.shares.items()}
-        found: dict[str, Any] = as_plain({"level": self.level, **ends, **self.values})
-        return found
+        return dict(as_plain({"level": self.level, **ends, **self.values}))
 
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
@@ -49,15 +47,14 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
         for level, own in rows.items():
             own.append(_cover_clip(found, predicted, clip, level))
         far.append(found.distribution.relative_distance(predicted.motion)[is_moving(predicted.motion)])
-    moved = np.concatenate(far)
-    nan, out = float("nan"), []
+    moved, out = np.concatenate(far), []
     for level, own in rows.items():
         rng = np.random.default_rng(0)
         columns = {name: np.array([row[name] for row in own]) for name in own[0]}
         shares = {name: interval(columns.pop(name), rng) for name in ("size", *"xyz")}
-        values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else nan for k, v in columns.items()}
-        values["out_of_distribution"] = float((moved > 1).mean()) if len(moved) else nan
-        values["distance"] = float(np.median(moved)) if len(moved) else nan
+        values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else math.nan for k, v in columns.items()}
+        values["out_of_distribution"] = float((moved > 1).mean()) if len(moved) else math.nan
+        values["distance"] = float(np.median(moved)) if len(moved) else math.nan
         out.append(Coverage(level, shares, values))
     return out
 

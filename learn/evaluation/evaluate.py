@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,12 @@ from learn.inference.predict import Predictor, force_size, length, total_force
 from synth.arrays import Floats, Map, Mask
 from synth.system.terminal import ProgressCallback
 
-FALSE_POSITIVE_MN = 5.0
-"""A contact-free cell is a false positive if a patch of `PATCH_MM2` at its density would carry more [mN]."""
-PATCH_MM2 = math.pi * 4.0**2
-"""Area of a contact of the jobs' mean radius, 4 mm."""
-FREE = 0.01
-"""A cell is contact-free if its true density is under this share of the training data's 99.9th percentile."""
-RIM_MM = 2.0
-"""Width of the rim around a contact that `false_positive_far` leaves out."""
-LOW = 0.05
-"""Share of the training data's 99.9th percentile: low-force frames are under it, relative false positives
-above."""
+PATCH_MM2 = math.pi * 4.0**2  # area of a contact of the jobs' mean radius, 4 mm
+FALSE_POSITIVE_MN = 5.0  # a contact-free patch that carries more is a false positive
+RIM_MM = 2.0  # width of the rim around a contact that `false_positive_far` leaves out
+# Shares of the training data's 99.9th percentile: cells are contact-free under the first, frames of low force
+# under the second, and relative false positives above it.
+FREE, LOW = 0.01, 0.05
 YOUNG = ("known", "half", "double", "unknown")
 """Columns: the true E, half and twice of it, and the training data's typical E."""
 
@@ -48,9 +43,9 @@ class ClipScore:
 
     def as_row(self) -> dict[str, float]:
         """All scores by key of `METRICS`."""
-        force = agreement(moments(self.true_mn, self.predicted_mn))
-        row = {f"map_{name}": value for name, value in asdict(agreement(self.map)).items()}
-        return row | {f"force_{name}": value for name, value in asdict(force).items()} | self.others
+        force = moments(self.true_mn, self.predicted_mn)
+        row = {f"map_{name}": value for name, value in agreement(self.map).items()}
+        return row | {f"force_{name}": value for name, value in agreement(force).items()} | self.others
 
 
 def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
@@ -62,8 +57,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     size, true_size = length(predicted), length(true)
     unit = card.scales.target * young
     contact = true_size >= FREE * unit
-    free = inside & ~contact
-    total = total_force(predicted, grid)
+    free, total = inside & ~contact, total_force(predicted, grid)
     predicted_mn = force_size(total)
     true_mn: Floats = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
@@ -73,7 +67,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     others = {}
     if parts == 3:
         components = np.broadcast_to(inside[:, None], predicted.shape)
-        others["vector_r2"] = agreement(moments(true[components], predicted[components])).r2
+        others["vector_r2"] = agreement(moments(true[components], predicted[components]))["r2"]
         others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
     others |= {
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
@@ -116,10 +110,10 @@ class EvaluationReport:
         """Means over sequences of every score, and pooled R² (`*_pooled`), in one E column."""
         rows, clips = self.per_clip(young), self.columns[young]
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
-        out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0)).r2
+        out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0))["r2"]
         true = np.concatenate([c.true_mn for c in clips])
         predicted = np.concatenate([c.predicted_mn for c in clips])
-        out["force_r2_pooled"] = agreement(moments(true, predicted)).r2
+        out["force_r2_pooled"] = agreement(moments(true, predicted))["r2"]
         out["calibration_slope"], out["calibration_offset_mn"] = line(predicted, true)
         return out
 
@@ -134,14 +128,12 @@ class EvaluationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
-        found: dict[str, Any] = as_plain(
-            {
-                "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
-                "columns": {young: self.summary(young) for young in self.columns},
-                "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
-            }
-        )
-        return found
+        found = {
+            "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
+            "columns": {young: self.summary(young) for young in self.columns},
+            "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
+        }
+        return dict(as_plain(found))
 
 
 def _mean(values: Sequence[float]) -> float:

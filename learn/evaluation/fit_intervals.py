@@ -15,6 +15,7 @@ from learn.split import Split, find_obstacle, find_sides, find_unit, groups, reg
 from learn.uncertainty.features import motion_features, motion_names
 from learn.uncertainty.intervals import Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
+from synth.arrays import Floats
 from synth.dataset.index import read_split
 from synth.errors import UserError
 from synth.system.terminal import ProgressCallback
@@ -34,15 +35,14 @@ def add_intervals(
 
     Of `clips`, `split.fit` is for the distribution of motion, `select` for the error model, `intervals` for
     the factors. Sequences of `select` that did not choose the epoch count as used for intervals from then on.
-    `source`: displacement that the intervals are for; None: the one that the model is scored on. Raises
-    UserError if nothing moves in the sequences.
+    `source`: displacement that the intervals are for; None: the scored one. UserError if nothing moves.
     """
     parts = split.fit, split.select, split.intervals
     fitted, selection, calibration = ([clips[i] for i in part] for part in parts)
     why, found = find_obstacle(selection, calibration), None
     if not why:
         source = source or scored_source(predictor.card.settings.input)
-        found = _fit(predictor, fitted, selection, calibration, source, report)
+        found = _fit(predictor, (fitted, selection, calibration), source, report)
     choosers = set(predictor.card.groups.get("select", ()))
     used = [*calibration, *(clip for clip in selection if calibration and clip.group not in choosers)]
     taken = {clip.content_hash for clip in used}, {clip.group for clip in used}
@@ -65,13 +65,12 @@ def fit_from_datasets(
     datasets: Sequence[Path],
     source: str,
     from_test: bool,
-    report: ProgressCallback = lambda done, of: None,
+    report: ProgressCallback,
 ) -> Intervals:
     """Fits a trained model's intervals on all sequences `clips` of some `datasets`, into its card.
 
-    `datasets`: the training data, and any with sequences that are new to the model; `from_test`: whether to
-    use half of the test brains; others as of `add_intervals`. Raises UserError if there is no training
-    sequence among them, or too few others.
+    `datasets`: the training data, and any new to the model; `from_test`: whether to use half of the test
+    brains; others as of `add_intervals`. UserError without a training sequence, or with too few others.
     """
     clips = regroup(clips, find_unit(predictor.card))
     marked = [read_split(one, required=False).sides.items() for one in datasets]
@@ -79,8 +78,7 @@ def fit_from_datasets(
     split = find_sides(clips, predictor.card, tests, from_test)
     if not split.fit:
         raise UserError(f"{datasets[0]}: holds no training sequence of {folder}; add its training dataset")
-    why = find_obstacle([clips[i] for i in split.select], [clips[i] for i in split.intervals])
-    if why:
+    if why := find_obstacle([clips[i] for i in split.select], [clips[i] for i in split.intervals]):
         hint = "" if from_test else "; add a dataset that is new to it, or use --from-test"
         raise UserError(f"{folder}: {why}{hint}")
     found = add_intervals(folder, predictor, clips, split, source, report).intervals
@@ -89,14 +87,10 @@ def fit_from_datasets(
 
 
 def _fit(
-    predictor: Predictor,
-    fitted: Sequence[Clip],
-    selection: Sequence[Clip],
-    calibration: Sequence[Clip],
-    source: str,
-    report: ProgressCallback,
+    predictor: Predictor, parts: Sequence[Sequence[Clip]], source: str, report: ProgressCallback
 ) -> Intervals:
-    card = predictor.card
+    """`parts`: as of `add_intervals`, for the distribution, the error model and the factors."""
+    card, (fitted, selection, calibration) = predictor.card, parts
     unit, rng = card.scales.force, np.random.default_rng(card.settings.seed)
     brains, examples = [0] * len(selection) + groups(calibration), []
     for k, (clip, brain) in enumerate(zip([*selection, *calibration], brains, strict=True)):
@@ -105,10 +99,7 @@ def _fit(
         examples.append(make_example(predict_clip(predictor, clip, source), true, brain, unit))
     report(len(brains), len(brains))
     some = [fitted[i] for i in rng.permutation(len(fitted))[:_MOST_FITTED]]
-    motion = [
-        motion_features(c.displacement[source], c.mask, c.confidence_of(source), card.settings.extent_mm)
-        for c in some
-    ]
+    motion = [_features(clip, source, card.settings.extent_mm) for clip in some]
     first, second = examples[: len(selection)], examples[len(selection) :]
     distribution = fit_distribution(motion, [one.motion for one in first])
     if distribution is None:
@@ -121,12 +112,12 @@ def _fit(
 def predict_clip(predictor: Predictor, clip: Clip, source: str) -> Prediction:
     """A sequence's forces per unit stiffness, the estimate at rest subtracted as in `ForceEstimator`."""
     shift, mask, grid = np.asarray(clip.displacement[source]), clip.mask, predictor.grid
-    confidence, young = clip.confidence_of(source), clip.young_kpa
-    density = predictor.density(shift, mask, young, confidence)
-    at_rest = predictor.density(np.zeros_like(shift[:1]), mask, young)
-    return Prediction(
-        motion=motion_features(shift, mask, confidence, grid.extent_mm),
-        force=net_force(density, at_rest, grid) / young,
-        magnitude=length(density) / np.float32(young),
-        pitch_mm=grid.pitch_mm,
-    )
+    young = clip.young_kpa
+    density = predictor.density(shift, mask, young, clip.confidence_of(source))
+    force = net_force(density, predictor.density(np.zeros_like(shift[:1]), mask, young), grid) / young
+    motion = _features(clip, source, grid.extent_mm)
+    return Prediction(motion, force, length(density) / np.float32(young), grid.pitch_mm)
+
+
+def _features(clip: Clip, source: str, extent_mm: float) -> Floats:
+    return motion_features(clip.displacement[source], clip.mask, clip.confidence_of(source), extent_mm)

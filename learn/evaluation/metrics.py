@@ -71,34 +71,21 @@ METRICS = {
 
 
 def moments(true: Array, predicted: Array) -> Array:
-    """Sums over pairs (true, predicted), of which every agreement score is a function; sums of parts add up.
-
-    Returns: (7,) count and sums of t, p, t², p², tp and |p − t|.
-    """
+    """Count and sums of t, p, t², p², tp and |p − t| over pairs (true, predicted), (7,), which add up."""
     t, p = (np.asarray(values, np.float64).ravel() for values in (true, predicted))
     return np.array([t.size, t.sum(), p.sum(), t @ t, p @ p, t @ p, np.abs(p - t).sum()])
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """R² = 1 − SSE/SST about the truth's mean; errors in the unit of the data; Pearson's r; CCC of Lin,
-    "A concordance correlation coefficient to evaluate reproducibility", Biometrics 1989."""
-
-    r2: float
-    mae: float
-    rmse: float
-    bias: float
-    r: float
-    ccc: float
-
-
-def agreement(moments: Array) -> Agreement:
-    """Agreement from moments (7,). R², r and CCC are NaN for constant truth, r for a constant prediction."""
-    return Agreement(**{name: float(value) for name, value in agreements(moments).items()})
+def agreement(moments: Array) -> dict[str, float]:
+    """`agreements` of moments (7,)."""
+    return {name: float(value) for name, value in agreements(moments).items()}
 
 
 def agreements(moments: Array) -> dict[str, Array]:
-    """Fields of `Agreement`, each (...), from many moments (..., 7) at once."""
+    """Scores by name, each (...), from moments (..., 7): r2 = 1 − SSE/SST about the truth's mean; mae, rmse
+    and bias in the unit of the data; Pearson's r; ccc of Lin, "A concordance correlation coefficient to
+    evaluate reproducibility", Biometrics 1989. r2, r and ccc are NaN for constant truth, r for a constant
+    prediction."""
     n, t, p, tt, pp, tp, absolute = np.moveaxis(np.asarray(moments, np.float64), -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean_t, mean_p = t / n, p / n

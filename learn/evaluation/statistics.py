@@ -1,8 +1,4 @@
-"""Confidence intervals of means over sequences, and paired tests of two models.
-
-The sequence is the unit: its frames share one contact and one tissue, and counted as independent they would
-make intervals ten times too narrow.
-"""
+"""Intervals of means over sequences, whose frames are not independent, and paired tests of models."""
 
 from __future__ import annotations
 
@@ -18,17 +14,13 @@ from scipy import stats
 from learn.evaluation.metrics import agreements
 from synth.arrays import Array, Floats
 
-LEAST_GROUPS = 5
-"""Of fewer specimens a 95% interval would hardly exceed the range of their means."""
+LEAST_GROUPS = 5  # of fewer specimens a 95% interval would hardly exceed the range of their means
 _DRAWS = 4000
 _SIGNS = 10_000
 
 
 def as_plain(value: Any, digits: int | None = None) -> Any:
-    """A value of dataclasses, mappings, sequences and arrays as JSON can store it.
-
-    Numbers are rounded to `digits` decimals, if given; NaN and infinity become None.
-    """
+    """A value as JSON can store it: numbers rounded to `digits` decimals, if given; NaN and infinity None."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, Mapping):
@@ -54,20 +46,15 @@ class Interval:
 
 
 def interval(values: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
-    """Mean and BCa bootstrap interval over sequences (Efron 1987); sequences with NaN are left out.
-
-    `values`: (n,), any unit. The interval is NaN with fewer than three values, or if all are equal.
-    """
+    """Mean and BCa bootstrap interval (Efron 1987) over sequences (n,), NaN left out; any unit. The interval
+    is NaN with fewer than three values, or if all are equal."""
     v = np.asarray(values, np.float64)
     return _bootstrap(np.mean, (v[np.isfinite(v)],), rng, draws)
 
 
 def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) -> Interval:
-    """R² over the pooled values of all sequences, and its BCa interval over sequences.
-
-    `moments`: (n, 7), `learn.evaluation.metrics.moments` of each sequence. The interval is NaN with fewer
-    than three sequences.
-    """
+    """R² over the pooled values of n sequences, from their `moments` (n, 7), and its BCa interval over
+    sequences; NaN with fewer than three."""
 
     def r2(*sums: Floats, axis: int) -> Floats:
         return agreements(np.stack([one.sum(axis) for one in sums], axis=-1))["r2"]
@@ -78,11 +65,8 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
 def over_groups(
     values: Sequence[float] | Floats, groups: Sequence[str], rng: np.random.Generator
 ) -> Interval:
-    """Mean over recordings and its percentile interval; whole groups (specimens) are resampled.
-
-    `values`: one per recording, NaN is left out; `groups`: the specimen of each. The interval is NaN with
-    fewer than `LEAST_GROUPS`.
-    """
+    """Mean over recordings, NaN left out, and its percentile interval, for which whole groups (specimens) are
+    drawn; NaN with fewer than `LEAST_GROUPS`."""
     v = np.asarray(values, np.float64)
     known = np.isfinite(v)
     of = np.unique(np.asarray(groups)[known], return_inverse=True)[1]
@@ -126,11 +110,8 @@ class Paired:
 
 
 def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
-    """Compares two models, sequence by sequence. `a`, `b`: (n,) in the same order.
-
-    The test is exact up to 13 sequences and uses random sign patterns above. Sequences without one of the
-    values are left out; one must have both.
-    """
+    """Compares two models, (n,) each, on the sequences that have both values, at least one; by an exact test
+    up to 13 sequences, by random sign patterns above."""
     d = np.asarray(b, np.float64) - np.asarray(a, np.float64)
     d = d[np.isfinite(d)]
     p = 1.0  # of a single sequence: both sign patterns are equally extreme

@@ -31,14 +31,16 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
 def coverage_table(covered: Sequence[Coverage]) -> Table:
     """Coverage and width of the model's intervals."""
     table = open_table("intervals", *(f"{one.level:.0%}" for one in covered))
-    for name, key in (("force", "size"), ("x", "x"), ("y", "y"), ("z", "z")):
+    for key in covered[0].shares:
         shares = [one.shares[key] for one in covered]
+        name = "force" if key == "size" else key
         table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
-    table.add_row("width of the force's [mN]", *(f"{one.values['width_mn']:.3g}" for one in covered))
-    table.add_row("the same over the peak", *(f"{one.values['width_of_peak']:.0%}" for one in covered))
-    table.add_row(
-        "moving frames out of distribution", *(f"{one.values['out_of_distribution']:.0%}" for one in covered)
-    )
+    for name, key, spec in (
+        ("width of the force's [mN]", "width_mn", ".3g"),
+        ("the same over the peak", "width_of_peak", ".0%"),
+        ("moving frames out of distribution", "out_of_distribution", ".0%"),
+    ):
+        table.add_row(name, *(format(one.values[key], spec) for one in covered))
     return table
 
 

@@ -92,23 +92,20 @@ def apply(
     """Force of every frame of a video, by `ForceEstimator`.
 
     `young_kpa` overrides the motion's own, unless the scale is unknown. Returns those of
-    `prediction_file.FIELDS` that the video and the model have. Mask and centre are the last frame's; they
-    change only where the tissue is wider than the grid.
+    `prediction_file.FIELDS` that the video and the model have; mask and centre are the last frame's.
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
-    if not motion.scale_known:
-        young = None
+    young = young if motion.scale_known else None
     for one in motion.passes:  # the last one counts
         estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
-        numbers, times, followed, found = [], [], list[bool](), list[FrameForce]()
+        rows, found = [], list[FrameForce]()
         for frame in one.frames:
-            numbers.append(frame.index)
-            times.append(math.nan if frame.time_s is None else frame.time_s)
-            followed.append(frame.trusted)
+            rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
             found.append(estimator.estimate(frame))
     findings = problems([*judge_young(young), *one.findings()])
     fault = first_fault(findings)
-    trusted = np.array(followed) & (not fault)
+    numbers, times, followed = map(np.array, zip(*rows, strict=True))
+    trusted = followed & (not fault)
     force = np.where(trusted[:, None], [each.force_mn for each in found], np.nan)
     last = found[-1].map
     # Pixel coordinates are of pixel centres: a picture begins at -0.5.
@@ -123,11 +120,11 @@ def apply(
         "centre_px": centres[-1],
         "young_kpa": last.young_kpa,
         "young_known": last.young_known,
-        "frame": np.array(numbers),
+        "frame": numbers,
         "centres_px": centres,
     }
     if np.isfinite(times).any():
-        out["time_s"] = np.array(times)
+        out["time_s"] = times
     if last.force_mn is not None:
         out["force_mn"] = force
     notes = [finding.message for finding in findings if finding.severity == "warning"]
@@ -147,10 +144,10 @@ def _ends(found: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
     """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where not `trusted` (T,)."""
     if not found[0].bands:
         return {}
-    wide, narrow = ([one.bands[level] for one in found] for level in LEVELS)
-    out = {"low_mn": [one.low for one in wide], "high_mn": [one.high for one in wide]}
-    out |= {"low68_mn": [one.low for one in narrow], "high68_mn": [one.high for one in narrow]}
-    out |= {"force_low_mn": [one.axes_low for one in wide], "force_high_mn": [one.axes_high for one in wide]}
+    wide, narrow = ([vars(one.bands[level]) for one in found] for level in LEVELS)
+    names = {"low": "low_mn", "high": "high_mn", "axes_low": "force_low_mn", "axes_high": "force_high_mn"}
+    out = {name: [one[end] for one in wide] for end, name in names.items()}
+    out |= {f"{end}68_mn": [one[end] for one in narrow] for end in ("low", "high")}
     sure = np.where(trusted, 1.0, np.nan)
     return {name: (np.concatenate(ends).T * sure).T for name, ends in out.items()}
 
@@ -171,9 +168,8 @@ def stiffness(
 ) -> float:
     """Young's modulus [kPa] by a least-squares fit of the prediction to the known force of a press.
 
-    Force is the network's prediction per unit stiffness times E, so one press with a known force (a weight, a
-    sensor on the tool) gives E for the rest of the recording. `force_mn`: (T,) size of the known force;
-    others as of `Predictor.density`. Raises UserError if the lengths differ, or force or prediction are zero.
+    `force_mn`: (T,) size of the known force; others as of `Predictor.density`. Raises UserError if the
+    lengths differ, or force or prediction are zero.
     """
     if len(force_mn) != len(displacement):
         raise UserError(f"calibration press: {len(force_mn)} forces for {len(displacement)} frames")

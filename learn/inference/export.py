@@ -1,10 +1,8 @@
 """A trained model as one ONNX file for other programs, which computes the input channels itself.
 
-Inputs: `displacement` (B, 2, N, N) mm on the grid and `mask` (B, 1, N, N) 0/1; for some models `confidence`
-(B, 1, N, N) 0..1. For stereo: `displacement` (B, 3, N, N) and `confidence` (B, 2, N, N). For some models
-`membrane` (B,): -1 stripped, 0 unknown, 1 intact. Output: force density per unit stiffness (B, C, N, N)
-[mN/mm² at 1 kPa]; times E in kPa it is mN/mm², times the cell's area and summed, mN. The .json next to it
-describes how a picture's flow is resampled to the grid.
+Inputs: `displacement` (B, 2, N, N) mm, in stereo (B, 3, N, N), and `mask` (B, 1, N, N) 0/1; for some models
+`confidence` (B, 1 or, in stereo, 2, N, N) 0..1 and `membrane` (B,): -1 stripped, 0 unknown, 1 intact. Output:
+force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. The .json next to it describes their use.
 """
 
 from __future__ import annotations
@@ -24,8 +22,7 @@ from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
 from synth.errors import UserError
 
-TOLERANCE = 1e-4
-"""Largest difference from PyTorch allowed, in units of the training data's 99.9th percentile."""
+TOLERANCE = 1e-4  # largest difference from PyTorch allowed, in units of the training data's 99.9th percentile
 
 
 class Portable(nn.Module):
@@ -69,11 +66,10 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
 
 @torch.no_grad()
 def export(predictor: Predictor, file: Path) -> float:
-    """Writes `file` as ONNX and a description `file`.json, and compares its output with PyTorch's.
+    """Writes `file` as ONNX, and a description `file`.json. Returns the largest difference from PyTorch.
 
-    Returns the largest difference, in units of the 99.9th percentile or of the largest output if that is
-    more. Raises UserError if it is above `TOLERANCE` (the file is removed), or if ONNX's packages are not
-    installed.
+    It is in units of the 99.9th percentile or of the largest output if that is more. UserError if it is above
+    `TOLERANCE` (the file is removed), or if ONNX's packages are not installed.
     """
     card = predictor.card
     module = Portable(predictor.model.cpu(), card).eval()

@@ -9,8 +9,7 @@ from learn.data.grid import Grid, centre, check_scale
 from synth.arrays import Map, Mask
 from synth.flow.confidence import LOW_CONFIDENCE
 
-Point = tuple[float, float]
-"""(x, y) px."""
+Point = tuple[float, float]  # (x, y) px
 
 # Chosen by hand.
 _CUT_OFF = 0.005  # share of the tissue that may lie beyond a grid that covers it
@@ -35,10 +34,7 @@ class GridPlacement:
         self._ends = [(float(axis.min()), float(axis.max())) for axis in (columns, rows)]
 
     def place(self, flow: Map, confidence: Map | None) -> Point:
-        """The grid's centre for a frame, from flow (H, W, 2) px and its confidence (H, W) in 0..1.
-
-        Pixels of low confidence don't count; None: all count.
-        """
+        """The grid's centre for a frame, by flow (H, W, 2) px of no low confidence (H, W; None: 1)."""
         if self.fits:
             return self.centre_px
         usable = self._tissue if confidence is None else self._tissue & (confidence >= LOW_CONFIDENCE)

@@ -29,11 +29,11 @@ from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 @dataclass(frozen=True)
 class MotionPass:
-    """The frames of one pass over a video, to be taken to the end, and what was found in them."""
+    """The frames of one pass over a video, in order and to the end, and what was found in them."""
 
-    frames: Iterator[FrameMotion]  # in order
-    notes: Callable[[], list[str]] = list  # on its processing, after the last frame
-    findings: Callable[[], list[Finding]] = list  # its faults, after the last frame
+    frames: Iterator[FrameMotion]
+    notes: Callable[[], list[str]] = list  # after the last frame, as the next
+    findings: Callable[[], list[Finding]] = list
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,11 @@ class VideoOptions:
 
 
 def motions(path: Path | Array, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
-    """Motions in a dataset folder, one NNNNNN.zarr store, an .npz of arrays, a video, its PNGs or its frames
-    (T, H, W, 3) uint8.
+    """Motions in a dataset, a store, an .npz, a video, a folder of PNGs or frames (T, H, W, 3) uint8.
 
     An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
     `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
-    instead of flow and confidence. A video's first frame is its rest frame. Raises UserError for anything
-    else, and for a video without a scale.
+    instead of flow and confidence. Raises UserError for anything else, and for a video without a scale.
     """
     if isinstance(path, np.ndarray) or video.is_video(path):
         yield _video(path, options or VideoOptions())

@@ -112,10 +112,7 @@ class Predictor:
     def on_grid(
         self, view: GridView, flow: Map, confidence: Map | None = None, moved: Moved | None = None
     ) -> tuple[Map, Map | None]:
-        """The network's input of a frame: displacement (C, N, N) mm and its confidence (C - 1, N, N).
-
-        Arguments and errors as `__call__`.
-        """
+        """Displacement (C, N, N) mm of a frame and its confidence (C - 1, N, N); arguments as `__call__`."""
         height, width = view.tissue.shape
         if flow.shape != (height, width, 2):
             raise UserError(f"flow: expected ({height}, {width}, 2), got {flow.shape}")
@@ -224,10 +221,7 @@ def length(density: Map) -> Map:
 
 
 def total_force(density: Map, grid: Grid) -> Floats:
-    """Total force of maps (T, C, N, N) mN/mm², (T, 3) mN in camera axes.
-
-    A map without direction gives the size in x, and NaN in y and z.
-    """
+    """Total force (T, 3) mN, camera axes, of maps (T, C, N, N) mN/mm²; without direction the size and NaN."""
     total = density.astype(np.float64).sum((2, 3)) * grid.pitch_mm**2
     return total if total.shape[1] == 3 else np.pad(total, ((0, 0), (0, 2)), constant_values=np.nan)
 

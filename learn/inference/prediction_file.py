@@ -85,9 +85,9 @@ def predict_files(
 ) -> Iterator[PredictedFile]:
     """Estimates and writes the forces of each video of a source, one after the other, into the folder `out`.
 
-    `predictor`, `each`: of `source` as `open_source` returns them; `young_kpa`, `membrane`: as of `apply`;
-    `overlay`: whether to write NAME.force.mp4 where the source has pictures. Raises UserError as
-    those, and for a file that would overwrite its source.
+    `predictor`, `each`: of `open_source`; `young_kpa`, `membrane`: as of `apply`; `overlay`: whether to write
+    NAME.force.mp4 where the source has pictures. UserError as those, and for a file that would overwrite its
+    source.
     """
     alone = source.is_file() or source.suffix == ".zarr" or video.is_video(source)
     for motion in each:
@@ -122,10 +122,9 @@ def write_prediction(found: dict[str, Any], stem: Path) -> None:
 
 
 def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
-    """Writes `stem`.force.mp4: the processed frames with the force map on them and its curve below.
+    """Writes `stem`.force.mp4: the processed frames with the rest frame's force map and the curve below.
 
-    The map is drawn in the rest frame. `found`: fields that `apply` returns; `source`: a video, or a
-    sequence's store. Returns None, without a file, if the source holds no pictures.
+    `found`: of `apply`; `source`: a video or a sequence's store. None, without a file, if it has no pictures.
     """
     wanted = {int(number) for number in found["frame"]}
     if video.is_video(source):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,11 +17,6 @@ NAMES = ("mono", "stereo")
 LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
 
 
-def shipped() -> dict[str, Path]:
-    """Folders of the pretrained networks by name."""
-    return {name: MODELS / name for name in NAMES}
-
-
 def find_model(named: Path | str) -> Path:
     """The folder of a model: a folder of that name, else of the pretrained network."""
     return MODELS / named if str(named) in NAMES and not Path(named).exists() else Path(named)
@@ -35,14 +29,14 @@ def choose_model(stereo: bool) -> Path:
 
 def find_name(card: ModelCard) -> str:
     """The name of the pretrained network with the same weights; empty if there is none."""
-    found = {checkpoint.read_card(folder).weights_hash: name for name, folder in shipped().items()}
+    found = {checkpoint.read_card(MODELS / name).weights_hash: name for name in NAMES}
     return found.get(card.weights_hash, "")
 
 
 def hash_data(card: ModelCard) -> str:
     """Hash of all sequences in a model's split, in any order."""
     named = {part: sorted(hashes) for part, hashes in card.split.items()}
-    return hashlib.blake2b(identity.canonical(named), digest_size=16).hexdigest()
+    return identity.digest(named)
 
 
 def pack_model(
@@ -84,7 +78,6 @@ def describe(card: ModelCard) -> str:
     settings, arch, motion = card.settings, card.settings.arch, " and ".join(card.motion)
     return (
         f"{'stereo' if arch.depth else 'monocular'}, {arch.output}, {settings.size}² cells, "
-        f"{settings.extent_mm:g} mm, input {settings.input} ({motion or 'version unknown'}); "
-        f"R² {card.score:.3f} on validation sequences, "
-        f"{len(card.split.get('fit', []))} training sequences"
+        f"{settings.extent_mm:g} mm, input {settings.input} ({motion or 'version unknown'}); R² "
+        f"{card.score:.3f} on validation sequences, {len(card.split.get('fit', []))} training sequences"
     )

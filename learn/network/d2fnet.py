@@ -26,14 +26,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from learn.data.grid import CHANNELS
 from synth.job.types import Section
 
-BOUNDS = (0.25, 0.75, 1.5)
-"""Largest output of each head, in units of the training data's 99.9th percentile. The published heads reach
-1/6, 1/2 and 1 of the largest force; here 1.5 times that, as a reserve."""
-SMALL_CONTACTS = 4.0
-"""Factor on the bounds of `relative` heads: a contact half as wide moves the tissue half as far."""
-LEAST_MOTION = 0.01
-"""Lower limit of the motion that `relative` divides by, as noise is smaller: share of the training data's
-99.9th percentile, some 0.02 mm."""
+# In units of the training data's 99.9th percentiles.
+BOUNDS = (0.25, 0.75, 1.5)  # largest output of each head; 1.5 times the published ones, as a reserve
+SMALL_CONTACTS = 4.0  # factor on them if `relative`: a contact half as wide moves the tissue half as far
+LEAST_MOTION = 0.01  # that `relative` divides by, some 0.02 mm: noise is smaller
 
 
 class Architecture(Section):
@@ -118,7 +114,7 @@ class D2FNet(nn.Module):
     def largest_motion(self, x: Tensor) -> Tensor:
         """The largest mean displacement of 3 × 3 cells, (B, 1, 1, 1) in the channels' unit."""
         axes = [k for k, name in enumerate(self.arch.channels) if name in ("dx", "dy", "dz")]
-        size = torch.cat([x[:, k : k + 1] for k in axes], dim=1).square().sum(1, keepdim=True)
+        size = x[:, axes].square().sum(1, keepdim=True)
         peak = F.avg_pool2d(size, 3, 1, 1).flatten(1).amax(1)
         return (peak + LEAST_MOTION**2).sqrt()[:, None, None, None]
 
@@ -211,8 +207,7 @@ class Heads(nn.Module):
     def begin_small(self) -> None:
         """Initialises the heads near zero force: half a bound everywhere would be a large false positive.
 
-        A bias of -2 gives a tenth of a bound; at -4 the sigmoids are so flat that what is left vanishes
-        slowly.
+        A bias of -2 gives a tenth of a bound; at -4 the sigmoids would be too flat to learn.
         """
         for conv in self.ranges:
             nn.init.normal_(conv.weight, std=0.02)  # type: ignore[arg-type]
@@ -242,8 +237,7 @@ def fused(model: nn.Module) -> nn.Module:
 def freeze(model: nn.Module, arch: Architecture, size: int) -> Callable[[Tensor], Tensor]:
     """The network traced for batches of any length on its own grid; its output is equal up to rounding.
 
-    Eager PyTorch runs small convolutions (gates, pyramid, heads) in its plain kernels; a frozen graph runs
-    all of them in oneDNN. That saves a fifth of the time of `d2fnet-s` on a CPU.
+    A frozen graph runs also small convolutions in oneDNN: a fifth of the time of `d2fnet-s` on a CPU.
     """
     net: Any = fused(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     example = torch.zeros(2, len(arch.channels), size, size).contiguous(memory_format=torch.channels_last)

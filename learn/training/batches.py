@@ -14,8 +14,7 @@ from learn.data.grid import Scales, channels, divergence, membrane_code
 from learn.settings import TrainingSettings
 from synth.errors import UserError
 
-MEMBRANE_HIDDEN = 1 / 3
-"""Share of training frames with an unknown membrane, so that `arch.membrane` also works without it."""
+MEMBRANE_HIDDEN = 1 / 3  # share of training frames with an unknown membrane: `arch.membrane` works without it
 
 
 class Batch(NamedTuple):
@@ -32,14 +31,9 @@ class Batch(NamedTuple):
 
     def turned(self, turn: int) -> Batch:
         """All fields turned by `turned`; each confidence is a scalar."""
-        planes = turned(self.confidence.flatten(0, 1)[:, None], turn)
-        return Batch(
-            turned(self.displacement, turn),
-            turned(self.mask, turn),
-            planes.reshape(self.confidence.shape),
-            turned(self.target, turn),
-            self.membrane,
-        )
+        planes = turned(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
+        moved, mask, true = (turned(one, turn) for one in (self.displacement, self.mask, self.target))
+        return Batch(moved, mask, planes, true, self.membrane)
 
 
 class FrameItem(NamedTuple):
@@ -53,10 +47,7 @@ class FrameItem(NamedTuple):
 
 
 def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
-    """The batch with random motion of the whole surface added to half of its frames, by `surface_motion_mm`.
-
-    `generator`: on the CPU, so that draws don't depend on the device.
-    """
+    """The batch with `surface_motion_mm` added to half of its frames; `generator`: always on the CPU."""
     moved = batch.displacement
     count, planes, size = moved.shape[0], moved.shape[1], moved.shape[-1]
     axis = torch.linspace(-1, 1, size)
@@ -78,16 +69,12 @@ def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
 
 
 def turned(values: Tensor, turn: int) -> Tensor:
-    """Fields (B, C, N, N) turned by `turn` % 4 × 90° counter-clockwise, and mirrored first if `turn` ≥ 4.
-
-    With two or three channels the first two are x, y components and turn with the field; a single channel is
-    a scalar.
-    """
+    """Fields (B, C, N, N) turned by `turn` % 4 × 90° counter-clockwise, and mirrored first if `turn` ≥ 4; two
+    or three channels begin with x, y components, a single one is a scalar."""
     vector = values.shape[1] > 1
     sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
     if turn >= 4:
-        values = values.flip(-1)
-        values = values * sign if vector else values
+        values = values.flip(-1) * sign if vector else values.flip(-1)
     for _ in range(turn % 4):
         values = values.rot90(dims=(2, 3))
         if vector:
@@ -146,10 +133,7 @@ class FrameDataset:
 
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:
-    """99.9th percentiles over tissue cells of up to `frames` evenly spaced frames of every clip.
-
-    Raises UserError if there is no motion or no force.
-    """
+    """Scales from up to `frames` evenly spaced frames of every clip. UserError: no motion or no force."""
     moved, strain, wanted, force = [], [], [], []
     squares, cells = 0.0, 0.0
     for clip in clips:

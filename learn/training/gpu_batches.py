@@ -50,9 +50,8 @@ class DeviceDataset(FrameDataset):
             at = torch.tensor([int(self._first[one.clip]) + one.frame for one in some], device=self._device)
             clip = torch.tensor([one.clip for one in some], device=self._device)
             mask = self._mask[clip]
-            confidence = torch.ones_like(mask)
-            if self._confidence is not None:
-                confidence = self._confidence[self.sources[k]][at]
+            sure = self._confidence
+            confidence = torch.ones_like(mask) if sure is None else sure[self.sources[k]][at]
             codes = [one.membrane_known * membrane_code(self.clips[one.clip].membrane) for one in some]
             membrane = torch.tensor(codes, device=self._device)
             moved = self._moved[self.sources[k]][at]

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 def set_threads(wanted: int | None = None) -> int:
     """Sets and returns PyTorch's number of threads; default: half the cores, from 1 to 8.
 
-    Two threads on two busy cores wait for each other (measured: thirty seconds instead of half a second of
-    one thread), so a small machine gets one.
+    Two threads on two busy cores wait for each other (measured: thirty seconds instead of half a second).
     """
     if wanted is not None and wanted < 1:
         raise UserError(f"threads {wanted}: must be at least 1")

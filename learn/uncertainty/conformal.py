@@ -26,19 +26,13 @@ def quantile(scores: Sequence[Floats], level: float) -> float:
     """Bound on the score of a frame of a new unit that holds with a probability of at least `level`.
 
     `scores`: (n,) of each of K exchangeable units, any n > 0. Every unit weighs 1 / (K + 1), shared by its
-    frames; the remaining weight is at infinity, for the new unit, as is the quantile if K is under
-    `least_units`.
+    frames; the rest is at infinity, for the new unit, as is the quantile if K is under `least_units`.
     """
-    return _weighted_quantile(scores, 1 / (len(scores) + 1), level)
+    return weighted_quantile(scores, 1 / (len(scores) + 1), level)
 
 
-def share_quantile(values: Sequence[Floats], level: float) -> float:
-    """Quantile of the units' values, (n,) each, with equal weights of the units: an estimate, not a bound."""
-    return _weighted_quantile(values, 1.0, level * len(values))
-
-
-def _weighted_quantile(units: Sequence[Floats], weight: float, share: float) -> float:
-    """Value at which the summed weights, `weight` per unit, reach `share`; infinity if they don't."""
+def weighted_quantile(units: Sequence[Floats], weight: float, share: float) -> float:
+    """Value at which the summed weights, `weight` per unit (n,), reach `share`; infinity if they don't."""
     values = np.concatenate(units)
     each = np.concatenate([np.full(len(unit), weight / len(unit)) for unit in units])
     order = np.argsort(values, kind="stable")

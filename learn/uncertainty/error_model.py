@@ -30,8 +30,7 @@ class ErrorModel:
 def fit_error_model(features: Floats, error: Floats, weight: Floats, least: float) -> ErrorModel:
     """Least squares on the logarithm of the error, slightly regularised (ridge).
 
-    `features`: (n, F); `error`: (n,) ≥ 0; `weight`: (n,) > 0; `least` > 0: added to an error before its
-    logarithm, in its unit.
+    `features`: (n, F); `error`: (n,) ≥ 0; `weight`: (n,) > 0; `least` > 0: added to an error, in its unit.
     """
     spread = np.maximum(features.std(0), 1e-6)
     wanted, share = np.log(error + least), weight / weight.mean()
@@ -39,10 +38,6 @@ def fit_error_model(features: Floats, error: Floats, weight: Floats, least: floa
     scaled = (features - middle) / spread
     normal = scaled.T @ (share[:, None] * scaled) + np.eye(scaled.shape[1])
     slopes = np.linalg.solve(normal, scaled.T @ (share * (wanted - level))) / spread
-    return ErrorModel(
-        intercept=level - float(middle @ slopes),
-        slopes=tuple(slopes.tolist()),
-        low=tuple(features.min(0).tolist()),
-        high=tuple(features.max(0).tolist()),
-        least=least,
-    )
+    ends = slopes, features.min(0), features.max(0)
+    per_feature, low, high = (tuple(end.tolist()) for end in ends)
+    return ErrorModel(level - float(middle @ slopes), per_feature, low, high, least)

@@ -26,8 +26,8 @@ def motion_names(depth: bool) -> tuple[str, ...]:
 def motion_features(displacement: Map, mask: Map, confidence: Map | None, extent_mm: float) -> Floats:
     """Features of each frame, (T, F), in the order of `motion_names`.
 
-    None needs the stiffness or the frame rate, which differs between sequences and videos. `displacement`:
-    (T, 2 or 3, N, N) mm; `mask`: (N, N) 0/1, tissue; `confidence`: (T, 1 or 2, N, N) in 0..1, None: 1.
+    `displacement`: (T, 2 or 3, N, N) mm; `mask`: (N, N) 0/1, tissue; `confidence`: (T, 1 or 2, N, N) in 0..1,
+    None: 1.
     """
     inside = mask > 0
     shift, weight = _coarse(displacement * inside, inside)
@@ -65,10 +65,8 @@ def is_moving(motion: Floats) -> Mask:
 
 
 def estimate_features(size: Floats, magnitude: Map, cell_mm2: float) -> Floats:
-    """Features of each frame's force estimate, in the order of `ESTIMATE`, (T, 2).
-
-    `size`: (T,) of the total force, as a share of the training data's; `magnitude`: (T, N, N), any unit.
-    """
+    """`ESTIMATE` of each frame, (T, 2), from the force's size (T,), as a share of the training data's, and
+    its map (T, N, N), any unit."""
     flat = magnitude.reshape(len(magnitude), -1).astype(np.float64)
     area = cell_mm2 * flat.sum(1) ** 2 / np.maximum(np.square(flat).sum(1), 1e-30)
     return np.stack([np.log(size + _LOW_SHARE), np.log(area + 1.0)], axis=1)

@@ -1,9 +1,8 @@
 """Prediction intervals of a network's force: of its size and its components.
 
-Half the width of an interval is the expected size of the error (`ErrorModel`), times a widening for frames
-out of distribution (`MotionDistribution`) and for estimates above those of the error model's fit, times a
-factor that gives the stated coverage on new sequences (`conformal.quantile`). The network, the error model
-and the factor are fitted on different sequences.
+Half their width is the expected size of the error (`ErrorModel`), times a widening for frames out of
+distribution and for estimates above those of the error model's fit, times a factor that gives the stated
+coverage (`conformal.quantile`). Network, error model and factor are fitted on different sequences.
 """
 
 from __future__ import annotations
@@ -131,12 +130,8 @@ def frame_features(predicted: Prediction, force_unit: float) -> Floats:
 def make_example(predicted: Prediction, true: Floats, unit: int, force_unit: float) -> Example:
     """A sequence's errors. `true`: (T, 3) force per unit stiffness; `force_unit`: as of `Intervals`."""
     off = np.abs(np.linalg.norm(true, axis=1) - predicted.size)
-    return Example(
-        unit=unit,
-        motion=predicted.motion,
-        features=frame_features(predicted, force_unit),
-        error=np.column_stack([off, np.abs(true - predicted.centre)]),
-    )
+    error = np.column_stack([off, np.abs(true - predicted.centre)])
+    return Example(unit, predicted.motion, frame_features(predicted, force_unit), error)
 
 
 def fit(
@@ -149,8 +144,7 @@ def fit(
 ) -> Intervals:
     """Fits error models on `selection` and factors on `calibration`; other arguments as in `Intervals`.
 
-    The two and the training sequences must not share units. Raises UserError if `calibration` has fewer units
-    than the highest level needs.
+    The two and the training sequences must not share units. UserError for too few of `calibration`.
     """
     count, least = len({one.unit for one in calibration}), conformal.least_units(LEVELS[0])
     if count < least:
@@ -171,20 +165,12 @@ def fit(
         factors = {str(level): max(conformal.quantile(scores, level), 1e-9) for level in LEVELS}
         return Spread(models[k], factors)
 
-    return Intervals(
-        features=(*names, *ESTIMATE),
-        force_unit=force_unit,
-        size=spread(0),
-        axes=(spread(1), spread(2), spread(3)),
-        distribution=distribution,
-        source=source,
-        units=count,
-        sequences=len(calibration),
-    )
+    size, axes, known = spread(0), (spread(1), spread(2), spread(3)), (*names, *ESTIMATE)
+    return Intervals(known, force_unit, size, axes, distribution, source, count, len(calibration))
 
 
 def _widen(distribution: MotionDistribution, size: ErrorModel, motion: Floats, features: Floats) -> Floats:
     """(T,) factor on the width of intervals, for distant motion and for sizes above the fitted ones."""
     log_size = len(features[0]) - len(ESTIMATE)
     above = np.exp(np.maximum(features[:, log_size] - size.high[log_size], 0.0))
-    return distribution.widening(motion) * above
+    return np.maximum(distribution.relative_distance(motion), 1.0) * above

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import FiniteFloat
 
-from learn.uncertainty.conformal import quantile, share_quantile
+from learn.uncertainty.conformal import quantile, weighted_quantile
 from learn.uncertainty.features import is_moving
 from synth.arrays import Floats
 from synth.job.types import Positive
@@ -45,23 +45,16 @@ class MotionDistribution:
         return float(np.quantile(moved, _QUANTILE)) if len(moved) else 0.0
 
     def calibrated(self, recordings: Sequence[Floats]) -> MotionDistribution:
-        """A copy with `recording_limit` from `motion_features` (T, F) of held-out recordings.
-
-        With fewer than 19 moving recordings it is the largest of their distances.
-        """
+        """A copy with `recording_limit` from `motion_features` (T, F) of held-out recordings: with fewer than
+        19 moving ones the largest of their distances."""
         far = [np.array([self.recording_distance(one)]) for one in recordings if is_moving(one).any()]
         limit = quantile(far, RECORDINGS)
         return replace(self, recording_limit=max(limit if np.isfinite(limit) else np.max(far), 1e-6))
-
-    def widening(self, motion: Floats) -> Floats:
-        """(T,) factor on the width of intervals: `relative_distance`, at least 1."""
-        return np.maximum(self.relative_distance(motion), 1.0)
 
 
 def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> MotionDistribution | None:
     """Distribution of the moving frames of training sequences; None if either argument has none.
 
-    Covariance with the shrinkage of Ledoit and Wolf (2004), on features of unit variance.
     `fitted`, `held_out`: `motion_features` (T, F) of each training sequence and of each other one.
     """
     moved = [motion[is_moving(motion)] for motion in fitted]
@@ -76,16 +69,14 @@ def fit_distribution(fitted: Sequence[Floats], held_out: Sequence[Floats]) -> Mo
     precision = np.linalg.inv(shrunk + np.diag(np.maximum(least - np.diag(shrunk), 0.0)))
     precision = precision / np.outer(spread, spread)
     found = MotionDistribution(tuple(frames.mean(0).tolist()), tuple(map(tuple, precision.tolist())), 1.0)
-    limit = share_quantile([found.distance(m)[is_moving(m)] for m in others], FRAMES)
+    far = [found.distance(one)[is_moving(one)] for one in others]
+    limit = weighted_quantile(far, 1.0, FRAMES * len(far))
     return replace(found, frame_limit=max(limit, 1e-6))
 
 
 def shrunk_covariance(samples: Floats) -> Floats:
-    """(F, F) covariance of (n, F) samples, shrunk towards a multiple of the identity.
-
-    Ledoit & Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J. Multivar.
-    Anal. 88, 2004.
-    """
+    """(F, F) covariance of (n, F) samples, shrunk towards a multiple of the identity: Ledoit & Wolf, "A
+    well-conditioned estimator for large-dimensional covariance matrices", J. Multivar. Anal. 88, 2004."""
     count, parts = samples.shape
     centred = samples - samples.mean(0)
     plain = centred.T @ centred / count
@@ -99,10 +90,8 @@ def shrunk_covariance(samples: Floats) -> Floats:
 def describe_out_of_distribution(
     distribution: MotionDistribution, names: Sequence[str], motion: Floats
 ) -> list[str]:
-    """A warning if a recording is further from the training data than 95% of held-out ones, else none.
-
-    `names`: of the features; `motion`: (T, F) `motion_features` of the tracked frames.
-    """
+    """A warning if a recording, by the features (T, F) of its tracked frames, is further from the training
+    data than 95% of held-out ones, else none."""
     far = distribution.recording_distance(motion)
     if not far > distribution.recording_limit:
         return []

@@ -22,10 +22,8 @@ _LARGEST_BYTES = 512 << 20
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Floats]:
     """Columns by name, float64, in the file's order of rows; empty cells and `nan` are NaN.
 
-    Dates of ISO 8601 are seconds since 1970, in UTC unless they state a zone.
-
-    `path`: with comma or tab, or semicolon and then also decimal commas, in UTF-8, or UTF-16 with BOM.
-    `required`: columns that must be present exactly once; `optional`: columns returned if present. Raises
+    Dates of ISO 8601 are seconds since 1970, in UTC unless they state a zone. `path`: with comma or tab, or
+    semicolon and then also decimal commas, in UTF-8, or UTF-16 with BOM. `required`: present exactly once.
     UserError: unreadable, too large, a missing column, no rows, a cell that is not a number.
     """
     header, rows = _split(path)

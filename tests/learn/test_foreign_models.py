@@ -65,9 +65,8 @@ def test_a_flipped_bit_of_weights_and_of_a_state_of_training_is_found(model: Pat
 
 
 def test_a_kill_between_card_and_weights_leaves_a_model(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    state = {
-        name: value * 2 for name, value in safetensors.torch.load_file(model / "weights.safetensors").items()
-    }
+    stored = safetensors.torch.load_file(model / "weights.safetensors")
+    state = {name: value * 2 for name, value in stored.items()}
     card = read_card(model)
     for dies_at in ("write_card", "os.replace"):
         before = {name: value.clone() for name, value in read_model(model)[0].state_dict().items()}

@@ -1,5 +1,6 @@
 """Stereo motion as a network's input."""
 
+import itertools
 import json
 from dataclasses import replace as replace_
 from pathlib import Path
@@ -28,11 +29,9 @@ from synth.job.types import MembraneState
 SCALES = Scales(0.5, 0.02, 0.3, 12.5, 0.07)
 
 
-def small(**changes: object) -> TrainingSettings:
+def small() -> TrainingSettings:
     base = preset("stereo")
-    return replace(
-        base, size=32, epochs=4, arch=replace(base.arch, levels=2, stem=2, membrane=True), **changes
-    )
+    return replace(base, size=32, epochs=4, arch=replace(base.arch, levels=2, stem=2, membrane=True))
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +100,8 @@ def test_turning_leaves_depth_unchanged(stereo: list[Clip]) -> None:
             sizes = [getattr(one, name)[:, -1].flatten().sort().values for one in (still, turned)]
             assert torch.equal(*sizes), (turn, name)
         # Both confidences are numbers, not a vector's components.
-        assert torch.equal(
-            turned.confidence.flatten(2).sort().values, still.confidence.flatten(2).sort().values
-        )
+        sizes = [one.confidence.flatten(2).sort().values for one in (still, turned)]
+        assert torch.equal(*sizes), turn
 
 
 def test_batches_on_a_device_are_equal_to_those_read_one_by_one(stereo: list[Clip], tmp_path: Path) -> None:
@@ -112,9 +110,8 @@ def test_batches_on_a_device_are_equal_to_those_read_one_by_one(stereo: list[Cli
         reading.pack(clip, tmp_path / str(k))  # packed clips are equal to read ones
     some = [reading.unpack(tmp_path / "0"), reading.unpack(tmp_path / "1"), *stereo[2:]]
     some[3] = stereo[3] = replace_(stereo[3], membrane="intact")
-    items = [
-        FrameItem(c, t, s, c, t == 4) for c in range(8) for t in (1, 4) for s in ("motion", "motion-ideal")
-    ]
+    every = itertools.product(range(8), (1, 4), ("motion", "motion-ideal"))
+    items = [FrameItem(c, t, source, c, t == 4) for c, t, source in every]
     read, stored = FrameDataset(stereo, settings), DeviceDataset(some, settings, torch.device("cpu"))
     for item in items:
         one, other = read.batch([item]), stored.batch([item])
@@ -128,9 +125,7 @@ def test_batches_on_a_device_are_equal_to_those_read_one_by_one(stereo: list[Cli
 @pytest.mark.slow
 def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> None:
     run(app, "predict", model, data, "-o", tmp_path / "f")
-    stored = np.load(tmp_path / "f/000000.npz")
-    assert stored["force_mn"].shape == (6, 3)
-    scored = run(app, "eval", model, data, "--all", "--json")
-    assert json.loads(scored.stdout)["input"] == "motion"
+    assert np.load(tmp_path / "f/000000.npz")["force_mn"].shape == (6, 3)
+    assert json.loads(run(app, "eval", model, data, "--all", "--json").stdout)["input"] == "motion"
     run(app, "eval", model, data, "--all", "--input", "recovered", code=2)
     assert export(load_model(model), tmp_path / "net.onnx") < 1e-4

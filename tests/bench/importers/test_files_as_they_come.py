@@ -85,9 +85,11 @@ def test_all_orientations_of_a_display_matrix(s: int, t: int, turned: bool, tmp_
     source = write(tmp_path / "a.mp4", [LEFT], "libx264", "yuv444p")
     data = bytearray(source.read_bytes())
     at = data.index(b"tkhd") + 44
+    # The track header's display matrix [ISO 14496-12, 8.3.2].
     data[at : at + 36] = struct.pack(">9i", *(v << 16 for v in (a, b, 0, c, d, 0, 0, 0, 1 << 14)))
     source.write_bytes(data)
     got = next(video.read_video(source)).rgb.astype(int)
+    assert got.shape[:2] == LEFT.shape[:2][:: -1 if turned else 1]
     y, x = np.mgrid[: LEFT.shape[0], : LEFT.shape[1]]
     across, down = a * x + c * y, b * x + d * y
     assert np.abs(got[down - down.min(), across - across.min()] - LEFT).mean() < 6

@@ -17,28 +17,23 @@ from synth.errors import UserError
 
 TIMES = np.array([0.0, 0.11, 0.19, 0.3])
 FORCE = np.array([[0.0, 0, 0], [0.1, 0, -0.2], [0.2, 0.1, 0], [0.0, 0, 0.05]])
-TIP = np.array([[1.0, 2, 3], [1, 2, 4], [1, 3, 4], [2, 3, 4]])
 
 
 def footage() -> NDArray[np.uint8]:
     """(4, 12, 16, 3), smooth enough to survive a change of colour space within two levels."""
     y, x = np.mgrid[:12, :16]
-    return np.stack(
-        [np.stack([60 + 8 * x, 90 + 6 * y, 120 + 20 * k + 0 * x], axis=-1) for k in range(4)]
-    ).astype(np.uint8)
+    shades = [[60 + 8 * x, 90 + 6 * y, 120 + 20 * k + 0 * x] for k in range(4)]
+    return np.moveaxis(np.array(shades, np.uint8), 1, -1)
 
 
 def igs(path: Path) -> Path:
     lines = ["ObjectType = Image", "NDims = 3", "DimSize = 16 12 4", "ElementType = MET_UCHAR",
              "ElementNumberOfChannels = 3", "UltrasoundImageOrientation = MF"]  # fmt: skip
     for k in range(4):
-        matrix = np.eye(4)
-        matrix[:3, 3] = TIP[k]
         lines += [
             f"Seq_Frame{k:04d}_Timestamp = {TIMES[k]}",
             f"Seq_Frame{k:04d}_Force = {' '.join(map(str, FORCE[k]))}",
-            f"Seq_Frame{k:04d}_StylusTipToWorldTransform = {' '.join(map(str, matrix.ravel()))}",
-            f"Seq_Frame{k:04d}_StylusTipToWorldTransformStatus = {'INVALID' if k == 2 else 'OK'}",
+            f"Seq_Frame{k:04d}_StylusTipToWorldTransformStatus = OK",
         ]
     head = "\n".join([*lines, "ElementDataFile = LOCAL", ""])
     path.write_bytes(head.encode() + footage().tobytes())
@@ -52,7 +47,7 @@ def hdf5(path: Path) -> Path:
         file["camera/timestamps"] = TIMES
         file["sensor/force"] = FORCE
         file["sensor/force_time"] = TIMES
-        file["tip"] = TIP
+        file["tip"] = FORCE
     return path
 
 
@@ -67,14 +62,12 @@ def mcap(path: Path, unstamped: str = "") -> Path:
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = store.types
-    names = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped"
-    image, wrench, pose = (kind[name] for name in names)
+    image, wrench = kind["sensor_msgs/msg/Image"], kind["geometry_msgs/msg/WrenchStamped"]
     vector, point = kind["geometry_msgs/msg/Vector3"], kind["geometry_msgs/msg/Point"]
-    turn = kind["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         written = {
             name: bag.add_connection(name, message.__msgtype__, typestore=store)
-            for name, message in (("/camera", image), ("/ft", wrench), ("/tip", pose))
+            for name, message in (("/camera", image), ("/ft", wrench), ("/tip", point))
         }
         for k, picture in enumerate(footage()):
 
@@ -85,11 +78,10 @@ def mcap(path: Path, unstamped: str = "") -> Path:
 
             bgr = np.ascontiguousarray(picture[..., ::-1]).ravel()
             force = kind["geometry_msgs/msg/Wrench"](vector(*FORCE[k]), vector(0.0, 0.0, 0.0))
-            place = kind["geometry_msgs/msg/Pose"](point(*(TIP[k] / 1000)), turn)
             for name, message in (
                 ("/camera", image(head("/camera"), 12, 16, "bgr8", 0, 48, bgr)),
                 ("/ft", wrench(head("/ft"), force)),
-                ("/tip", pose(head("/tip"), place)),
+                ("/tip", point(1.0, 2.0, 3.0)),
             ):
                 raw = store.serialize_cdr(message, message.__msgtype__)
                 bag.write(written[name], round(1e9 * (LATE_S + TIMES[k])), raw)

@@ -18,10 +18,7 @@ from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 
 SIZE, FPS, FOCAL, BASE_MM, AWAY_MM = (320, 180), 10.0, 1000.0, 5.0, 100.0
-CAMERAS = {
-    "left": "/davinci/left/camera/image_raw/compressed",
-    "right": "/davinci/right/camera/image_raw/compressed",
-}
+CAMERAS = {side: f"/davinci/{side}/camera/image_raw/compressed" for side in ("left", "right")}
 DEPTH = "/davinci/depth/image"
 ARMS = ("/PSM1/body/measured_cf", "/PSM2/body/measured_cf")
 LATE_S = 0.012  # delay of the right camera's stamps
@@ -34,10 +31,8 @@ Rgb = np.ndarray
 def lenses(pair: tuple[np.ndarray, np.ndarray], bent: list[np.ndarray]) -> dict[str, dict[str, Any]]:
     """What ROS's `camera_calibration` writes for a pair: OpenCV's rectification, with lengths in metres."""
     R1, R2, P1, P2, *_ = cv2.stereoRectify(K, bent[0], K, bent[1], SIZE, pair[0], pair[1][:, None] / 1000)
-    return {
-        camera: {"k": K.ravel(), "d": d, "r": R.ravel(), "p": P.ravel()}
-        for camera, d, R, P in zip(CAMERAS, bent, (R1, R2), (P1, P2), strict=True)
-    }
+    parts = zip(CAMERAS, bent, (R1, R2), (P1, P2), strict=True)
+    return {camera: {"k": K.ravel(), "d": d, "r": R.ravel(), "p": P.ravel()} for camera, d, R, P in parts}
 
 
 def write_bag(
@@ -94,12 +89,10 @@ def write_bag(
 def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:
     """Of six frames the right camera lacks the first, fourth and last."""
     bent = [k * np.array([-0.3, 0.1, 0.001, -0.002, 0.05]) for k in (1.0, 0.9)]
-    video = [
-        {camera: np.full((*SIZE[::-1], 3), 30 * t + 9 * (camera == "right"), np.uint8) for camera in CAMERAS}
-        for t in range(6)
-    ]
-    for t in (0, 3, 5):
-        video[t].pop("right")
+    shape = (*SIZE[::-1], 3)
+    video = [{"left": np.full(shape, 30 * t, np.uint8)} for t in range(6)]
+    for t in (1, 2, 4):
+        video[t]["right"] = np.full(shape, 30 * t + 9, np.uint8)
     source = write_bag(tmp_path / "bag", video, np.zeros((60, 3)), lenses(TOED_IN, bent))
     words = ["import", source, "-o", tmp_path / "rec", "--scale", AWAY_MM / FOCAL]
     run(app, *words, "--use", f"right={CAMERAS['right']}", "--use", f"force={ARMS[0]}")
@@ -141,15 +134,11 @@ def test_partners_are_each_others_nearest() -> None:
     assert found.tolist() == [0, 1, -1, 3, -1]
 
 
-@pytest.mark.parametrize(
-    "use",
-    [
-        {"right": "/nothing"},
-        {"right": CAMERAS["right"], "depth": CAMERAS["left"]},
-        {"frames": CAMERAS["left"], "calibration": "/a"},
-        {},
-    ],
-)
+LEFT, RIGHT = CAMERAS.values()
+WRONG = {"right": "/nothing"}, {"right": RIGHT, "depth": LEFT}, {"frames": LEFT, "calibration": "/a"}, {}
+
+
+@pytest.mark.parametrize("use", WRONG)
 def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, str]) -> None:
     # Of another size than the calibration's.
     video = [{camera: np.zeros((90, 160, 3), np.uint8) for camera in CAMERAS}]

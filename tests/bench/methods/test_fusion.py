@@ -14,9 +14,8 @@ CAUTION = 1.5  # factor of the network's stated deviation
 
 
 def estimate(forces: list[Floats], deviations: list[float], weights: list[float]) -> ForceEstimate:
-    mixture = ForceMixture(
-        np.array(weights), np.array(forces), np.array([np.eye(3) * one**2 for one in deviations])
-    )
+    covariance = np.square(deviations)[:, None, None] * np.eye(3)
+    mixture = ForceMixture(np.array(weights), np.array(forces), covariance)
     return ForceEstimate(mixture.mean, likely=mixture)
 
 

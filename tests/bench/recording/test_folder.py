@@ -36,22 +36,6 @@ def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
     assert read["fy_n"].tolist() == [0, 1, 0]
 
 
-def test_stated_rotation_is_applied(tmp_path: Path) -> None:
-    rgb = np.zeros((32, 64, 3), np.uint8)
-    rgb[:8, :8] = 255  # top left as recorded
-    writer.write_video(tmp_path / "v.mp4", iter([rgb]), np.zeros(1))
-    data = bytearray((tmp_path / "v.mp4").read_bytes())
-    # The track header's display matrix [ISO 14496-12, 8.3.2]: 90 degrees clockwise.
-    at = data.find(b"tkhd") + 4 + 40
-    matrix = [0, 0x10000, 0, -0x10000, 0, 0, 32 << 16, 0, 0x40000000]
-    data[at : at + 36] = b"".join((v & 0xFFFFFFFF).to_bytes(4, "big") for v in matrix)
-    (tmp_path / "r.mp4").write_bytes(data)
-    upright = next(iter(video.read_video(tmp_path / "r.mp4"))).rgb
-    assert upright.shape == (64, 32, 3)
-    assert upright[:8, -8:].mean() > 200  # what was top left is now top right
-    assert upright[:8, :8].mean() < 50
-
-
 def test_force_in_mn_sign_and_gaps(make: Maker) -> None:
     folder = make(frames=3, meta={"sensor": {"acts_on": "tool"}})
     (folder / "force.csv").write_text(

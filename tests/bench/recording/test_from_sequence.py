@@ -29,7 +29,7 @@ def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path
     assert names == {"frames", "masks", "force.csv", "frames.csv", "meta.yaml", "tissue.png"}
     recording = open_recording(folder)
     frames = list(recording.frames())
-    assert np.array_equal(np.stack([f.rgb for f in frames]), sequence["rgb"][:])
+    assert np.array_equal([f.rgb for f in frames], sequence["rgb"][:])
     assert [f.time_s for f in frames] == pytest.approx(sequence["time"][:])
     assert recording.force is not None
     assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)

@@ -55,13 +55,10 @@ def rise(amount: float) -> np.ndarray:
 
 def write_pair(folder: Path) -> dict[str, object]:
     """Writes the calibration and returns its section of meta.yaml."""
-    storage = cv2.FileStorage(str(folder / "pair.yaml"), cv2.FILE_STORAGE_WRITE)
     right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
-    for name, value in {"K1": K, "K2": right, "R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}.items():
-        storage.write(name, value)
-    for name in ("D1", "D2"):
-        storage.write(name, np.zeros((1, 5)))
-    storage.release()
+    pair = {"K1": K, "D1": np.zeros(5), "K2": right, "D2": np.zeros(5)}
+    pair |= {"R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}
+    writer.write_storage(folder / "pair.yaml", pair)
     return {"calibration": "pair.yaml", "mm_per_unit": BASE}
 
 
@@ -117,13 +114,12 @@ def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> Non
         assert moved.motion[60, 80, 0] == pytest.approx(2.5 * amount * AWAY / FOCAL, abs=0.05)
         assert (moved.deviation[inner] > 0).all()
     assert done.stereo is not None
+    assert done.stereo.noise_mm > 0
+    assert np.isnan(done.stereo.baseline_mm) == (second == "depth")
     if second == "right":
         assert done.stereo.baseline_mm == pytest.approx(BASE, rel=1e-3)
         assert done.stereo.epipolar_px < 0.1
         assert (done.stereo.copied, done.stereo.frozen) == (False, 0)
-    else:
-        assert np.isnan(done.stereo.baseline_mm)
-    assert done.stereo.noise_mm > 0
 
 
 @pytest.mark.parametrize(("second", "lost"), [("right", "001.png"), ("depth", "001.npy")])
@@ -178,18 +174,12 @@ def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
 PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        {"copied": True},
-        {"frozen": 3},
-        {"tool_behind_px": 2.0},
-        {"lag_s": -0.1},
-        {"epipolar_px": 3.0},
-        {"last_rows_px": 1.8},
-    ],
-)
-def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: dict[str, float]) -> None:
+FAULTS: dict[str, float] = {"copied": True, "frozen": 3, "tool_behind_px": 2.0, "lag_s": -0.1}
+FAULTS |= {"epipolar_px": 3.0, "last_rows_px": 1.8}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: str) -> None:
     recording = open_recording(make("right"))
 
     def severities(quality: StereoQuality) -> set[str]:
@@ -199,7 +189,7 @@ def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: dict[str, flo
     assert severities(PAIR) == {"ok"}
     assert severities(replace(PAIR, noise_mm=0.3)) == {"warning"}
     assert "warning" in severities(replace(PAIR, sharpness=0.5))
-    assert "error" in severities(replace(PAIR, **fault))
+    assert "error" in severities(replace(PAIR, **{fault: FAULTS[fault]}))
 
 
 def test_a_baseline_in_metres_is_reported(make: Make) -> None:
@@ -207,8 +197,7 @@ def test_a_baseline_in_metres_is_reported(make: Make) -> None:
     tracked = TrackedRecording(stereo=quality, scale_mm_per_px=0.05)
     (found,) = stereo.check_scale(open_recording(make("right")), tracked)
     assert found.severity == "error"
-    assert "metres" in found.message
-    assert "1000" in found.message
+    assert {"metres,", "1000"} <= set(found.message.split())
 
 
 @pytest.mark.parametrize(
@@ -220,9 +209,7 @@ def test_a_lag_of_the_right_camera_is_found_by_its_motion(
 ) -> None:
     rng = np.random.default_rng(3)
     rows, frames = np.arange(60), np.arange(24)[:, None]
-    place = np.where(
-        frames < 6, 5 * frames, np.where(frames < 18, 30, 30 + 4 * (frames - 18))
-    )  # moves, rests
+    place = 5 * frames.clip(0, 6) + 4 * (frames - 18).clip(0)  # moves, rests, moves
     left = 5 * np.exp(-(((rows - place) / 6) ** 2)) * np.diff(place, axis=0, prepend=-5).clip(0, 1)
     left = left + np.sin(frames / 3) ** 2 * np.exp(-(((rows - 30) / 15) ** 2)) + 2
     right = 0.8 * left[order(np.arange(24))] + rng.normal(0, 0.05, left.shape)

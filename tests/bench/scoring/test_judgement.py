@@ -14,18 +14,13 @@ from bench.scoring.headline import headline
 from bench.scoring.result import as_json
 from learn.cli import app as learn
 
-STATED = {
-    "E in Pa": ({"young_kpa": 1500.0}, "stiffness"),
-    "E in MPa": ({"young_kpa": 0.0015}, "stiffness"),
-    "scale in metres": ({"scale_mm_per_px": 2.5e-4}, "scale"),
-    "a pixel is a millimetre wide": ({"scale_mm_per_px": 3.0}, "scale"),
-}
+# E in Pa and in MPa, the scale in metres, pixels that are millimetres wide.
+UNITS = ("young_kpa", 1500.0), ("young_kpa", 0.0015), ("scale_mm_per_px", 2.5e-4), ("scale_mm_per_px", 3.0)
 
 
-@pytest.mark.parametrize("case", STATED)
-def test_wrong_units_are_found_by_check_and_score(make: Maker, case: str) -> None:
-    meta, cause = STATED[case]
-    folder = make(frames=6, meta=meta)
+@pytest.mark.parametrize(("key", "value"), UNITS)
+def test_wrong_units_are_found_by_check_and_score(make: Maker, key: str, value: float) -> None:
+    folder, cause = make(frames=6, meta={key: value}), "stiffness" if key == "young_kpa" else "scale"
     result = scored(folder, backend="dis")
     wrong = [one for one in result.findings if one.severity == "error"]
     assert [one.cause for one in wrong] == [cause]
@@ -107,22 +102,11 @@ def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
 
 
 def test_a_video_that_starts_under_load_rests_elsewhere() -> None:
-    load = np.concatenate(
-        [np.zeros(15), np.linspace(0, 1, 10), np.ones(20), np.linspace(1, 0, 10), np.zeros(15)]
-    )
-    cases = {
-        "whole": (0, 70),
-        "released": (20, 70),
-        "hold at the start": (26, 70),
-        "hold at the end": (0, 45),
-    }
-    found = {
-        name: find_other_rest(TIME[: stop - start], np.abs(load - load[start])[start:stop])
-        for name, (start, stop) in cases.items()
-    }
-    sure = {name: None if one is None else one[1] for name, one in found.items()}
-    # Of a hold and a release, the video shows the same.
-    assert sure == {"whole": None, "released": True, "hold at the start": False, "hold at the end": False}
+    load = np.interp(np.arange(70), [15, 24, 45, 54], [0, 1, 1, 0])
+    # Whole, released, and held at the start or at the end, of which the video shows the same.
+    for start, stop, sure in ((0, 70, None), (20, 70, True), (26, 70, False), (0, 45, False)):
+        found = find_other_rest(TIME[: stop - start], np.abs(load - load[start])[start:stop])
+        assert (found and found[1]) == sure, (start, stop)
 
 
 BLACK = np.zeros((96, 128, 3), np.uint8)

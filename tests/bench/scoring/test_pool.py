@@ -23,6 +23,12 @@ def score(name: str, mae: float, specimen: str = "", **networks: str) -> dict[st
     return about | {"scores": {"mae_mn": mae}, "methods": methods, "settings": settings}
 
 
+def store(folder: Path, tree: dict[str, Any]) -> Path:
+    folder.mkdir()
+    (folder / "score.json").write_text(json.dumps(tree))
+    return folder
+
+
 def test_means_and_intervals_over_specimens() -> None:
     tree = pool.pool([score("a", 1.0, "x"), score("b", 3.0, "x"), score("c", 5.0, "y")])
     net = tree["methods"]["net"]["scores"]["mae_mn"]
@@ -36,46 +42,35 @@ def test_means_and_intervals_over_specimens() -> None:
 
 
 def test_methods_are_identified_by_their_hash(tmp_path: Path) -> None:
-    tree = pool.pool(
-        [score("a", 1.0, net="x", one="y", two="z"), score("b", 3.0, net="x", other="y", two="w")]
-    )
+    first = score("a", 1.0, net="x", one="y", two="z")
+    tree = pool.pool([first, score("b", 3.0, net="x", other="y", two="w")])
     assert list(tree["methods"]) == ["net", "zero", "one"]  # called otherwise in b
     assert tree["methods"]["one"]["scores"]["mae_mn"]["mean"] == 2.0
     assert tree["of_some"] == ["two"]
-    for name, network in ("a", "x"), ("b", "y"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "score.json").write_text(json.dumps(score(name, 1.0, net=network)))
+    both = [store(tmp_path / name, score(name, 1.0, net=network)) for name, network in ("ax", "by")]
     with pytest.raises(UserError, match=r"net of a.*net of b"):
-        pool.read([tmp_path / "a", tmp_path / "b"])
+        pool.read(both)
 
 
-@pytest.mark.parametrize(
-    "odd",
-    [
-        {"lost": {"frames": 3, "share": 0.3, "most": 0.2}},
-        {"fault": "the picture never changes"},
-        {"sync": {"refused": "ambiguous"}},
-    ],
-)
+ODD = {"lost": {"share": 0.3, "most": 0.2}}, {"fault": "it never changes"}, {"sync": {"refused": "ambiguous"}}
+
+
+@pytest.mark.parametrize("odd", ODD)
 def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path: Path) -> None:
     tree = pool.pool(
         [score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}, score("b", 1.0) | odd]
     )
     assert list(tree["left_out"]) == ["b"]
     assert tree["methods"]["net"]["scores"]["mae_mn"]["mean"] == 5.0
-    (tmp_path / "score.json").write_text(json.dumps(score("b", 1.0) | odd))
     with pytest.raises(UserError):
-        pool.read([tmp_path])
+        pool.read([store(tmp_path / "b", score("b", 1.0) | odd)])
 
 
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "score.json").write_text(json.dumps(score(name, 2.0, name)))
-    out = tmp_path / "out"
-    run(app, "pool", tmp_path / "a", tmp_path / "b", "-o", out)
+    both, out = [store(tmp_path / name, score(name, 2.0, name)) for name in "ab"], tmp_path / "out"
+    run(app, "pool", *both, "-o", out)
     assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.svg"}
     with pytest.raises(UserError, match="given twice"):
-        pool.read([tmp_path / "a", tmp_path / "a"])
+        pool.read([both[0], both[0]])
     with pytest.raises(UserError, match="no readable score"):
         pool.read([tmp_path])

@@ -13,9 +13,8 @@ from tests.synth.recording_flow.test_find_tissue import RIM, SETTINGS, video
 
 def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
     folder, contexts = make(frames=12, size=OPENING.shape), list[MethodContext]()
-    for path, one in zip(
-        sorted((folder / "frames").iterdir()), video(OPENING, RIM, 4).pictures(), strict=True
-    ):
+    files = sorted((folder / "frames").iterdir())
+    for path, one in zip(files, video(OPENING, RIM, 4).pictures(), strict=True):
         assert cv2.imwrite(str(path), one.rgb[..., ::-1])
 
     def method(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:

@@ -5,6 +5,7 @@ from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -79,20 +80,11 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
             slow.set_result(super().submit(rgb, proposal).result())
             return slow
 
-    class Clock:
-        def start(self, time_s: float) -> None:
-            pass
-
-        def is_due(self, index: int, time_s: float) -> bool:
-            log.append(f"due {index}")
-            return True
-
-        def spare_s(self, time_s: float) -> float:
-            return 0.04
-
+    clock = Mock(spare_s=lambda time_s: 0.04)
+    clock.is_due = lambda index, time_s: log.append(f"due {index}") is None
     settings = RecordingFlowSettings("dis", 1, rate_hz=None, pulse=False, masks="none")
     footage = Footage(lambda: pictures(4), "test")
-    for frame in VideoPass(footage, settings, flow=Later(), pace=Clock()).frames():
+    for frame in VideoPass(footage, settings, flow=Later(), pace=clock).frames():
         if not frame.is_rest:
             log.append(f"out {frame.index}")
     assert log == expected

@@ -175,16 +175,14 @@ def test_train_and_eval_use_the_split(tmp_path: Path) -> None:
     run(cli.app, "train", own, "-o", tmp_path / "b", "folds=3", code=2)
 
 
-def many(clips: list[Clip], brains: int, each: int = 2) -> list[Clip]:
-    """Sequences that differ in name alone."""
-    one = clips[0]
-    return [
-        replace(one, content_hash=f"{b}-{k}", group=f"brain-{b}") for b in range(brains) for k in range(each)
-    ]
+def many(clips: list[Clip], brains: int) -> list[Clip]:
+    """Sequences that differ in name alone, two of each brain."""
+    names = [(f"{b}-{k}", f"brain-{b}") for b in range(brains) for k in range(2)]
+    return [replace(clips[0], content_hash=name, group=brain) for name, brain in names]
 
 
-def of(brains: Iterable[int], each: int = 2) -> tuple[int, ...]:
-    return tuple(b * each + k for b in brains for k in range(each))
+def of(brains: Iterable[int]) -> tuple[int, ...]:
+    return tuple(2 * b + k for b in brains for k in range(2))
 
 
 def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: list[Clip]) -> None:
@@ -205,10 +203,7 @@ def test_brains_in_the_card_or_in_a_test_are_not_used_for_intervals(clips: list[
     named = name_parts(some, Split(of(range(6)), of(range(6, 10)), of([10, 11])))
     known = ModelCard(preset("tiny"), SCALES, 1.7, *named)
     # A sequence of its own of a brain that was fitted, of one that is test, and a brain marked test.
-    some += [
-        replace(some[0], content_hash="new-a", group="brain-3"),
-        replace(some[0], content_hash="new-b", group="brain-10"),
-    ]
+    some += [replace(some[0], content_hash=f"new-{b}", group=f"brain-{b}") for b in (3, 10)]
     found = find_sides(some, known, {"12-0"}, from_test=False)
     assert {some[i].group for i in found.intervals} == {f"brain-{b}" for b in range(13, 30)}
     assert {some[i].group for i in found.test} == {"brain-10", "brain-11", "brain-12"}

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -59,11 +61,9 @@ def test_pooled_r2_is_of_all_values_and_its_interval_of_whole_sequences() -> Non
         t, p = np.concatenate([true[k] for k in i]), np.concatenate([predicted[k] for k in i])
         return float(1 - ((t - p) ** 2).sum() / ((t - t.mean()) ** 2).sum())
 
-    theirs = stats.bootstrap(
-        (np.arange(20),), r2, n_resamples=2000, method="BCa", vectorized=False, rng=rng()
-    )
-    assert got.low == pytest.approx(theirs.confidence_interval.low, abs=0.02)
-    assert got.high == pytest.approx(theirs.confidence_interval.high, abs=0.02)
+    how: dict[str, Any] = {"n_resamples": 2000, "method": "BCa", "vectorized": False, "rng": rng()}
+    theirs = stats.bootstrap((np.arange(20),), r2, **how).confidence_interval
+    assert (got.low, got.high) == pytest.approx((theirs.low, theirs.high), abs=0.02)
     assert np.isnan(pooled_r2(sums[:2], rng()).low)
     still = np.array([moments(np.zeros(4), np.ones(4))] * 4)
     assert np.isnan(pooled_r2(still, rng()).mean), "R² needs force"

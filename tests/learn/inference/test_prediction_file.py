@@ -53,11 +53,9 @@ def test_a_dataset_gives_the_three_files(data: Path, model: Path, tmp_path: Path
         assert found["scale_mm_per_px"] == pytest.approx(sequence.attrs["scale_mm_per_px"])
         rows = list(csv.DictReader((tmp_path / "000000.force.csv").read_text().splitlines()))
         assert tuple(rows[0]) == prediction_file.COLUMNS
-        assert [float(row["total_force_mn"]) for row in rows] == pytest.approx(
-            found["total_force_mn"], rel=1e-5
-        )
-        assert [float(row["force_y_mn"]) for row in rows] == pytest.approx(found["force_mn"][:, 1], rel=1e-5)
-        assert [float(row["time_s"]) for row in rows] == pytest.approx(sequence["time"][:], rel=1e-5)
+        columns = {"total_force_mn": found["total_force_mn"], "force_y_mn": found["force_mn"][:, 1]}
+        for name, values in (columns | {"time_s": sequence["time"][:]}).items():
+            assert [float(row[name]) for row in rows] == pytest.approx(values, rel=1e-5), name
     overlay = frames(tmp_path / "000000.force.mp4")
     assert len(overlay) == sequence.frames
     assert overlay[0].shape[0] > sequence.size[0], "the curve lies below the picture"
@@ -101,9 +99,8 @@ def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, 
     cells = np.exp(-((np.arange(n)[:, None] - 0.6 * n) ** 2 + (np.arange(n) - 0.4 * n) ** 2) / 20)
     place = found["centres_px"][2], float(found["scale_mm_per_px"]), float(found["pitch_mm"])
     there = to_image(cells, motion.tissue.shape, *place)
-    back = GridView(np.ones_like(motion.tissue), motion.scale_mm_per_px, predictor.grid, view.centre_px).mean(
-        there
-    )
+    whole = np.ones_like(motion.tissue)
+    back = GridView(whole, motion.scale_mm_per_px, predictor.grid, view.centre_px).mean(there)
     assert np.abs(back - cells)[view.mask > 0].max() < 0.1
     row, column = (np.average(axis, weights=there) for axis in np.indices(there.shape))
     x, y = found["centres_px"][2]

@@ -56,9 +56,7 @@ def test_the_pretrained_networks_predict_the_same_as_before(name: str, force: li
 
 @pytest.mark.parametrize("name", shipped.NAMES)
 def test_pretrained_networks_are_small_complete_and_documented(name: str) -> None:
-    folder = shipped.MODELS / name
+    folder, card = shipped.MODELS / name, learn.load_model(name).card
     assert folder_bytes(folder) <= shipped.LARGEST_BYTES == 4_000_000
-    card = learn.load_model(name).card
     assert card.settings.arch.depth == (name == "stereo")
-    page = (folder / "README.md").read_text()
-    assert shipped.hash_data(card) in page
+    assert shipped.hash_data(card) in (folder / "README.md").read_text()

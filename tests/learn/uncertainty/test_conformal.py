@@ -21,11 +21,9 @@ def coverage(
     for k in range(DRAWS):
         errors = rng.normal(size=(units + 1, 1)) + own * rng.normal(size=(units + 1, frames))
         scores = np.abs(errors)
+        bound = conformal.quantile(list(scores[:-1]), level)
         if naive:
-            pooled = np.sort(scores[:-1].ravel())
-            bound = pooled[math.ceil((len(pooled) + 1) * level) - 1]
-        else:
-            bound = conformal.quantile(list(scores[:-1]), level)
+            bound = np.sort(scores[:-1].ravel())[math.ceil((units * frames + 1) * level) - 1]
         held[k] = (scores[-1] <= bound).mean()
     return float(held.mean()), float(held.std() / math.sqrt(DRAWS))
 

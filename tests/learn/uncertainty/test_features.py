@@ -7,13 +7,10 @@ from scipy.stats import chi2
 from sklearn.covariance import LedoitWolf
 from sklearn.linear_model import Ridge
 
+from learn.uncertainty import out_of_distribution
 from learn.uncertainty.error_model import fit_error_model
 from learn.uncertainty.features import FLOOR_MM, MOTION, motion_features
-from learn.uncertainty.out_of_distribution import (
-    describe_out_of_distribution,
-    fit_distribution,
-    shrunk_covariance,
-)
+from learn.uncertainty.out_of_distribution import describe_out_of_distribution, fit_distribution
 
 Floats = NDArray[np.float64]
 
@@ -81,8 +78,7 @@ def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
     assert found.frame_limit == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
     far = MEAN[None] + 9 * MIX[:, 2]
     assert found.distance(far)[0] == pytest.approx(9.0, rel=0.03)
-    assert found.widening(far)[0] == pytest.approx(9.0 / found.frame_limit, rel=0.03)
-    assert found.widening(MEAN[None])[0] == 1
+    assert found.relative_distance(far)[0] == pytest.approx(9.0 / found.frame_limit, rel=0.03)
 
 
 def test_one_in_twenty_recordings_like_the_calibration_is_out_of_distribution() -> None:
@@ -113,7 +109,8 @@ def test_frames_at_rest_have_no_distance() -> None:
 def test_the_covariance_is_ledoits_and_wolfs(count: int) -> None:
     rng = np.random.default_rng(3)
     samples = rng.normal(size=(count, 8)) @ rng.normal(size=(8, 8)) + 5
-    assert shrunk_covariance(samples) == pytest.approx(LedoitWolf().fit(samples).covariance_, rel=1e-9)
+    found = out_of_distribution.shrunk_covariance(samples)
+    assert found == pytest.approx(LedoitWolf().fit(samples).covariance_, rel=1e-9)
 
 
 def test_the_scale_is_a_ridges() -> None:
@@ -122,8 +119,6 @@ def test_the_scale_is_a_ridges() -> None:
     error, weight = np.exp(features[:, 0] + rng.normal(size=60)), rng.uniform(0.2, 2, 60)
     rule = fit_error_model(features, error, weight, 0.1)
     spread = features.std(0)
-    theirs = Ridge(alpha=1.0).fit(
-        features / spread, np.log(error + 0.1), sample_weight=weight / weight.mean()
-    )
+    theirs = Ridge().fit(features / spread, np.log(error + 0.1), sample_weight=weight / weight.mean())
     assert rule.slopes == pytest.approx(theirs.coef_ / spread, rel=1e-6)
     assert rule.intercept == pytest.approx(float(theirs.intercept_), rel=1e-6)

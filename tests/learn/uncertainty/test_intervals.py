@@ -20,13 +20,9 @@ def draw(rng: np.random.Generator, directed: bool = True) -> tuple[Prediction, F
     """One sequence's estimate, whose relative error varies mostly by sequence, and the force (T, 3)."""
     force = rng.normal(size=3) * 60 * np.sin(np.linspace(0.2, 1.5, FRAMES))[:, None]
     size = np.linalg.norm(force, axis=1)
-    motion = np.column_stack(
-        [
-            np.log(0.05 + size / 100) + 0.1 * rng.normal(size=FRAMES),
-            0.3 * rng.normal() + 0.1 * rng.normal(size=FRAMES),
-            *(0.5 + 0.1 * rng.normal(size=(4, FRAMES))),
-        ]
-    )
+    first = np.log(0.05 + size / 100) + 0.1 * rng.normal(size=FRAMES)
+    second = 0.3 * rng.normal() + 0.1 * rng.normal(size=FRAMES)
+    motion = np.column_stack([first, second, *(0.5 + 0.1 * rng.normal(size=(4, FRAMES)))])
     share = 1 + 0.2 * rng.normal() + 0.1 * 0.2 * rng.normal(size=(FRAMES, 1))
     estimate = share * force + 0.2 * rng.normal(size=3) * size[:, None]
     if not directed:
