@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem.external.read import read_series
 from synth.fem.external.series import MeshSeries, Units
@@ -14,6 +15,7 @@ from synth.fem.surface_embedding import vertex_area
 from synth.job import writer
 
 _RADIUS_MM = 12.0
+_FLAT = 1e-3  # height of a point over the middle of a sheet, relative to the radius
 _DT_S = 0.04  # written where files carry no time
 
 
@@ -53,20 +55,17 @@ def as_job(source: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _opening(series: MeshSeries) -> tuple[np.ndarray, np.ndarray, float]:
+def _opening(series: MeshSeries) -> tuple[Floats, Floats, float]:
     """Point [mm], outward direction and radius [mm] of an opening where the surface moves most."""
-    points, faces = series.points, series.faces
+    points = series.points
     most = np.linalg.norm(series.displacement, axis=2).max(axis=0)
-    area = vertex_area(points, faces)
-    weight = area * (most > 0.7 * most.max())
-    middle = (weight[:, None] * points).sum(axis=0) / weight.sum()
+    weight = vertex_area(points, series.faces) * (most > 0.7 * most.max())
+    middle = weight @ points / weight.sum()
     point = points[np.linalg.norm(points - middle, axis=1).argmin()]
-    corners = points[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    centres = corners.mean(axis=1)
-    near = np.linalg.norm(centres - point, axis=1)
     radius = min(_RADIUS_MM, 0.4 * float(np.sort(np.ptp(points, axis=0))[1]))
-    out = normal[near <= max(radius / 2, near.min() + 1e-9)].sum(axis=0)
-    # Faces of a sheet may be turned either way: away from the body's middle is outwards.
-    side = np.sign(out @ (point - points.mean(axis=0))) or 1.0
-    return point, side * out / np.linalg.norm(out), radius
+    near = np.argsort(np.linalg.norm(points - point, axis=1))
+    near = near[: max(12, int((np.linalg.norm(points - point, axis=1) < radius / 2).sum()))]
+    # The normal of their plane, as faces may be turned either way; outwards is away from the body's middle.
+    out = np.linalg.svd(points[near] - points[near].mean(axis=0))[2][2]
+    away = out @ (point - points.mean(axis=0))
+    return point, out if (away if abs(away) > _FLAT * radius else out.sum()) > 0 else -out, radius

@@ -14,7 +14,7 @@ from synth.fem.external.transfer import attach
 from synth.sequence.scene import RestScene
 from synth.system.stopwatch import StageCallback, Stopwatch
 
-_LOST = 0.01  # share of the load outside the drawn surface above which it is reported
+_LOST = 0.01  # share of the load outside the opening above which it is reported
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class SeriesMechanics:
         turn, shift = rest.brain.to_world[:3, :3], rest.brain.to_world[:3, 3]
         with watch.stage("mesh"):
             transfer = attach(series.points @ turn.T + shift, series.faces, rest.shape)
-        area, count = rest.vertex_area, series.tip.shape[1]
+        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], job.anatomy.craniotomy.radius_mm
         moved = np.zeros((len(time), len(area), 3))
         load, lost = np.zeros_like(moved), np.zeros((len(time), 3))
         parts, work = np.zeros((len(time), count, 3)), np.zeros(len(time))
@@ -57,10 +57,12 @@ class SeriesMechanics:
         if step > _cell_mm(series.points, series.faces):
             jump = f"a vertex moves by {step:.2g} mm from frame to frame, more than a cell of the mesh"
             warnings.warn(f"mechanics.source: {jump}; store more states, or raise fps", Caution, stacklevel=1)
-        whole, outside = load.sum(axis=1), float(np.linalg.norm(lost, axis=1).max())
-        if outside > _LOST * (most := float(np.linalg.norm(whole, axis=1).max())):
-            share = f"{outside:.3g} mN, {100 * outside / (most + outside):.0f}% of the load,"
-            why = f"mechanics.force: {share} act outside the opening; they are not in the label"
+        whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm
+        outside = float(np.linalg.norm(lost + load[:, hidden].sum(axis=1), axis=1).max())
+        if outside > _LOST * (most := float(np.linalg.norm(whole + lost, axis=1).max())):
+            share = f"{outside:.3g} mN, {100 * outside / most:.0f}% of the load"
+            beyond = f"{np.linalg.norm(lost, axis=1).max():.2f} mN beyond the drawn surface are in no label"
+            why = f"mechanics.force: {share}, act outside the opening; {beyond}"
             warnings.warn(why, Caution, stacklevel=1)
         if series.force is None:
             for unknown in (load, whole, parts):

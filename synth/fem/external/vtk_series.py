@@ -16,7 +16,7 @@ from synth.fem.external.series import MeshSeries, Units, assemble, find_surface
 from synth.geometry.mesh_file import SUFFIXES, MeshFile, read_mesh
 from synth.system import checked_file
 
-LARGEST = 2 << 30  # bytes of a file
+_LARGEST, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file, of a collection
 COLLECTIONS = (".pvd", ".series")
 MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {
@@ -92,7 +92,7 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
 
 def _collection(source: Path) -> list[tuple[Path, float]]:
     """Files and times of a .pvd or .series file. UserError if it is neither, or lists fewer than two."""
-    text = checked_file.read_text(source, checked_file.LARGEST_JSON)
+    text = checked_file.read_text(source, _LARGEST_LIST)
     with as_user_error(f"{source}: is not a collection of files"):
         if source.suffix == ".pvd":
             sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
@@ -109,7 +109,7 @@ def _collection(source: Path) -> list[tuple[Path, float]]:
 
 
 def _read(file: Path) -> MeshFile:
-    data = checked_file.read_bytes(file, LARGEST)
+    data = checked_file.read_bytes(file, _LARGEST)
     with as_user_error(f"{file}: is not a readable mesh"):
         return read_mesh(data)
 

@@ -4,39 +4,35 @@ import numpy as np
 import pytest
 import trimesh
 
-from synth.arrays import Floats, Ints
-from synth.geometry.skin import CELLS, FLAT, skin
+from synth.arrays import Ints
+from synth.geometry.skin import CELLS, skin
 
 HEXAHEDRON = np.array(
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]], float
 )
-CORNERS = {
-    "hexahedron": HEXAHEDRON,
-    "wedge": HEXAHEDRON[[0, 3, 1, 4, 7, 5]],
-    "pyramid": np.concatenate([HEXAHEDRON[:4], [[0.5, 0.5, 1.0]]]),
-    "tetrahedron": HEXAHEDRON[[0, 1, 3, 4]],
+SHAPES = {  # corners and volume
+    (10, 24): (HEXAHEDRON[[0, 1, 3, 4]], 1 / 6),
+    (12, 25): (HEXAHEDRON, 1.0),
+    (13, 26): (HEXAHEDRON[[0, 3, 1, 4, 7, 5]], 0.5),
+    (14, 27): (np.concatenate([HEXAHEDRON[:4], [[0.5, 0.5, 1.0]]]), 1 / 3),
 }
-VOLUME = {"hexahedron": 1.0, "wedge": 0.5, "pyramid": 1 / 3, "tetrahedron": 1 / 6}
-VOLUMES = [kind for kind in CELLS if kind not in FLAT]
-
-
-def cell(kind: int) -> tuple[Floats, Ints]:
-    name, size, _, edges = CELLS[kind]
-    corners = CORNERS[name.removeprefix("quadratic ")]
-    middle = [corners[list(edge)].mean(axis=0) for edge in edges]
-    points = np.array([*corners, *middle])
-    assert len(points) == size
-    return points, np.arange(size)[None]
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("kind", VOLUMES)
-def test_of_one_cell_is_closed_and_turned_outwards(kind: int, mirrored: bool) -> None:
-    points, nodes = cell(kind)
+@pytest.mark.parametrize("kinds", SHAPES)
+@pytest.mark.parametrize("quadratic", [0, 1])
+def test_of_one_cell_is_closed_and_turned_outwards(
+    kinds: tuple[int, int], quadratic: int, mirrored: bool
+) -> None:
+    corners, volume = SHAPES[kinds]
+    cell = CELLS[kinds[quadratic]]
+    points = np.array([*corners, *(corners[list(edge)].mean(axis=0) for edge in cell.edges)])
+    assert len(points) == cell.nodes
     points = points * [1, 1, -1] if mirrored else points
-    surface = trimesh.Trimesh(points, skin(points, {kind: nodes}), process=False)
+    faces = skin(points, {kinds[quadratic]: np.arange(len(points))[None]})
+    surface = trimesh.Trimesh(points, faces, process=False)
     assert surface.is_watertight
-    assert surface.volume == pytest.approx(VOLUME[CELLS[kind][0].removeprefix("quadratic ")])
+    assert surface.volume == pytest.approx(volume)
     assert set(surface.faces.ravel()) == set(range(len(points)))
 
 

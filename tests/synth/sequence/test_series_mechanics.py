@@ -1,0 +1,183 @@
+"""Another program's states as a sequence: sealed, verified, with the program's own motion and force."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from command import run
+from pressed_block import PLACE, POISSON, STATES, STEP_S, YOUNG_KPA, solve, write
+from scipy import ndimage
+
+import synth
+from synth.arrays import Floats
+from synth.checks.verify import verify_dataset
+from synth.cli import app
+from synth.errors import Caution, UserError
+from synth.job import identity
+from synth.job.schema import Job
+from synth.render.camera import camera
+from synth.sequence.scene import draw_craniotomy
+
+SMALL = [
+    "sequences=1",
+    f"frames={STATES}",
+    f"fps={1 / STEP_S}",
+    "render.size=[96,72]",
+    "anatomy.vertices=1500",
+]
+TISSUE = [f"fem.young_kpa={YOUNG_KPA}", f"fem.poisson={POISSON}", "mechanics.unit_mn=1"]
+FORCE = [*TISSUE, "mechanics.force=nodal:contact"]
+
+
+def job_of(source: Path, *more: str) -> Job:
+    files = [f"mechanics.source={source}", "mechanics.unit_mm=1", f"mechanics.dt_s={STEP_S}", PLACE]
+    return synth.load_job("tiny", ["fem.load=[0.05,0.4]", "fem.tets=1600", *SMALL, *files, *more])
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("block"), "binary")
+
+
+@pytest.mark.slow
+def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp_path: Path) -> None:
+    """One state per frame; then at twice the rate; the exported surface, rendered again, is the same."""
+    synth.render_job(job_of(source, *FORCE), tmp_path / "a", workers=1)
+    found = verify_dataset(tmp_path / "a")
+    assert found.good, found.lines()
+    sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
+    turn, true = np.array(sequence.attrs["rotation"]), -solve().scale[:, None] * solve().reaction
+    np.testing.assert_allclose(sequence["force"][:], true @ turn.T, rtol=1e-4, atol=1e-4)
+    assert {one.name: one.count for one in found.checks}["work"] == 1
+    assert sequence.attrs["mechanics"]["law"] == "external"
+    run(app, "export", tmp_path / "a", tmp_path / "vtu", "--to", "vtu")
+    place = "anatomy.craniotomy={point: [0, 0, 0], direction: [0, 0, 1], radius_mm: 10}"
+    again = job_of(tmp_path / "vtu" / "000000.pvd", *FORCE, place, "mechanics.force=nodal:force")
+    second = synth.simulate(again, 0)
+    np.testing.assert_allclose(second.force, sequence["force"][:], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_flow_is_the_projection_of_the_engines_nodes(source: Path) -> None:
+    """Of a fine mesh, between whose nodes motion is smooth; without veins, which would stand out of it."""
+    fine = ["anatomy.vertices=160000", "render.size=[320,240]", "flow.backend=ideal"]
+    folder = write(source.parent / "fine", "npz", spacing_mm=1.5)
+    scene = synth.simulate(job_of(folder, *FORCE, *fine), 0, content=draw_craniotomy)
+    block, t, frame = solve(1.5), 2, scene.frame(2)
+    top = np.isclose(block.points[:, 2], 0) & (np.hypot(*block.points[:, :2].T) < 8)
+    assert scene.brain is not None
+    turn, shift = scene.brain.to_world[:3, :3], scene.brain.to_world[:3, 3]
+    rest, moved = (at[top] @ turn.T + shift for at in (block.points, block.points + block.scale[t] * block.u))
+    start = camera.project(scene.view, rest)
+    true = camera.project(frame.camera, moved) - start
+    inside = ndimage.map_coordinates(scene.tissue.astype(float), start.T[::-1], order=1) == 1
+    found = [ndimage.map_coordinates(frame.flow[..., d], start.T[::-1], np.float64, order=3) for d in (0, 1)]
+    off = np.linalg.norm(np.stack(found, axis=1) - true, axis=1)[inside]
+    assert inside.sum() > 50
+    assert np.linalg.norm(true, axis=1).max() > 2
+    assert np.median(off) < 1.5e-3
+    assert off.max() < 1e-2
+
+
+def test_frames_lie_between_states_and_other_axes_turn_the_result(source: Path, tmp_path: Path) -> None:
+    plain = synth.simulate(job_of(source, *FORCE), 0)
+    twice = synth.simulate(job_of(source, *FORCE, f"frames={2 * STATES - 1}", f"fps={2 / STEP_S}"), 0)
+    np.testing.assert_allclose(twice.motion.displacement[::2], plain.motion.displacement, atol=1e-9)
+    middle = (plain.force[1:] + plain.force[:-1]) / 2
+    np.testing.assert_allclose(twice.force[1::2], middle, rtol=1e-6, atol=1e-6)
+    with np.load(write(tmp_path, "npz")) as held:
+        arrays = {name: one[..., [1, 2, 0]] if one.shape[-1] == 3 else one for name, one in held.items()}
+    np.savez(tmp_path / "turned.npz", **arrays)
+    place = "anatomy.craniotomy={point: [0, 0, 0], direction: [0, 1, 0], radius_mm: 10}"
+    turned = synth.simulate(job_of(tmp_path / "turned.npz", *FORCE, place), 0)
+    sizes = [np.linalg.norm(one, axis=-1) for one in (turned.force, plain.force)]
+    np.testing.assert_allclose(*sizes, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(turned.motion.force[:, 2], plain.motion.force[:, 2], rtol=1e-5, atol=1e-5)
+
+
+def table(source: Path, name: str, tip: Floats) -> None:
+    rows = [f"{STEP_S * k},{x},{y},{z},0,0,2" for k, (x, y, z) in enumerate(tip.tolist())]
+    (source.parent / name).write_text("time,x0,y0,z0,u0,v0,w0\n" + "\n".join(rows) + "\n")
+
+
+@pytest.mark.slow
+def test_instruments_follow_their_table(source: Path) -> None:
+    """The tip is where the load is, by the check of contacts in pixels; it hides the tissue under it."""
+    tip = np.array([1.0, 0.0, 0.0]) + np.outer(solve().scale, [0.3, 0, -1.0])
+    table(source, "tips.csv", tip)
+    scene = synth.simulate(
+        job_of(source, *FORCE, "mechanics.instruments=tips.csv", "fem.instrument=suction"), 0
+    )
+    assert scene.brain is not None
+    turn, shift = scene.brain.to_world[:3, :3], scene.brain.to_world[:3, 3]
+    np.testing.assert_allclose(scene.motion.tip[:, 0], tip @ turn.T + shift, atol=1e-9)
+    np.testing.assert_allclose(scene.motion.shaft[:, 1], np.broadcast_to(turn[:, 2], (STATES, 3)), atol=1e-9)
+    np.testing.assert_allclose(scene.motion.by_instrument[:, 0], scene.motion.force)
+    assert scene.frame(2).tool.any()
+
+
+@pytest.mark.slow
+def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path) -> None:
+    synth.render_job(job_of(source), tmp_path / "a", workers=1)
+    assert verify_dataset(tmp_path / "a").good
+    sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
+    assert not {"force", "traction"} & set(sequence.fields)
+    assert sequence.attrs["young_kpa"] is None
+    assert "peak_force_mn" not in sequence.attrs["summary"]
+    for form, works in (("folder", 0), ("video", 0), ("endonerf", 0), ("lerobot", 2), ("d2fnet-npz", 2)):
+        run(app, "export", tmp_path / "a", tmp_path / form, "--to", form, code=works)
+    assert np.isnan(synth.simulate(job_of(source), 0).force).all()
+
+
+def test_load_outside_the_opening_is_reported(source: Path) -> None:
+    place = PLACE.replace("point: [0", "point: [10")
+    with pytest.warns(Caution, match=r"mechanics\.force: .* mN, [3-7]\d%.* 0.00 mN"):
+        scene = synth.simulate(job_of(source, *FORCE, place), 0)
+    np.testing.assert_allclose(scene.motion.force[2], -solve().reaction, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (["fem.membrane.probability=1"], "membrane"),
+        (["fem.young_kpa=[1,2]"], "young_kpa"),
+        (["anatomy.mesh=brain.obj"], "mesh"),
+        (["frames=20"], "frames=5"),
+        (["mechanics.source="], r"mechanics\.dt_s"),
+        (["mechanics.force=", "store.extra=[intensity]"], "intensity"),
+    ],
+)
+def test_a_job_that_does_not_suit_is_refused(more: list[str], named: str, source: Path) -> None:
+    (source.parent / "brain.obj").touch()
+    with pytest.raises(UserError, match=named):
+        synth.simulate(job_of(source, *FORCE, *more), 0)
+
+
+def test_files_enter_the_identity_by_content_and_folders_take_turns(tmp_path: Path) -> None:
+    for name in ("run_a", "run_b"):
+        write(tmp_path / name, "ascii")
+    job = job_of(tmp_path / "run_*", *FORCE, "sequences=3")
+    assert [one.name for one in identity.list_sources(job.mechanics)] == ["run_a", "run_b"]
+    before, file = identity.identify_job(job), tmp_path / "run_b" / "block_3.vtu"
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("run_a", "run_b"):
+        (tmp_path / name).rename(tmp_path / "elsewhere" / name)
+    moved = job_of(tmp_path / "elsewhere" / "run_*", *FORCE, "sequences=3")
+    assert identity.identify_job(moved) == before
+    file = tmp_path / "elsewhere" / "run_b" / file.name
+    file.write_text(file.read_text().replace("0.1", "0.2", 1))
+    assert identity.identify_job(moved) != before
+
+
+@pytest.mark.parametrize("form", ["binary", "recorder", "npz"])
+def test_new_writes_a_job_that_can_be_simulated(form: str, tmp_path: Path) -> None:
+    source = write(tmp_path / "run_1", form)
+    run(app, "new", tmp_path / "job.yaml", "--from-series", source)
+    values = yaml.safe_load((tmp_path / "job.yaml").read_text())
+    assert values["frames"] == STATES
+    assert values["anatomy"]["craniotomy"]["point"] == pytest.approx([0, 0, 0], abs=3)
+    scene = synth.simulate(synth.load_job(tmp_path / "job.yaml", ["anatomy.vertices=1500"]), 0)
+    assert np.linalg.norm(scene.motion.displacement, axis=2).max() == pytest.approx(
+        float(np.linalg.norm(solve().u, axis=1).max()), rel=0.1
+    )
