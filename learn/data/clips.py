@@ -104,6 +104,8 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     tissue, or if values don't match their seal."""
     wanted = tuple(wanted)
     check_readable(sequence, wanted)
+    if sequence.attrs.get("young_kpa") is None:
+        raise UserError(f"{sequence.path}: lacks the attribute young_kpa; set fem.young_kpa in its job")
     young, scale = (float(sequence.attrs[name]) for name in ("young_kpa", "scale_mm_per_px"))
     tissue, area, force = (sequence.read_whole(name) for name in ("tissue", "area", "force"))
     view = GridView(tissue, scale, grid)
@@ -136,7 +138,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
 
 
 def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
-    """Raises UserError if a store lacks a displacement of `FIELDS`, its scale or its stiffness."""
+    """Raises UserError if a store lacks a displacement of `FIELDS`, or its scale."""
     for source in wanted:
         if FIELDS[source] not in sequence:
             what = "stereo motion" if has_depth(source) else f"{source} flow"
@@ -144,8 +146,8 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
             others = [f"use --input {one}" for one in alike if FIELDS[one] in sequence]
             hint = ", or ".join([_CURE[source], *others[:1]])
             raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
-    if any(sequence.attrs.get(name) is None for name in ("young_kpa", "scale_mm_per_px")):
-        raise UserError(f"{sequence.path}: lacks the attribute young_kpa or scale_mm_per_px")
+    if sequence.attrs.get("scale_mm_per_px") is None:
+        raise UserError(f"{sequence.path}: lacks the attribute scale_mm_per_px")
 
 
 def _plain(sequence: Sequence) -> dict[str, Any]:

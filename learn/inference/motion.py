@@ -96,8 +96,10 @@ def _sequences(path: Path) -> Iterator[Sequence]:
 
 def _stored(sequence: Sequence, source: str) -> Motion:
     check_readable(sequence, [source])
-    scale, young = (float(sequence.attrs[name]) for name in ("scale_mm_per_px", "young_kpa"))
-    time_s, tissue, force = (sequence.read_whole(name) for name in ("time", "tissue", "force"))
+    scale, time_s, tissue = (
+        float(sequence.attrs["scale_mm_per_px"]),
+        *map(sequence.read_whole, ("time", "tissue")),
+    )
 
     def frames() -> Iterator[FrameMotion]:
         confidences: Iterator[Any] = repeat(np.ones(tissue.shape, np.float32), sequence.frames)
@@ -117,9 +119,9 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         passes=iter([MotionPass(frames())]),
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
-        young_kpa=young,
+        young_kpa=sequence.attrs["young_kpa"],
         recovered_by=sequence.recovered_by if source in ("recovered", "motion") else "",
-        force_mn=np.linalg.norm(force, axis=1),
+        force_mn=np.linalg.norm(sequence.read_whole("force"), axis=1) if "force" in sequence else None,
     )
 
 

@@ -116,7 +116,7 @@ def test_figures_of_the_readme_are_those_of_stored_results() -> None:
     assert {figure for figure, page in shown if page == BY_HAND} <= set(by_hand)
 
 
-HOWTO = ("instruments", "export", "camera", "models", *PLUG_INS)
+HOWTO = ("instruments", "mechanics", "export", "camera", "models", *PLUG_INS)
 GIVEN = {
     "camera": """
 import numpy as np

@@ -99,39 +99,39 @@ def test_coincident_nodes_count_once_and_their_loads_add_up(tmp_path: Path) -> N
 def change(name: str, old: str, new: str, form: str = "ascii") -> Callable[[Path], Path]:
     """A series with the first match of a pattern in one of its files replaced."""
 
-    def spoil(folder: Path) -> Path:
+    def made(folder: Path) -> Path:
         source, file = write(folder, form), folder / name
         text = file.read_text("latin-1")
         assert re.search(old, text, re.DOTALL)
         file.write_text(re.sub(old, new, text, count=1, flags=re.DOTALL), "latin-1")
         return source
 
-    return spoil
+    return made
 
 
 def arrays(**changed: Callable[[Floats], Floats] | None) -> Callable[[Path], Path]:
     """An .npz with arrays changed, or left out."""
 
-    def spoil(folder: Path) -> Path:
+    def made(folder: Path) -> Path:
         source = write(folder, "npz")
         with np.load(source) as held:
-            kept = dict(held)
+            every = dict(held)
         for name, how in changed.items():
-            value = kept.pop(name)
-            kept |= {} if how is None else {name: how(value)}
-        np.savez(source, **kept)
+            value = every.pop(name)
+            every |= {} if how is None else {name: how(value)}
+        np.savez(source, **every)
         return source
 
-    return spoil
+    return made
 
 
 def without(name: str, form: str) -> Callable[[Path], Path]:
-    def spoil(folder: Path) -> Path:
+    def made(folder: Path) -> Path:
         source = write(folder, form)
         (folder / name).unlink()
         return source
 
-    return spoil
+    return made
 
 
 def remeshed(folder: Path) -> Path:
@@ -206,8 +206,8 @@ BAD: dict[str, tuple[str, Callable[[Path], Path]]] = {
 
 @pytest.mark.parametrize("what", BAD)
 def test_a_bad_series_is_refused_in_one_line_that_names_it(what: str, tmp_path: Path) -> None:
-    named, spoil = BAD[what]
-    source = spoil(tmp_path)
+    named, made = BAD[what]
+    source = made(tmp_path)
     with pytest.raises(UserError, match=named) as refused:
         read(source)
     assert "\n" not in str(refused.value)
@@ -235,6 +235,6 @@ def test_a_bad_table_is_refused_by_name(table: str, named: str, tmp_path: Path) 
     ("units", "key"),
     [(Units(None, 1, 0.1), "unit_mm"), (Units(1, None, 0.1), "unit_mn"), (Units(1, 1), "dt_s")],
 )
-def test_what_files_do_not_state_is_asked_for(units: Units, key: str, tmp_path: Path) -> None:
+def test_what_files_do_not_state_is_needed(units: Units, key: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=rf"mechanics\.{key}"):
         read_series(write(tmp_path, "ascii"), units, FORCE)

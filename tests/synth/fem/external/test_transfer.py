@@ -59,7 +59,7 @@ def test_force_keeps_its_size_and_nearly_its_place() -> None:
     assert not transfer.borne[np.abs(points[:, 0]) > 19.5].any()
 
 
-def test_work_of_a_smooth_load_is_kept() -> None:
+def test_work_of_a_smooth_load_is_preserved() -> None:
     points, faces = cap(41)
     transfer = attach(points, faces, FINE)
     load = dent(points)
