@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Ints
 from synth.errors import UserError
 from synth.fem.surface_embedding import vertex_area
 from synth.geometry.triangles import Shape
@@ -15,6 +15,16 @@ _ROUNDING = 1e-6
 """Part of a quantity's largest value that passes for 0: other engines may compute in single precision."""
 _LOADS = "traction", "force", "by_instrument"
 _OPTIONAL = ("min_jacobian", "energy", "residual", "tool_work", "pulse_work")
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Quadratic tetrahedra under a surface over T frames, world axes."""
+
+    points: Floats  # (N, 3) mm at rest
+    cells: Ints  # (M, 10) in VTK's order
+    displacement: Floats  # (T, N, 3) mm
+    stress: Floats  # (T, N, 6) kPa at nodes: Cauchy's xx yy zz xy yz xz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +57,8 @@ class Deformation:
     tool_work: Floats | None = None
     """(T,) mN mm, half of traction times the motion by the instruments alone: without a pulse, and under the
     linear law, the energy."""
+    volume: Volume | None = None
+    """The volume under the surface, where `FemMechanics` was to return it."""
     pulse_work: Floats | None = None
     """(T,) mN mm, half of traction times the motion by the pulse alone."""
 

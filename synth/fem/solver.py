@@ -10,7 +10,7 @@ import numpy as np
 from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem import surface_embedding, tool_gesture
-from synth.fem.deformation import Deformation
+from synth.fem.deformation import Deformation, Volume
 from synth.fem.equilibrium import solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
@@ -22,6 +22,7 @@ from synth.job import schema
 from synth.job.laws import check_load
 
 _STEP_S = 0.03  # longest time step of dynamics
+_TO_VTK = [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]  # order of a tetrahedron's nodes in VTK
 _DAMPING = 2.0  # mass-proportional, 1/s
 _DENSITY_KG_M3 = 1040.0  # of grey and white matter (Barber et al., Acta Neurol. Scand. 46, 1970)
 
@@ -37,6 +38,7 @@ def deform(
     pulse: Pulse | None = None,
     opening_mm: float = schema.CraniotomySection().radius_mm,
     motions: Sequence[ToolMotion] = (),
+    inside: bool = False,
 ) -> Deformation:
     """Deformation of a brain by the gestures of its instruments.
 
@@ -47,6 +49,7 @@ def deform(
         frames, fps: T >= 2, and their rate in 1/s.
         pulse, opening_mm: no part of force and traction; radius of the craniotomy, which is exposed to it.
         motions: of the gestures, over T frames each; their own trajectories if there are none.
+        inside: whether the volume's motion and stress are returned too.
 
     Raises UserError: the load is past the law's range, or the contact is not on the surface; and as
     `equilibrium.solve_path`.
@@ -72,9 +75,14 @@ def deform(
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))
     pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
+    under = None
+    if inside:
+        stress = tissue.young_kpa * np.stack([system.cauchy(u) for u in path.displacement])
+        under = Volume(tets.points, tets.cells[:, _TO_VTK], np.asarray(path.displacement), stress)
     return Deformation(
         displacement=displacement,
         traction=traction,
+        volume=under,
         **_instruments(tools, surface, displacement),
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,

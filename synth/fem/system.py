@@ -60,8 +60,34 @@ class System:
 
     def state(self, u: Floats) -> State:
         """Energy and forces at (N, 3) mm."""
-        (mu, lam), weight = lame(1.0, self.poisson), self.mesh.weight
         strain = _strain(self.mesh, u)
+        answer, energy = self._stress(strain)
+        force = np.empty_like(u)
+        divergence(self.mesh.cells, self.mesh.slope, self.mesh.weight, answer, force)
+        spring = self.springs(u)
+        energy += 0.5 * float(np.vdot(u, spring))
+        force += spring
+        if self.membrane is not None:
+            energy += self.membrane.pull(u, force)
+        return State(energy, force)
+
+    def cauchy(self, u: Floats) -> Floats:
+        """Stress (N, 6) xx yy zz xy yz xz for E = 1 kPa at (N, 3) mm: a node's elements, by volume."""
+        strain = _strain(self.mesh, u)
+        sigma = self._stress(strain)[0]
+        if self.law != "linear":  # which knows one stress, of small strain
+            f = strain + np.eye(3)
+            sigma = sigma @ f.swapaxes(1, 2) / np.linalg.det(f)[:, None, None]
+        cells, weight = self.mesh.cells, self.mesh.weight
+        parts = sigma[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]].reshape(*weight.shape, 6)
+        whole, volume = np.zeros((len(u), 6)), np.zeros(len(u))
+        np.add.at(whole, cells, np.einsum("mq,mqk->mk", weight, parts)[:, None])
+        np.add.at(volume, cells, weight.sum(axis=1)[:, None])
+        return whole / volume[:, None]
+
+    def _stress(self, strain: Floats) -> tuple[Floats, float]:
+        """First Piola-Kirchhoff stress (M * Q, 3, 3) kPa and energy mN mm at displacement gradients."""
+        (mu, lam), weight = lame(1.0, self.poisson), self.mesh.weight
         answer, density = np.empty_like(strain), np.empty(len(strain))
         if self.law in NUMBER:
             stress(NUMBER[self.law], strain, mu, lam - self.averaged, answer, density)
@@ -71,14 +97,7 @@ class System:
         if self.averaged:
             swelling = NUMBER.get(self.law, NUMBER["neo-hookean"])  # of a plug-in: log J
             energy += resist_swelling(swelling, strain, weight, self.averaged, answer)
-        force = np.empty_like(u)
-        divergence(self.mesh.cells, self.mesh.slope, weight, answer, force)
-        spring = self.springs(u)
-        energy += 0.5 * float(np.vdot(u, spring))
-        force += spring
-        if self.membrane is not None:
-            energy += self.membrane.pull(u, force)
-        return State(energy, force)
+        return answer, energy
 
     def springs(self, u: Floats) -> Floats:
         """Force (N, 3) mN of the springs at (N, 3) mm."""

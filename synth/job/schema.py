@@ -104,8 +104,8 @@ class MechanicsSection(Section):
 
     source: Path | None = None
     """Files of a deforming surface or volume: numbered .vtu, .vtk or .vtp as a pattern with *, a collection
-    of them (.pvd, .series), a folder with either or with a run of the published recorder, or an .npz;
-    relative to the job file. A pattern that ends in */ names folders, used by sequences in turn. Its surface
+    of them (.pvd, .series), a run of the published recorder, an .npz, or a folder with one of these; relative
+    to the job file. A pattern that ends in */ names folders, used by sequences in turn. Its surface
     at rest takes the place of `anatomy.mesh`. Empty: our own finite elements."""
     unit_mm: Positive | None = None
     """Millimetres in the files' unit of length: 1000 for m."""

@@ -1,4 +1,4 @@
-"""A first job for another program's series: what can be read from the files is stated, the rest is left open."""
+"""A first job for another program's series: what files state is set, the rest is left open."""
 
 from __future__ import annotations
 

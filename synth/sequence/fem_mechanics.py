@@ -22,6 +22,9 @@ class FemMechanics:
     motions: Sequence[ToolMotion] = ()
     """Of the instruments, over T frames each; the gestures' own trajectories if there are none."""
 
+    inside: bool = False
+    """Whether to return the volume's motion and stress too."""
+
     def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
         """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
         motions = self.motions and check_motions(self.motions, rest.scenario.gestures, rest.job.frames)
@@ -31,7 +34,9 @@ class FemMechanics:
         report("fem", 0, 1)
         with watch.stage("fem"):
             tissue, duration = (job.fem, case.tissue, case.gestures), (job.frames, job.fps)
-            return solver.deform(*tissue, tets, rest.shape, *duration, case.pulse, opening_mm, motions)
+            return solver.deform(
+                *tissue, tets, rest.shape, *duration, case.pulse, opening_mm, motions, self.inside
+            )
 
 
 def build_volume(rest: RestScene) -> Tets:

@@ -46,8 +46,8 @@ def read_series(
     """The series in `source`, of any kind.
 
     Args:
-        source: a pattern with * or a collection of VTK files, a folder that holds either or a run of the
-            published recorder, or an .npz.
+        source: a pattern with * or a collection of VTK files, a run of the published recorder, an .npz,
+            or a folder that holds one of these.
         units: what the files do not state.
         force: `nodal:NAME`, `traction:NAME`, or a table of the total force, a .csv in the folder of the files
             (see `press`). None: it is not known.
@@ -60,6 +60,8 @@ def read_series(
     folder = source if source.is_dir() else source.parent
     table = folder / force if force is not None and force.lower().endswith(".csv") else None
     field, run = None if table else force, find_run(source) if source.is_dir() else None
+    if source.is_dir() and len(alone := list(source.glob("*.npz"))) == 1:
+        source = alone[0]
     if run is not None or source.suffix == ".npz":
         found = read_arrays(run or source, units, field, recorded=run is not None)
     else:

@@ -51,6 +51,21 @@ def test_stiffness_is_scikit_fems() -> None:
     assert error <= 1e-12 * abs(ours).max()
 
 
+@pytest.mark.parametrize("law", ["linear", "neo-hookean"])
+def test_stress_at_nodes_is_that_of_a_uniform_strain(law: str) -> None:
+    tets, (mu, lam), one = cube(), lame_parameters(1.0, 0.4)[::-1], np.eye(3)
+    strain = np.array([[0.05, 0.02, -0.03], [0.01, -0.04, 0.02], [0.03, 0.0, 0.06]])
+    f = one + strain
+    j = np.linalg.det(f)
+    true = mu * (strain + strain.T) + lam * np.trace(strain) * one
+    if law == "neo-hookean":
+        true = (mu * (f @ f.T - one) + lam * np.log(j) * one) / j
+    found = assemble(tets, law, 0.4).cauchy(tets.points @ strain.T)
+    np.testing.assert_allclose(
+        found, np.tile(true[[0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]], (len(found), 1)), atol=1e-12
+    )
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_patch(law: str) -> None:
     """Under a uniform strain on the boundary, the inside follows it: forces at inner nodes vanish."""
