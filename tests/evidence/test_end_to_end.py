@@ -1,17 +1,22 @@
-"""Whole pipelines: errors of known estimates, orientations of clips, ridge, the cache."""
+"""Pipelines, learning curves and the gap: errors of known estimates, held-out data, ridge, noise, cache."""
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from made_clip import made_clip
 from numpy.typing import NDArray
 
-from evidence import cache
+from evidence import cache, gap
+from evidence.curves import experiment
+from evidence.curves.experiment import GRID, SAME, Estimator
 from evidence.end_to_end import models
 from learn.data.clips import Clip
 from synth.dataset import provenance
+from synth.errors import UserError
 
 N, T = 16, 6
 
@@ -81,3 +86,95 @@ def test_cached_results_depend_on_inputs_and_code(tmp_path: Path, monkeypatch: p
     assert hashes[0] != hashes[1]
     monkeypatch.setattr(cache, "code", lambda: hashes[1])
     assert count("a", ["b"]) == 3
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    """Clips whose displacement is the force, all over the grid."""
+    rng, made = np.random.default_rng(1), []
+    for k in range(12):
+        force = rng.normal(size=(6, 3))
+        moved = np.broadcast_to(force[:, :, None, None], (6, 3, GRID.size, GRID.size)).astype(np.float32)
+        one = made_clip(k, moved[:, :2], 2.0 * force)
+        fields = {"recovered": moved[:, :2], "motion": moved}
+        sure = np.ones((6, 2, GRID.size, GRID.size), np.float32)
+        density = moved / GRID.extent_mm**2
+        made.append(replace(one, displacement=fields, motion_confidence=sure, density=density))
+    return made
+
+
+def row(one: Estimator, clips: list[Clip], work: Path) -> dict[str, Any]:
+    """Errors on the first four clips after fitting on the last six."""
+    tests = {SAME: (clips[:4], [k % 2 == 0 for k in range(4)])}
+    (found,) = experiment.measure_estimator(one, clips[4:], 2, tests, 10, 3600.0, work)
+    return found
+
+
+def test_ridge_estimates_force_in_stereo_and_its_lateral_part_monocular(
+    clips: list[Clip], tmp_path: Path
+) -> None:
+    two = row(Estimator("ridge", 2, 6), clips, tmp_path)
+    one = row(Estimator("ridge", 1, 6), clips, tmp_path)
+    assert two["whole"][0] < 0.02
+    assert two["gain"] == pytest.approx(1, abs=0.02)
+    assert one["across"][0] < 0.02
+    assert one["along"][0] > 0.3
+    assert two["cpu_h"] == pytest.approx(6, abs=0.1)
+
+
+def test_tested_sequences_are_held_out(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: dict[str, list[str]] = {}
+
+    def fitted(one: Estimator, fit: list[Clip], select: list[Clip], steps: int, work: Path) -> object:
+        used.update(fit=[c.content_hash for c in fit], select=[c.content_hash for c in select])
+        return lambda clip: used.setdefault("test", []).append(clip.content_hash) or clip.force
+
+    monkeypatch.setattr(experiment, "fitted", fitted)
+    assert row(Estimator("ridge", 2, 6), clips, tmp_path)["whole"][0] == 0
+    assert used == {"fit": [*map(str, range(6, 12))], "select": ["4", "5"], "test": ["0", "1", "2", "3"]}
+
+
+def test_share_closed_of_known_errors() -> None:
+    rng = np.random.default_rng(0)
+    base = rng.uniform(0.9, 1.1, 30)
+    got = gap.closed(8 * base, 4 * base)
+    assert got["share"] == pytest.approx(4 / 8, rel=1e-9)
+    assert got["interval"] == pytest.approx([0.5, 0.5], abs=1e-6)  # proportional pairs: no uncertainty
+    none = gap.closed(-0.3 * rng.normal(size=20), np.ones(20))
+    assert none["share"] is None
+    assert none["undefined"]
+
+
+def test_fitted_noise_is_that_added() -> None:
+    rng = np.random.default_rng(1)
+    mask = np.zeros((48, 48), np.float32)
+    mask[6:-6, 6:-6] = 1
+    ideal = [np.cumsum(rng.normal(size=(6, 2, 1, 1)), axis=0).astype(np.float32) * mask for _ in range(8)]
+    true = gap.Noise(0.9, 0.12, 2.0)
+    both = [{"ideal": i, "recovered": true.add(i, mask, rng)} for i in ideal]
+    clips = [
+        replace(made_clip(k, one["ideal"], np.zeros((6, 3)), mask), displacement=one)
+        for k, one in enumerate(both)
+    ]
+    found = gap.fit_noise(clips)
+    assert found.gain == pytest.approx(0.9, abs=0.02)
+    assert found.sigma_mm == pytest.approx(0.12, rel=0.1)
+    assert found.reach_cells == pytest.approx(2.0, rel=0.1)
+    assert not true.add(ideal[0], mask, rng)[:, :, 0, 0].any()
+
+
+def test_the_parts_share_no_anatomy() -> None:
+    def made(name: str, count: int) -> list[Any]:
+        return [SimpleNamespace(group=f"{name}{k // 2}", content_hash=f"{name}{k}") for k in range(count)]
+
+    ours, theirs = made("a", 60), made("b", 8)
+    split, tested = gap.parts(ours, theirs)
+    assert split.test == tuple(range(60, 68))
+    parts = [set(split.fit), set(split.select), set(tested)]
+    assert set.union(*parts) == set(range(60))
+    anatomies = [{i // 2 for i in part} for part in parts]
+    assert sum(map(len, anatomies)) == len(set.union(*anatomies))
+    with pytest.raises(UserError):
+        gap.parts(ours, made("a", 4))

@@ -47,7 +47,7 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
         card.write_card(folder)
 
 
-def start(root: Path, job: Job, work: str, **environment: str) -> subprocess.Popen[bytes]:
+def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
     """Starts a run in a process of its own, which can be killed."""
     # Tests in a shell's background ignore SIGINT, and so would their children.
     program = (
@@ -56,7 +56,7 @@ def start(root: Path, job: Job, work: str, **environment: str) -> subprocess.Pop
         "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
     )
     words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
-    return subprocess.Popen([sys.executable, "-c", program, *words], env={**os.environ, **environment})
+    return subprocess.Popen([sys.executable, "-c", program, *words])
 
 
 def run_here(root: Path, job: str, work: str) -> None:

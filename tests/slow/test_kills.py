@@ -3,13 +3,10 @@
 import os
 import shutil
 import signal
-import socket
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -78,47 +75,28 @@ def test_a_run_that_is_killed_again_and_again_makes_the_same_dataset(tmp_path: P
     assert good["seal"]
 
 
-@contextmanager
-def local_cluster(workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and `workers` worker processes on this machine: `host:port`, and the workers' processes."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-
-    def begin(module: str, *words: str) -> subprocess.Popen[bytes]:
-        program = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard"]
-        quiet = subprocess.DEVNULL
-        return subprocess.Popen([*program, *words], stdout=quiet, stderr=quiet, start_new_session=True)
-
-    scheduler = begin("dask_scheduler", "--port", port)
-    processes = [
-        begin("dask_worker", f"tcp://127.0.0.1:{port}", "--nthreads", "1", "--no-nanny")
-        for _ in range(workers)
-    ]
-    try:
-        yield f"127.0.0.1:{port}", processes
-    finally:
-        for process in [*processes, scheduler]:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
 def test_a_lost_dask_worker_changes_no_byte(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-    root = tmp_path / "cluster"
-    with local_cluster(2) as (address, processes):
+    import psutil
+    from distributed.deploy.subprocess import SubprocessCluster
+
+    root, here = tmp_path / "cluster", "127.0.0.1"
+    alone = {"n_workers": 2, "threads_per_worker": 1, "worker_class": "distributed.Worker"}
+    with SubprocessCluster(host=here, dashboard_address=f"{here}:0", **alone) as cluster:
+        victim = psutil.Process(cluster.workers[0].process.pid)
 
         def kill_half_way() -> None:
             wait_for(lambda: len(list(root.glob("[0-9]*.zarr"))) >= 2)
-            os.killpg(processes[0].pid, signal.SIGKILL)
+            for process in (*victim.children(recursive=True), victim):
+                process.kill()
 
         killer = threading.Thread(target=kill_half_way, daemon=True)
         killer.start()
-        made = engine.run_job(JOB, root, options("slow", workers=None, engine=f"dask://{address}"), Silent())
+        address = cluster.scheduler_address.replace("tcp", "dask")
+        made = engine.run_job(JOB, root, options("slow", workers=None, engine=address), Silent())
         killer.join(timeout=10)
-        assert processes[0].poll() is not None, "none was killed"
-    here = engine.run_job(JOB, tmp_path / "local", options("sequence"), Silent())
+        assert not killer.is_alive(), "none was killed"
+    calm = engine.run_job(JOB, tmp_path / "local", options("sequence"), Silent())
     assert (made.done, made.failed) == (6, {})
-    assert made.content_hash == here.content_hash
+    assert made.content_hash == calm.content_hash
     assert not list(root.glob("*.part"))

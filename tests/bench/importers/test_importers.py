@@ -14,6 +14,7 @@ from bench.cli import app
 from bench.importers import registry
 from bench.recording.folder import open_recording
 from synth.errors import UserError
+from tests.bench.importers.test_stereo_bag import writing
 
 TIMES = np.array([0.0, 0.11, 0.19, 0.3])
 FORCE = np.array([[0.0, 0, 0], [0.1, 0, -0.2], [0.2, 0.1, 0], [0.0, 0, 0.05]])
@@ -56,35 +57,17 @@ LATE_S = 1e6  # offset of the bag's own clock
 
 def mcap(path: Path, unstamped: str = "") -> Path:
     """A ROS 2 bag folder; the topic `unstamped` has no times of its own."""
-    pytest.importorskip("rosbags", reason="rosbags is not installed")
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    kind = store.types
-    image, wrench = kind["sensor_msgs/msg/Image"], kind["geometry_msgs/msg/WrenchStamped"]
-    vector, point = kind["geometry_msgs/msg/Vector3"], kind["geometry_msgs/msg/Point"]
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        written = {
-            name: bag.add_connection(name, message.__msgtype__, typestore=store)
-            for name, message in (("/camera", image), ("/ft", wrench), ("/tip", point))
-        }
-        for k, picture in enumerate(footage()):
-
-            def head(name: str, time_s: float = TIMES[k]) -> object:
-                nanoseconds = 0 if name == unstamped else round(1e9 * time_s)
-                stamp = kind["builtin_interfaces/msg/Time"](nanoseconds // 10**9, nanoseconds % 10**9)
-                return kind["std_msgs/msg/Header"](stamp, "")
-
+    with writing(path) as (kind, put):
+        vector = kind["geometry_msgs/msg/Vector3"]
+        for time_s, picture, newtons in zip(TIMES, footage(), FORCE, strict=True):
             bgr = np.ascontiguousarray(picture[..., ::-1]).ravel()
-            force = kind["geometry_msgs/msg/Wrench"](vector(*FORCE[k]), vector(0.0, 0.0, 0.0))
-            for name, message in (
-                ("/camera", image(head("/camera"), 12, 16, "bgr8", 0, 48, bgr)),
-                ("/ft", wrench(head("/ft"), force)),
-                ("/tip", point(1.0, 2.0, 3.0)),
+            force = kind["geometry_msgs/msg/Wrench"](vector(*newtons), vector(0.0, 0.0, 0.0))
+            for topic, name, values in (
+                ("/camera", "sensor_msgs/msg/Image", (12, 16, "bgr8", 0, 48, bgr)),
+                ("/ft", "geometry_msgs/msg/WrenchStamped", (force,)),
             ):
-                raw = store.serialize_cdr(message, message.__msgtype__)
-                bag.write(written[name], round(1e9 * (LATE_S + TIMES[k])), raw)
+                put(topic, name, LATE_S + time_s, *values, stamp_s=0 if topic == unstamped else time_s)
+            put("/tip", "geometry_msgs/msg/Point", LATE_S + time_s, 1.0, 2.0, 3.0)
     return path
 
 

@@ -1,5 +1,7 @@
 """A bag as surgical robots record them: two compressed cameras, two wrenches, calibrations."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +37,29 @@ def lenses(pair: tuple[np.ndarray, np.ndarray], bent: list[np.ndarray]) -> dict[
     return {camera: {"k": K.ravel(), "d": d, "r": R.ravel(), "p": P.ravel()} for camera, d, R, P in parts}
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[tuple[Any, Callable[..., None]]]:
+    """Types of messages, and a function that writes one; without `stamp_s` its type has no header."""
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind, made = store.types, dict[str, Any]()
+
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+
+        def put(topic: str, name: str, time_s: float, *values: Any, stamp_s: float | None = None) -> None:
+            stamp = kind["builtin_interfaces/msg/Time"](*divmod(round(1e9 * (stamp_s or 0)), 10**9))
+            head = () if stamp_s is None else (kind["std_msgs/msg/Header"](stamp, ""),)
+            if topic not in made:
+                made[topic] = bag.add_connection(topic, name, typestore=store)
+            message = kind[name](*head, *values)
+            bag.write(made[topic], round(1e9 * time_s), store.serialize_cdr(message, name))
+
+        yield kind, put
+
+
 def write_bag(
     path: Path,
     video: list[dict[str, Rgb]],
@@ -43,26 +68,10 @@ def write_bag(
     depths: tuple[np.ndarray, ...] = (),
 ) -> Path:
     """Pictures (H, W, 3) of the cameras, PSM1's force (N, 3) at 10 samples per frame; PSM2's is 0."""
-    pytest.importorskip("rosbags", reason="rosbags is not installed")
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    kind = store.types
-
-    def head(time_s: float) -> Any:
-        nanoseconds = round(1e9 * time_s)
-        stamp = kind["builtin_interfaces/msg/Time"](nanoseconds // 10**9, nanoseconds % 10**9)
-        return kind["std_msgs/msg/Header"](stamp, "")
-
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        made: dict[str, Any] = {}
+    with writing(path) as (kind, write):
 
         def put(topic: str, name: str, time_s: float, *values: Any) -> None:
-            message = kind[name](head(time_s), *values)
-            if topic not in made:
-                made[topic] = bag.add_connection(topic, name, typestore=store)
-            bag.write(made[topic], round(1e9 * time_s), store.serialize_cdr(message, name))
+            write(topic, name, time_s, *values, stamp_s=time_s)
 
         for camera, topic in CAMERAS.items():
             roi = kind["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)

@@ -1,4 +1,4 @@
-"""Masks of a recording: by frame, one for all, and the tracked region."""
+"""Masks of a recording: by frame, one for all, the tracked region, tissue that is found."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from fake_recording import Bump, Maker
 
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import picture_masks, track_recording
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.video import read as video
+from synth.video.read import read_mask
+from tests.synth.recording_flow.test_camera_motion import OPENING
+from tests.synth.recording_flow.test_find_tissue import RIM, SETTINGS, video
 
 _SIZE = (96, 128)
 
@@ -40,7 +43,7 @@ def test_masks_of_all_encodings_are_read(tmp_path: Path, kind: str) -> None:
     saved = {"0 and 1": tool, "alpha": alpha, "white": 255 * tool, "16 bits": tool.astype(np.uint16)}
     saved["soft"] = cv2.GaussianBlur(200 * tool, (0, 0), 1)
     assert cv2.imwrite(str(tmp_path / "m.png"), saved[kind])
-    assert np.sum(video.read_mask(tmp_path / "m.png", _SIZE) != tool) < 8
+    assert np.sum(read_mask(tmp_path / "m.png", _SIZE) != tool) < 8
 
 
 def test_only_the_region_is_tissue(tmp_path: Path) -> None:
@@ -61,3 +64,20 @@ def test_given_mask_is_masked_and_pictured(tmp_path: Path) -> None:
     assert found.rest is not None
     assert np.abs(picture.astype(int) - found.rest)[:, 40:].mean() < 1
     assert np.abs(picture.astype(int) - found.rest)[:, :30].mean() > 20
+
+
+def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
+    folder, contexts = make(frames=12, size=OPENING.shape), list[MethodContext]()
+    files = sorted((folder / "frames").iterdir())
+    for path, one in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
+        assert cv2.imwrite(str(path), one.rgb[..., ::-1])
+
+    def method(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        contexts.append(scene)
+        return ForceEstimate(np.zeros(3))
+
+    found = track_recording(open_recording(folder), {"own": method}, 0.2, SETTINGS)
+    tissue = contexts[-1].tissue
+    assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
+    assert ("missing", "tissue") in [(one.severity, one.cause) for one in found.findings]
+    assert picture_masks(found) is not None  # shows its outline

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from skimage import data
 
 from bench.checks import stereo
@@ -19,15 +18,11 @@ from bench.recording.folder import open_recording
 from bench.recording.right_pictures import StereoQuality
 from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import TrackedRecording, track_recording
-from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import RecordingFlowSettings
-from synth.render.camera.camera import Camera
+from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, ROWS, K
 
-SIZE = (160, 120)
-FOCAL, BASE, AWAY, FPS = 1370.0, 24.0, 300.0, 6.0
-K = np.array([[FOCAL, 0, 79.5], [0, FOCAL, 59.5], [0, 0, 1.0]])
-COLUMNS, ROWS = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+FPS = 6.0
 DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
 SETTINGS = RecordingFlowSettings(rate_hz=None, pulse=False, masks="none")
 Make = Callable[..., Path]
@@ -55,8 +50,7 @@ def rise(amount: float) -> np.ndarray:
 
 def write_pair(folder: Path) -> dict[str, object]:
     """Writes the calibration and returns its section of meta.yaml."""
-    right = K + np.array([[0, 0, FOCAL * BASE / AWAY], [0, 0, 0], [0, 0, 0]])
-    pair = {"K1": K, "D1": np.zeros(5), "K2": right, "D2": np.zeros(5)}
+    pair = {"K1": K, "D1": np.zeros(5), "K2": K_RIGHT, "D2": np.zeros(5)}
     pair |= {"R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}
     writer.write_storage(folder / "pair.yaml", pair)
     return {"calibration": "pair.yaml", "mm_per_unit": BASE}
@@ -154,21 +148,6 @@ def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, seco
     deepest = int(np.argmax(load))
     assert motion[1, deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
     assert done.stereo is not None
-
-
-def test_a_written_pair_is_read_back(tmp_path: Path) -> None:
-    """x_right = R x_left + T."""
-    rng = np.random.default_rng(0)
-    lenses = [
-        Camera(K + 0, np.array([-0.1, 0.02, 0, 0, 0]), turn, rng.normal(0, 20, 3), SIZE, 0.0, 0.0, 0.2)
-        for turn in Rotation.random(2, random_state=1).as_matrix()
-    ]
-    writer.write_pair(tmp_path / "pair.yaml", *lenses)
-    found = read_rig(tmp_path / "pair.yaml", SIZE)
-    point = rng.normal(0, 10, 3)
-    left, right = (lens.rotation @ point + lens.translation for lens in lenses)
-    np.testing.assert_allclose(found.rotation @ left + found.translation, right, atol=1e-6)
-    np.testing.assert_allclose(found.right.distortion, lenses[1].distortion, atol=1e-12)
 
 
 PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)

@@ -1,20 +1,27 @@
-"""`synth verify`: a good dataset passes, and each check finds the fault that it is made for."""
+"""`synth verify`: a good dataset passes, each check finds its fault; what others edited is refused."""
 
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import fake_work
 import foreign
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import zarr
 from fake_run import in_process
 
 from synth.checks import verify
-from synth.dataset import index
+from synth.dataset import index, split
+from synth.dataset.folder import claim
+from synth.dataset.store import open_sequence
+from synth.errors import UserError
 from synth.job.schema import Job
+from synth.publish.export.registry import export_dataset
 
 PAIR = {"size": (96, 72), "stereo_mm": 24.0}
 JOB = Job(seed=1, sequences=2, frames=5, render=PAIR, flow={"backend": "ideal"})
@@ -154,3 +161,41 @@ def broken_chunk(root: Path) -> None:
 def test_damage_is_found(dataset: Path, damage: Callable[[Path], object], found: set[str]) -> None:
     damage(dataset)
     assert failing(dataset) == found
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"young_kpa": np.nan}, {"frames": 10**9}, {"scenario": {"gestures": "pull"}}, {"format_version": 1}],
+)
+def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: dict[str, Any]) -> None:
+    foreign.edit_attributes(dataset / "000000.zarr", **changes)
+    with pytest.raises(UserError):
+        open_sequence(dataset / "000000.zarr")
+    assert "readable" in failing(dataset)
+
+
+def test_an_edited_sequence_is_not_exported(dataset: Path) -> None:
+    foreign.edit_attributes(dataset / "000000.zarr", reseal=False, young_kpa=2.0)
+    with pytest.raises(UserError):
+        export_dataset(dataset, dataset / "to", "folder")
+
+
+@pytest.mark.parametrize("text", ['{"by": 7}', "\x00"])
+def test_an_index_of_another_program_and_a_damaged_split_are_refused(dataset: Path, text: str) -> None:
+    pq.write_table(pa.table({"a": [1]}), dataset / "index.parquet")
+    with pytest.raises(UserError):
+        index.read_index(dataset)
+    assert "dataset" in failing(dataset)
+    (dataset / "split.json").write_text(text)
+    with pytest.raises(UserError, match="split"):
+        split.read_stored(dataset)
+
+
+def test_no_run_follows_a_link(dataset: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "precious").mkdir(parents=True)
+    shutil.rmtree(dataset / ".run/scratch")
+    (dataset / ".run/scratch").symlink_to(elsewhere)
+    with pytest.raises(UserError), claim(dataset, JOB):
+        pass
+    assert (elsewhere / "precious").is_dir()

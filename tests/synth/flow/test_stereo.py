@@ -1,14 +1,12 @@
 """Stereo: rectification against OpenCV's projections, and known motion in three dimensions."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 from synth.errors import UserError
-from synth.flow.stereo import calibration, depth_correction, depth_motion, rest
+from synth.flow.stereo import depth_correction, depth_motion, rest
 from synth.flow.stereo.rig import Intrinsics, Rectified, StereoRig
 from synth.flow.stereo.track import StereoTracker
 
@@ -83,26 +81,6 @@ def test_rectified_rows_and_depths_match_opencvs_projections(rig: StereoRig) -> 
         planes = np.stack([np.full(SIZE[::-1], part, np.float32) for part in flow[k]])
         found = rectified.motion(field, np.full_like(field, change[k]), planes)[at[1], at[0]]
         np.testing.assert_allclose(found, moved[k] - points[k], atol=0.03)
-
-
-def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
-    def written(name: str, rotation: np.ndarray) -> Path:
-        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
-        for number, camera in (("1", TURNED.left), ("2", TURNED.right)):
-            storage.write(f"M{number}", camera.K)
-            storage.write(f"D{number}", camera.distortion[None])
-        storage.write("R", rotation)
-        storage.write("T", TURNED.translation[:, None] / 25.0)
-        storage.release()
-        return tmp_path / name
-
-    found = calibration.read_rig(written("pair.yaml", TURN), SIZE, mm_per_unit=25.0)
-    np.testing.assert_allclose(found.right.K, TURNED.right.K)
-    np.testing.assert_allclose(found.left.distortion, TURNED.left.distortion)
-    np.testing.assert_allclose(found.rotation, TURN, atol=1e-12)
-    np.testing.assert_allclose(found.translation, TURNED.translation)
-    with pytest.raises(UserError):
-        calibration.read_rig(written("bent.yaml", 1.1 * TURN), SIZE)
 
 
 def test_rest_disparity_of_a_slope_with_a_step() -> None:

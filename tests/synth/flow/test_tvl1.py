@@ -1,5 +1,6 @@
-"""The masked TV-L1 solver: its parts against formulas and tensor code, flow of known warps, tracking."""
+"""The masked TV-L1 solver against tensor code, flow of known warps, tracking; the correction of flow."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,33 +8,13 @@ import torch.nn.functional as F
 from tensor_tvl1 import solve_level
 
 from evidence.flow.scenes import CLEAN, Recipe, Stage, noise_field, pairs
-from synth.flow import image, kernels, track, tvl1
+from synth.flow import correction, image, track, tvl1
 from synth.flow.image import Level
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 
 def _error(flow: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(flow - truth, axis=-1)
-
-
-def test_derivative_is_exact_for_cubics() -> None:
-    y, x = np.mgrid[:20, :24].astype(np.float32) / 10
-    dx, dy = np.empty((2, *x.shape), np.float32)
-    kernels.differentiate(x**3 - 2 * x * y + y**2, dx, dy)
-    inner = (slice(2, -2), slice(2, -2))
-    np.testing.assert_allclose(dx[inner] * 10, (3 * x**2 - 2 * y)[inner], atol=1e-4, rtol=1e-4)
-    np.testing.assert_allclose(dy[inner] * 10, (2 * y - 2 * x)[inner], atol=1e-4, rtol=1e-4)
-
-
-def test_warp_samples_where_the_flow_points() -> None:
-    picture = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(1))
-    flow = torch.zeros(1, 2, 12, 16)
-    flow[:, 0], flow[:, 1] = 2, -1
-    moved, visible = image.warp(picture, torch.ones_like(picture), flow)
-    torch.testing.assert_close(moved[..., 1:, :-2], picture[..., :-1, 2:], atol=1e-5, rtol=0)
-    assert visible[..., 1:, :-2].min() == 1
-    assert visible[..., 0, :].max() == 0
-    assert visible[..., -2:].max() == 0
 
 
 def test_pull_with_tool_highlights_and_light() -> None:
@@ -173,3 +154,38 @@ def test_a_diverged_flow_samples_at_the_border() -> None:
     flow = torch.full((1, 2, 4, 5), 1e9)
     level = Level(now, now, torch.ones_like(now), torch.ones_like(now))
     assert torch.isfinite(tvl1.solve([level], flow, TVL1Settings(warps=1, median=False))).all()
+
+
+def _described(mirrored: bool) -> np.ndarray:
+    """Features of a texture that moved by (0.4, -0.25) px, with a flow of (0, 0)."""
+    rng = np.random.default_rng(3)
+    coloured = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
+    shift = np.float32([[1, 0, 0.4], [0, 1, -0.25]])
+    moved = cv2.warpAffine(coloured, shift, (88, 104), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    pictures = np.clip([coloured, moved], 0, 255).astype(np.uint8)
+    rest, now = np.ascontiguousarray(pictures[:, :, :: -1 if mirrored else 1])
+    greys = rest[..., 1] / np.float32(12), now[..., 1] / np.float32(12)
+    every, flow = np.ones((104, 88), bool), np.zeros((104, 88, 2), np.float32)
+    return correction.describe(rest, now, every, greys, np.float32(every), flow, np.float32(every))
+
+
+def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -> None:
+    features, mirrored = _described(mirrored=False), _described(mirrored=True)
+    assert features.shape == (correction.CHANNELS, 26, 22)
+    for x, y in correction.VECTORS[:4]:
+        np.testing.assert_allclose(np.median(features[x, 3:-3, 3:-3]), 0.4, atol=0.05)
+        np.testing.assert_allclose(np.median(features[y, 3:-3, 3:-3]), -0.25, atol=0.05)
+    signs = np.ones((correction.CHANNELS, 1, 1))
+    signs[[x for x, _ in correction.VECTORS]] = -1
+    np.testing.assert_allclose(signs * mirrored[..., ::-1], features, atol=0.02)
+
+
+def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None:
+    errors = []
+    for pair in pairs(Recipe(), 3, 23):
+        pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable
+        flows = [Tvl1(corrected=on).flow(*pictures)[0] for on in (False, True)]
+        off = [np.linalg.norm(flow - pair.flow, axis=-1)[pair.contact & ~pair.hidden] for flow in flows]
+        errors.append([one.mean() for one in off])
+    before, after = np.mean(errors, axis=0)
+    assert after < before

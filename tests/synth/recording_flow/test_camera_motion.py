@@ -47,13 +47,15 @@ def test_a_similarity_is_estimated_and_undone(motion: tuple[float, ...]) -> None
     assert found.deviation_px < 0.05
 
 
-def test_a_camera_bump_is_removed_from_the_motion_and_reported() -> None:
+@pytest.mark.parametrize("tissue", [OPENING, None], ids=["opening", "everywhere"])
+def test_a_camera_bump_is_removed_from_the_motion_and_reported(tissue: NDArray[np.bool_] | None) -> None:
     pictures = [Picture(t, t / 8, texture(*moved(0, 5 * (t > 2)))) for t in range(6)]
     settings = RecordingFlowSettings("dis", 1, None, False, "none")
-    video = VideoPass(Footage(lambda: pictures, "video", lambda size: OPENING), settings)
-    frames = list(video.frames())
+    stated = None if tissue is None else lambda size: tissue
+    video = VideoPass(Footage(lambda: pictures, "video", stated), settings)
+    frames, inside = list(video.frames()), EVERYWHERE if tissue is None else tissue
     assert all(np.array_equal(one.rgb, two.rgb) for one, two in zip(frames[:3], pictures[:3], strict=True))
-    assert max(np.median(np.abs(one.flow[OPENING])) for one in frames) < 0.05
+    assert max(np.median(np.abs(one.flow[inside])) for one in frames) < 0.05
     assert all(one.trusted for one in frames)
     # The pictures have no noise and are therefore reported as repeated too.
     (finding,) = [one for one in video.findings if one.cause == "camera"]

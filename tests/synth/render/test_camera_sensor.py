@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from synth.geometry.triangles import lengths
 from synth.job.schema import SensorSection
 from synth.render.camera import camera_sensor, video_link
 from synth.render.camera.camera_sensor import CameraSensor, processed, record
@@ -87,12 +86,6 @@ def test_corners_lose_the_given_share() -> None:
     assert found[0, 0] / found[100, 100] == pytest.approx(0.7, rel=0.03)
 
 
-def test_same_seed_same_bytes_other_seed_other_noise() -> None:
-    pictures = [record(flat(0.5), PLAIN, np.random.default_rng(seed)) for seed in (1, 1, 2)]
-    assert (pictures[0] == pictures[1]).all()
-    assert (pictures[0] != pictures[2]).any()
-
-
 def test_blur_widens_an_edge_by_its_own_width() -> None:
     edge = np.zeros((64, 128, 3), np.float32)
     edge[:, 64:] = 0.5
@@ -124,13 +117,6 @@ def test_odd_sizes_and_no_codec() -> None:
     section = SensorSection.model_validate({"bitrate_mbps": 1.0, "chroma": "4:2:0"})
     assert np.abs(video_link.recorded(video, section, 25.0).astype(int) - 90).max() <= 4
     assert video_link.recorded(video, SensorSection(), 25.0) is video
-
-
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_lengths_are_those_of_norm(kind: type) -> None:
-    vectors = RNG.normal(size=(50, 40, 3)).astype(kind)
-    assert np.array_equal(lengths(vectors), np.linalg.norm(vectors, axis=-1))
-    assert lengths(vectors).dtype == kind
 
 
 def test_the_sensor_is_the_chain_of_its_parts() -> None:
