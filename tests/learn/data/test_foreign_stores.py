@@ -1,5 +1,7 @@
 """Untrusted stores and caches: data that doesn't match its seal is refused."""
 
+import json
+import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -57,12 +59,31 @@ def test_data_that_does_not_match_its_seal_is_neither_trained_nor_predicted_on(
         assert not (tmp_path / "f").exists()
 
 
-def test_a_corrupted_cache_is_refused(own: Path, tmp_path: Path) -> None:
+def test_a_copied_hash_does_not_fill_the_cache(own: Path, tmp_path: Path) -> None:
+    """A store that claims the hash of another is refused, before and after that one is in the cache."""
+    cache = tmp_path / "cache"
+    load_clips(own, GRID, ("ideal",), cache=cache)
+    attrs = json.loads((own / "000000.zarr/zarr.json").read_text())["attributes"]
+    foreign.edit_attributes(own / "000005.zarr", reseal=False, content_hash=attrs["content_hash"])
+    for place in (cache, tmp_path / "fresh"):
+        with pytest.raises(UserError, match=r"000005\.zarr"):
+            load_clips(own, GRID, ("ideal",), cache=place)
+    # All attributes of the other, with seals: only the values differ.
+    foreign.edit_attributes(own / "000005.zarr", reseal=False, **attrs)
+    for path in own.glob("00000[!5].zarr"):
+        shutil.rmtree(path)
+    with pytest.raises(UserError):
+        load_clips(own, GRID, ("ideal",), cache=tmp_path / "empty")
+    assert not (tmp_path / "empty").exists()
+
+
+@pytest.mark.parametrize("pickled", [False, True])
+def test_a_corrupted_cache_is_refused(own: Path, tmp_path: Path, pickled: bool) -> None:
     cache = tmp_path / "cache"
     load_clips(own, GRID, ("ideal",), cache=cache)
     file = min(cache.iterdir())
     data = bytearray(file.read_bytes())
     data[-5] ^= 4
-    file.write_bytes(data)
+    file.write_bytes(pickle.dumps(print) if pickled else data)
     with pytest.raises(UserError):
         load_clips(own, GRID, ("ideal",), cache=cache)

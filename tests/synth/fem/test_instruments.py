@@ -1,5 +1,6 @@
 """Instruments given by the job, several at once: labels that add up, forces in place of loads."""
 
+import re
 from pathlib import Path
 from typing import Any, get_args
 
@@ -90,6 +91,19 @@ def test_a_force_replaces_the_load() -> None:
         assert 3.0 <= force <= 5.0
         assert force == pytest.approx(gesture.load * tissue.young_kpa * gesture.footprint_mm**2)
     assert schema.FemSection(force_mn=0.2).chosen_law[0] == "linear"
+
+
+def test_the_page_has_the_table_of_instruments() -> None:
+    page = (Path(__file__).parents[3] / "docs/howto/instruments.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", page, re.MULTILINE)
+    shown = {
+        gesture: [*re.findall(r"`(\w+)` \d+%", usual), *re.findall(r"`(\w+)`", others)]
+        for gesture, usual, others in rows
+    }
+    assert shown == {kind: list(takes) for kind, takes in mechanics.INSTRUMENTS.items()}
+    shares = [int(share) for _, usual, _ in rows for share in re.findall(r"(\d+)%", usual)]
+    known = [share for takes in mechanics.INSTRUMENTS.values() for share in takes.values() if share]
+    assert shares == [round(100 * share) for share in known]
 
 
 def test_gestures_and_instruments_are_drawn_together() -> None:
