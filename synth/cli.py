@@ -121,7 +121,7 @@ def schema(
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Annotated[str, Argument(help="A job file, a named job, or a brain (OBJ, STL, PLY, OFF, VTK, VTP).")],
+    job: Annotated[str, Argument(help="A job file, a named job, or a brain (OBJ, STL, GIfTI, lh.pial...).")],
     overrides: Overrides = None,
     out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,

@@ -23,7 +23,9 @@ from synth.job import identity
 from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
-_KINDS = ("obj", "stl", "ply", "off", *SUFFIXES)  # suffixes of the files that can be read
+_KINDS = ("obj", "stl", "ply", "off", *SUFFIXES, "gii")  # suffixes of the files that can be read
+_FREESURFER = b"\xff\xff\xfe"  # what its surfaces start with; suffixes vary, and links to them are followed
+_CENTRE = rb"valid\s*=\s*1\b[\s\S]*?\ncras\s*=([^\n]*)"  # in a footer of FreeSurfer's
 
 _BRAIN_MM = 20.0, 400.0  # greatest extent: of a small phantom, of more than a head
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
@@ -48,7 +50,7 @@ def load_brain(
     attachments: Sequence[AttachmentSection] = (),
     fill_holes: bool = False,
 ) -> Brain:
-    """Reads a surface (OBJ, STL, PLY, OFF, VTK or VTP, mm), merges its vertices, and places it.
+    """Reads a surface (of a format of `anatomy.mesh`, mm), merges its vertices, and places it.
 
     `craniotomy` and `attachments` are in the file's axes; `fill_holes` as in `read_brain`. UserError: the
     file cannot be read or closed, encloses no volume, or has no surface at the craniotomy.
@@ -175,18 +177,23 @@ def _heights(vertices: Floats, faces: Ints) -> Floats:
 
 
 def _read(path: Path) -> tuple[Floats, Ints]:
-    kind = path.suffix.lower().removeprefix(".")
-    if kind not in _KINDS:
-        hint = "3D Slicer converts most others, mris_convert those of FreeSurfer and GIFTI"
-        raise UserError(f"anatomy.mesh: {path.name} is not one of {', '.join(_KINDS)}; {hint}")
     with as_user_error("anatomy.mesh"):
         data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
+    kind = path.suffix.lower().removeprefix(".")
+    if data.startswith(_FREESURFER):
+        kind = "freesurfer"
+    elif kind not in _KINDS:
+        known = f"{', '.join(_KINDS)}, nor a surface of FreeSurfer's such as lh.pial"
+        hint = "gunzip unpacks it" if kind == "gz" else "3D Slicer converts most others"
+        raise UserError(f"anatomy.mesh: {path.name} is none of {known}; {hint}")
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     stated = re.search(_STATED, data[:4096])
-    space = stated[1].decode() if stated else ""
+    space, offset = stated[1].decode() if stated else "", np.zeros(3)
     try:
-        if kind in SUFFIXES:
+        if kind in ("gii", "freesurfer"):
+            vertices, faces, offset = _read_neuroimaging(path, data)
+        elif kind in SUFFIXES:
             file = read_mesh(data)
             vertices, faces, space = file.points, skin(file.points, file.cells), file.space or space
             if space and not re.fullmatch("[RL][AP][SI]", space):
@@ -198,6 +205,8 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise ValueError("a face refers to a missing point")
+    except ModuleNotFoundError as error:
+        raise UserError(f"anatomy.mesh: {path.name} needs {error.name}: pip install {error.name}") from None
     except Exception as error:  # readers of formats raise anything
         why = first_line(error)
         raise UserError(f"anatomy.mesh: {path.name} is not a readable surface ({why})") from error
@@ -209,7 +218,32 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             Caution,
             stacklevel=1,
         )
+    if offset.any():
+        plus = f"scanner RAS is this plus {offset.round(2).tolist()}"
+        what = f"{path.name} and points on it are in surface RAS, SurfaceRAS in freeview"
+        warnings.warn(f"anatomy.mesh: {what}; {plus}", Caution, stacklevel=1)
     return _merged(vertices, faces)
+
+
+def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
+    """Vertices (V, 3) mm, faces (F, 3) and offset (3,) mm to scanner RAS, of GIfTI or FreeSurfer."""
+    from nibabel import freesurfer, gifti
+
+    offset = np.zeros(3)
+    if data.startswith(_FREESURFER):
+        with np.errstate(over="raise"):  # of counts
+            vertices, faces = freesurfer.read_geometry(path)
+        if stated := re.search(_CENTRE, data):
+            offset = np.array(stated[1].split(), np.float64)
+    else:
+        image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
+        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{one}") for one in ("POINTSET", "TRIANGLE")]
+        if [[one.data.shape[1:] for one in arrays] for arrays in held] != [[(3,)], [(3,)]]:
+            raise ValueError("one list of points and one of triangles are needed, as in a .surf.gii")
+        points, vertices, faces = held[0][0], held[0][0].data, held[1][0].data
+        if points.coordsys is None or points.coordsys.dataspace != 1:  # 1: NIFTI_XFORM_SCANNER_ANAT
+            offset = np.array([float(points.meta.get(f"VolGeomC_{axis}", 0)) for axis in "RAS"])
+    return np.asarray(vertices, np.float64), np.asarray(faces, np.int64), offset
 
 
 def _whole(data: bytes) -> bytes:

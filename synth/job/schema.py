@@ -62,7 +62,7 @@ class AnatomySection(Section):
     """The brain: a procedural block, or a user's surface."""
 
     mesh: Path | None = None
-    """Surface of a brain (OBJ, STL, PLY, OFF, VTK, VTP; mm), relative to the job file. Empty: a block."""
+    """Brain (OBJ, STL, PLY, OFF, VTK, VTP, GIfTI, lh.pial; mm), relative to the job file. Empty: a block."""
     fill_holes: bool = False
     """Whether holes of the mesh are closed, each by a fan of triangles; an error if that is not possible."""
     dome_mm: Positive = 70.0
