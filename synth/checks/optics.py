@@ -22,13 +22,13 @@ def picture(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
     tissue = sequence["tissue"][:]
     yield truth(bool(tissue.any()), "no tissue in view")
     for t in frames:
-        free = tissue & ~sequence["tool"][t]
-        if free.any():
-            blank = blank_share(sequence["rgb"][t][free])
-            yield Measure(blank, MOST_BLANK, f"frame {t}: tissue black or burnt out")
+        shown = {"tissue": sequence["rgb"][t][tissue & ~sequence["tool"][t]]}
         if "rgb_right" in sequence:
-            blank = blank_share(sequence["rgb_right"][t])
-            yield Measure(blank, MOST_BLANK, f"frame {t}: right picture black or burnt out")
+            shown["right picture"] = sequence["rgb_right"][t]
+        for what, pixels in shown.items():
+            if len(pixels):
+                blank = blank_share(pixels)
+                yield Measure(blank, MOST_BLANK, f"frame {t}: {what} black or burnt out")
 
 
 def camera(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
@@ -102,13 +102,7 @@ def camera_poses(sequence: Sequence) -> Floats:
 def camera_of(sequence: Sequence, lens: Mapping[str, Any] | None = None) -> cameras.Camera:
     """The camera of a sequence, or that of another `lens` in its attributes, without aperture and focus."""
     lens, (height, width) = lens or sequence.attrs, sequence.size
-    return cameras.Camera(
-        K=np.asarray(lens["K"], np.float64),
-        distortion=np.asarray(lens["distortion"], np.float64),
-        rotation=np.asarray(lens["rotation"], np.float64),
-        translation=np.asarray(lens["translation"], np.float64),
-        size=(width, height),
-        aperture_mm=0.0,
-        focus_mm=0.0,
-        mm_per_px=float(sequence.attrs["scale_mm_per_px"]),
-    )
+    names = ("K", "distortion", "rotation", "translation")
+    given = {name: np.asarray(lens[name], np.float64) for name in names}
+    scale = float(sequence.attrs["scale_mm_per_px"])
+    return cameras.Camera(**given, size=(width, height), aperture_mm=0.0, focus_mm=0.0, mm_per_px=scale)

@@ -6,13 +6,10 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import Map, Mask, Pixels
+from synth.arrays import Array, Map, Mask, Pixels
 from synth.checks.measure import Measure, Nothing, inner
 from synth.dataset.store import Sequence
-
-Floats = NDArray[np.floating]
 
 # Error of a point moved forward and back: compressed or slanted tissue is projected to few pixels.
 _RETURN_PX = 4.0
@@ -42,8 +39,7 @@ def force(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
         yield Nothing("another program's motion without a force")
         return
     applied = sequence["force"][:]
-    shown = np.zeros_like(applied)
-    whole = np.ones(len(applied), bool)
+    shown, whole = np.zeros_like(applied), np.ones(len(applied), bool)
     if "force_of" in sequence and applied.any():
         off = np.abs(sequence["force_of"][:].sum(axis=1) - applied).max()
         yield Measure(float(off / np.abs(applied).max()), 1e-6, "sum of the instruments")
@@ -71,10 +67,9 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
     relaxation is not checked.
     """
     mechanics = sequence.attrs.get("mechanics") or {}
-    raised = mechanics.get("pulse_work_mn_mm")
-    known = "tool_work_mn_mm" if raised is not None else "energy_mn_mm"
-    instruments = mechanics.get("instruments")
-    if not (mechanics.get("elastic") or raised is not None) or known not in mechanics or not instruments:
+    raised, instruments = mechanics.get("pulse_work_mn_mm"), mechanics.get("instruments")
+    known = mechanics.get("energy_mn_mm" if raised is None else "tool_work_mn_mm")
+    if not (mechanics.get("elastic") or raised is not None) or known is None or not instruments:
         yield Nothing("inertia, relaxation, no instruments, or mechanics without energy")
         return
     if raised is not None and len(instruments) > 1:
@@ -82,8 +77,8 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
         yield Nothing("a pulse and several instruments")
         return
     forces = np.stack([one["force_mn"] for one in instruments], axis=1)  # (T, I, 3)
-    work = np.asarray(mechanics[known], np.float64)
-    pulse = np.zeros(len(work)) if raised is None else _PULSE_KNOWN * np.abs(np.asarray(raised, np.float64))
+    work = np.asarray(known, np.float64)
+    pulse = np.zeros(len(work)) if raised is None else _PULSE_KNOWN * np.abs(raised)
     size = np.linalg.norm(forces, axis=(1, 2))
     for t in range(1, len(work)):
         two = slice(t - 1, t + 1)
@@ -161,7 +156,7 @@ def forward_backward(sequence: Sequence, frames: list[int]) -> Iterator[Measure]
         yield Measure(float((corners & (turned < 0)).sum()) / count, 0.005, f"frame {t}: turned over")
 
 
-def _targets(flow: Floats) -> tuple[Map, Map]:
+def _targets(flow: Array) -> tuple[Map, Map]:
     """Column and row (H, W) to which each rest pixel has moved."""
     rows, columns = np.indices(flow.shape[:2], np.float32)
     return (columns + flow[..., 0]).astype(np.float32), (rows + flow[..., 1]).astype(np.float32)

@@ -21,8 +21,7 @@ _HALF_PX = 0.008  # rounding of a flow below 32 px in float16
 
 def stereo(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Nothing]:
     """Flows and depths of both cameras, rest disparity and motion in space agree [px, relative]."""
-    needed = {"motion", "disparity", "depth"}
-    if any(name not in sequence for name in needed):
+    if not {"motion", "disparity", "depth"} <= set(sequence.fields):
         yield Nothing("no depth is stored" if "motion" in sequence else "one camera")
         return
     left, right = optics.camera_of(sequence), right_of(sequence)

@@ -96,8 +96,7 @@ class Writer:
         peaks = {key: self._writers[name].largest for name, key in _PEAKS.items() if name in self._writers}
         summary: dict[str, Any] = peaks
         if self._half:
-            rounded = {name: one.rounding for name, one in self._writers.items() if FIELDS[name].half}
-            summary["rounding_px"] = rounded
+            summary["rounding_px"] = {k: one.rounding for k, one in self._writers.items() if FIELDS[k].half}
         attrs = {
             **self._own,
             **attributes,
@@ -131,10 +130,9 @@ class _FieldWriter:
         self.largest = self.rounding = 0.0
         chunk, shard = shape, None
         if field.framed:
-            chunk = (1, *shape[1:])
-            frame_bytes = int(np.prod(chunk)) * dtype.itemsize
+            frame_bytes = int(np.prod(shape[1:])) * dtype.itemsize
             self._shard_frames = int(np.clip(_SHARD_BYTES // frame_bytes, 1, shape[0]))
-            shard = (self._shard_frames, *shape[1:])
+            chunk, shard = (1, *shape[1:]), (self._shard_frames, *shape[1:])
         self._array = group.create_array(
             field.name,
             shape=shape,

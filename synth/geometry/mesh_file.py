@@ -29,10 +29,7 @@ _VERTICES, _LINE, _STRIP, _POLYGON = 2, 4, 6, 7
 _REGULAR = {8: (9, [0, 1, 3, 2]), 11: (12, [0, 1, 3, 2, 4, 5, 7, 6])}  # pixel, voxel: as quad, hexahedron
 _XML_CELLS = {"Cells": None, "Polys": _POLYGON, "Strips": _STRIP, "Lines": _LINE, "Verts": _VERTICES}
 _LEGACY_CELLS = {"POLYGONS": _POLYGON, "TRIANGLE_STRIPS": _STRIP, "LINES": _LINE, "VERTICES": _VERTICES}
-_PACKERS: dict[str, Callable[[bytes], bytes]] = {
-    "vtkZLibDataCompressor": zlib.decompress,
-    "vtkLZMADataCompressor": lzma.decompress,
-}
+_PACKERS = {"vtkZLibDataCompressor": zlib, "vtkLZMADataCompressor": lzma}
 _LEGACY_TYPES = {
     "float": "f4", "double": "f8", "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2",
     "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtkidtype": "i8",
@@ -50,34 +47,28 @@ class MeshFile:
     points: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3), the file's unit
     cells: dict[int, Ints] = field(default_factory=dict)  # nodes (C, n) by VTK's number of the type
     point_data: dict[str, Numbers] = field(default_factory=dict)  # (N, ...) by name
-    time: float | None = None  # as stated in the file
+    time: float = np.nan  # as stated in the file
     space: str = ""  # of its axes, such as LPS, as 3D Slicer states it in .vtp
 
-    def add(self, kind: int, nodes: Ints, ends: Ints) -> None:
-        """Adds cells of one type: their nodes one after another, and where each cell ends."""
-        if not len(ends):
-            return
-        sizes = np.diff(ends, prepend=0)
-        if kind in IGNORED:
-            nodes = np.zeros((len(ends), 1), np.int64)  # present, without a face
-        elif kind in (_POLYGON, _STRIP):
-            kind, nodes = TRIANGLE, _triangles(kind, nodes, ends, sizes)
-        else:
-            kind, order = _REGULAR.get(kind, (kind, slice(None)))
-            size = CELLS[kind].nodes if kind in CELLS else int(sizes[0])
-            if (sizes != size).any():
-                raise ValueError(f"a cell of VTK's type {kind} has {sizes[sizes != size][0]} nodes")
-            nodes = nodes.reshape(-1, size)[:, order]
-        self.cells[kind] = np.concatenate([self.cells.get(kind, nodes[:0]), nodes])
-
-    def add_mixed(self, kinds: Numbers, nodes: Ints, ends: Ints) -> None:
-        """Adds cells of several types (C,)."""
-        if len(kinds) != len(ends) or (len(ends) and ends[-1] != len(nodes)):
+    def add(self, kinds: Numbers | int, nodes: Ints, ends: Ints) -> None:
+        """Adds cells of types (C,) or of one: their nodes one after another, and where each cell ends."""
+        if np.shape(kinds) not in ((), ends.shape) or (len(ends) and ends[-1] != len(nodes)):
             raise ValueError("numbers of cells, types and nodes differ")
-        sizes = np.diff(ends, prepend=0)
-        for kind in np.unique(kinds):
+        kinds, sizes = np.broadcast_to(kinds, len(ends)), np.diff(ends, prepend=0)
+        for kind in np.unique(kinds).tolist():
             mine = kinds == kind
-            self.add(int(kind), nodes[np.repeat(mine, sizes)], np.cumsum(sizes[mine]))
+            own, each = nodes[np.repeat(mine, sizes)], sizes[mine]
+            if kind in IGNORED:
+                own = np.zeros((len(each), 1), np.int64)  # present, without a face
+            elif kind in (_POLYGON, _STRIP):
+                kind, own = TRIANGLE, _triangles(own, each, kind == _STRIP)
+            else:
+                kind, order = _REGULAR.get(kind, (kind, slice(None)))
+                size = CELLS[kind].nodes if kind in CELLS else int(each[0])
+                if (each != size).any():
+                    raise ValueError(f"a cell of VTK's type {kind} has {each[each != size][0]} nodes")
+                own = own.reshape(-1, size)[:, order]
+            self.cells[kind] = np.concatenate([self.cells.get(kind, own[:0]), own])
 
 
 def read_mesh(data: bytes) -> MeshFile:
@@ -88,14 +79,14 @@ def read_mesh(data: bytes) -> MeshFile:
     return _read_legacy(data) if data.startswith(b"# vtk DataFile") else _read_xml(data)
 
 
-def _triangles(kind: int, nodes: Ints, ends: Ints, sizes: Ints) -> Ints:
+def _triangles(nodes: Ints, sizes: Ints, strips: bool) -> Ints:
     """Triangles (F, 3) of polygons, as fans, or of strips, each second of which is turned."""
     parts = [np.zeros((0, 3), np.int64)]
     for size in np.unique(sizes):
-        cells = nodes[(ends - size)[sizes == size][:, None] + np.arange(size)]
+        cells = nodes[np.repeat(sizes == size, sizes)].reshape(-1, size)
         for k in range(size - 2):
             strip = [k, k + 1, k + 2] if k % 2 == 0 else [k + 1, k, k + 2]
-            parts.append(cells[:, strip if kind == _STRIP else [0, k + 1, k + 2]])
+            parts.append(cells[:, strip if strips else [0, k + 1, k + 2]])
     return np.concatenate(parts)
 
 
@@ -116,8 +107,7 @@ def _read_xml(data: bytes) -> MeshFile:
             parts = {one.get("Name"): array(one) for one in piece.iterfind(f"{name}/DataArray")}
             if {"connectivity", "offsets"} <= set(parts):
                 nodes, ends = (parts[one].astype(np.int64) for one in ("connectivity", "offsets"))
-                cells = before + nodes, ends
-                found.add_mixed(parts["types"], *cells) if kind is None else found.add(kind, *cells)
+                found.add(parts["types"] if kind is None else kind, before + nodes, ends)
         for one in piece.iterfind("PointData/DataArray"):
             if len(values := array(one)) and len(values) % len(here) == 0:
                 name, values = str(one.get("Name")), values.reshape(len(here), -1)
@@ -165,8 +155,7 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> Callable[[ET.Element | None], 
         else:
             sizes = np.frombuffer(data, word, count + 3)[3:].tolist()
             stops = np.cumsum([width * (count + 3), *sizes])
-            parts = pairwise(stops)
-            data = b"".join(_PACKERS[packer](data[a:b]) for a, b in parts)
+            data = b"".join(_PACKERS[packer].decompress(data[a:b]) for a, b in pairwise(stops))
         return np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
 
     return array
@@ -198,7 +187,7 @@ def _read_legacy(data: bytes) -> MeshFile:
         elif key in _LEGACY_CELLS:
             found.add(_LEGACY_CELLS[key], *file.cells(int(words[1]), int(words[2])))
         elif key == "CELL_TYPES" and mixed is not None:
-            found.add_mixed(file.numbers(int(words[1]), "int"), *mixed)
+            found.add(file.numbers(int(words[1]), "int"), *mixed)
         elif key in ("POINT_DATA", "CELL_DATA"):
             rows, target = int(words[1]), found.point_data if key == "POINT_DATA" else {}
         elif key in _ATTRIBUTES and target is not None:

@@ -66,7 +66,9 @@ def skin(points: Floats, cells: Mapping[int, Ints]) -> Ints:
     if not known:
         lines = "; it has lines or points only" if any(map(len, cells.values())) else ""
         raise ValueError(f"it has no cells with a surface{lines}")
-    for nodes in known.values():
+    for kind, nodes in known.items():
+        if nodes.shape[1:] != (CELLS[kind].nodes,):
+            raise ValueError(f"cells of VTK's type {kind} have {CELLS[kind].nodes} nodes each")
         if nodes.min() < 0 or nodes.max() >= len(points):
             raise ValueError("a cell refers to a missing point")
     volumes = {kind: nodes for kind, nodes in known.items() if kind not in _FLAT}

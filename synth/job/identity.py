@@ -18,7 +18,7 @@ FILES: dict[tuple[str, str], int] = {
 }
 """Keys of a job that are files, as (section, key), and the largest size of such a file in bytes."""
 _LARGEST_STATE = 2 << 30
-_COLLECTIONS = (".pvd", ".series")
+COLLECTIONS = (".pvd", ".series")  # suffixes of files that name those of a series
 
 
 def canonical(value: Any) -> bytes:
@@ -60,7 +60,7 @@ def list_files(mechanics: MechanicsSection) -> list[Path]:
     found = list[Path]()
     for source in list_sources(mechanics):
         folder = source if source.is_dir() else source.parent
-        whole = folder == source or source.suffix in _COLLECTIONS  # which name files in folders below
+        whole = folder == source or source.suffix in COLLECTIONS  # which name files in folders below
         tables = [mechanics.force, mechanics.instruments]
         named = [folder / one for one in tables if one is not None and one.lower().endswith(".csv")]
         found += [*named, *sorted(folder.rglob("*") if whole else folder.glob(source.name))]

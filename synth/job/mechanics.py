@@ -27,17 +27,12 @@ INSTRUMENTS: dict[Kind, dict[Instrument, float]] = {
 
 CLEAR_MM = 1.0  # least distance of a contact from the rim
 
-_DIRECTIONS: dict[Kind, tuple[str, Callable[[float, float, float], bool]]] = {
-    "pull": ("points out of the brain, z above 0", lambda x, y, z: z > 0),
-    "grasp": ("points out of the brain, z above 0", lambda x, y, z: z > 0),
-    "push": ("points into the brain, z below 0", lambda x, y, z: z < 0),
-    "tap": ("points into the brain, z below 0", lambda x, y, z: z < 0),
-    "retract": (
-        "points sideways, z not above 0 and x or y not 0",
-        lambda x, y, z: z <= 0 and not x == y == 0,
-    ),
-    "slide": ("needs x or y, the direction of its motion", lambda x, y, z: not x == y == 0),
-}
+_Rule = tuple[str, Callable[[float, float, float], bool]]
+_OUT: _Rule = "points out of the brain, z above 0", lambda x, y, z: z > 0
+_IN: _Rule = "points into the brain, z below 0", lambda x, y, z: z < 0
+_SIDE: _Rule = "points sideways, z not above 0 and x or y not 0", lambda x, y, z: z <= 0 and any((x, y))
+_ALONG: _Rule = "needs x or y, the direction of its motion", lambda x, y, z: not x == y == 0
+_DIRECTIONS = {"pull": _OUT, "grasp": _OUT, "push": _IN, "tap": _IN, "retract": _SIDE, "slide": _ALONG}
 """Rule for the direction of each gesture's load, and its test; z points out of the brain."""
 
 _Time = FiniteFloat | Annotated[str, Field(max_length=40)]
@@ -82,9 +77,9 @@ class InstrumentSection(Section):
             touch, full, fall, release = _read_times(self.timing)[0]
             if not 0 < touch < full <= fall < release:
                 raise ValueError("timing: touch, full load, fall and release must follow one another")
-        if self.direction is not None and self.gesture is None:
-            raise ValueError("direction needs gesture: that of a push points inwards, of a pull outwards")
-        if self.direction is not None and self.gesture is not None:
+        if self.direction is not None:
+            if self.gesture is None:
+                raise ValueError("direction needs gesture: that of a push points inwards, of a pull outwards")
             rule, holds = _DIRECTIONS[self.gesture]
             if not holds(*self.direction):
                 raise ValueError(f"direction: a {self.gesture} {rule}")
@@ -98,9 +93,8 @@ class InstrumentSection(Section):
         end = (frames - 1) / fps * {"s": 1.0, "ms": 1000.0}[unit] if unit else 1.0
         if numbers[3] >= end:
             if not unit:
-                raise ValueError(
-                    f"timing: {numbers[3]:g} is not below 1, the sequence's end; for seconds add s"
-                )
+                what = "is not below 1, the sequence's end; for seconds add s"
+                raise ValueError(f"timing: {numbers[3]:g} {what}")
             ends = f"{numbers[3]:g} {unit}, the sequence at {end:.4g} {unit}"
             raise ValueError(f"timing ends at {ends}: release earlier, or raise frames")
         return self.model_copy(update={"timing": tuple(one / end for one in numbers)})

@@ -224,6 +224,9 @@ class Job(Section):
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
+        right = [name for name in self.store.extra if name.endswith("_right")]
+        if right and self.render.stereo_mm == 0:
+            raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")
         return self
 
     @model_validator(mode="after")
@@ -241,13 +244,6 @@ class Job(Section):
             raise ValueError(f"fem.{min(unused)} is not used: the files of mechanics.source hold the motion")
         if self.mechanics.force is not None and self.fem.young_kpa[0] != self.fem.young_kpa[1]:
             raise ValueError("mechanics.force needs one value of fem.young_kpa, that of the files' tissue")
-        return self
-
-    @model_validator(mode="after")
-    def _right_camera_exists(self) -> Job:
-        right = [name for name in self.store.extra if name.endswith("_right")]
-        if right and self.render.stereo_mm == 0:
-            raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")
         return self
 
     @model_validator(mode="after")

@@ -32,9 +32,7 @@ def commented(job: Job | None = None) -> str:
 
 def schema() -> dict[str, Any]:
     """JSON schema of a job file, for editors."""
-    described = Job.model_json_schema()
-    described["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    return described
+    return Job.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
 
 
 def dump_job(job: Job) -> str:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import Floats
-from synth.errors import UserError
 from synth.fem.external.read import read_series
 from synth.fem.external.series import MeshSeries, Units
 from synth.fem.external.vtk_series import MOVED
@@ -21,13 +20,7 @@ _DT_S = 0.04  # written where files carry no time
 
 def as_job(source: Path) -> str:
     """The text of a job for the series in `source`. UserError: it can't be read."""
-    dt_s = None
-    try:
-        series = read_series(source, Units(guess=True))
-    except UserError as error:
-        if "dt_s" not in str(error):
-            raise
-        series = read_series(source, Units(guess=True, dt_s=(dt_s := _DT_S)))
+    series = read_series(source, Units(dt_s=_DT_S, guess=True))
     point, direction, radius = _opening(series)
     frames = max(3, min(len(series.time), 250))
     named = [f"nodal:{name}, traction:{name}" for name in series.fields if name.lower() not in MOVED]
@@ -41,7 +34,7 @@ def as_job(source: Path) -> str:
         "mechanics:",
         f"  source: {writer.scalar(source.resolve())}",
         f"  unit_mm: {series.unit_mm:g}  # from the size of the surface; is it right?",
-        *([f"  dt_s: {dt_s}  # PLEASE SET: the files state no time"] if dt_s else []),
+        *([] if series.timed else [f"  dt_s: {_DT_S}  # PLEASE SET: the files state no time"]),
         "  # For a label, state the force on the surface from outside, its unit, and the tissue's stiffness:",
         f"  # force: {', '.join([*named, 'or force.csv with time, fx, fy, fz, x, y, z'])}",
         "  # unit_mn: 1000  # for N",
@@ -63,9 +56,9 @@ def _opening(series: MeshSeries) -> tuple[Floats, Floats, float]:
     middle = weight @ points / weight.sum()
     point = points[np.linalg.norm(points - middle, axis=1).argmin()]
     radius = min(_RADIUS_MM, 0.4 * float(np.sort(np.ptp(points, axis=0))[1]))
-    near = np.argsort(np.linalg.norm(points - point, axis=1))
-    near = near[: max(12, int((np.linalg.norm(points - point, axis=1) < radius / 2).sum()))]
+    away = np.linalg.norm(points - point, axis=1)
+    near = np.argsort(away)[: max(12, int((away < radius / 2).sum()))]
     # The normal of their plane, as faces may be turned either way; outwards is away from the body's middle.
     out = np.linalg.svd(points[near] - points[near].mean(axis=0))[2][2]
-    away = out @ (point - points.mean(axis=0))
-    return point, out if (away if abs(away) > _FLAT * radius else out.sum()) > 0 else -out, radius
+    height = out @ (point - points.mean(axis=0))
+    return point, out if (height if abs(height) > _FLAT * radius else out.sum()) > 0 else -out, radius

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,13 +30,11 @@ from synth.sequence.scene import Frame, Scene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
-# Fields of a `RenderedFrame`, for one camera and for two; those of `store.extra` are its attributes as well,
-# except for the published method's.
+# Fields of a `RenderedFrame`, for one camera and for two; so are those of `store.extra` but `_PUBLISHED`.
 _RENDERED = ("rgb", "flow", "visible", "tool", "glare", "depth")
 _STEREO = ("rgb_right", "flow_right", "visible_right", "depth_right", "motion")
 _PUBLISHED = ("flow_noisy", "intensity")
-_CAMERAS = (("rgb", "tool"), ("rgb_right", "tool_right"))
-"""Fields of each camera: picture and instruments."""
+_CAMERAS = (("rgb", "tool"), ("rgb_right", "tool_right"))  # picture and instruments of each
 
 
 @dataclass(frozen=True)
@@ -49,8 +47,7 @@ class _Task:
     report: StageCallback
 
 
-@dataclass(frozen=True)
-class _Video:
+class _Video(NamedTuple):
     """Video of one camera."""
 
     rgb: Pixels  # (T, H, W, 3)
@@ -75,7 +72,6 @@ def write_scene(
     job, report, watch = scene.job, report or (lambda stage, done, of: None), watch or Stopwatch()
     with watch.stage("scene"):
         renderer = scene.renderer
-
     _refuse_unseen(scene)
     width, height = job.render.size
     writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=job)
@@ -88,7 +84,6 @@ def write_scene(
     writer.put("area", scene.area)
     if renderer.right is not None:
         writer.put("disparity", renderer.disparity())
-
     task = _Task(scene, writer, watch, report)
     videos = _render_frames(task)
     if _coded(job):
@@ -159,10 +154,10 @@ def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
     """Writes and returns the videos after the job's codec."""
     job = task.scene.job
     with task.watch.stage("store"):
-        coded = [video_link.recorded(video.rgb, job.sensor, job.fps) for video in videos]
-        for rgb, (name, _) in zip(coded, _CAMERAS, strict=False):
-            task.writer.put(name, rgb)
-    return [replace(video, rgb=rgb) for video, rgb in zip(videos, coded, strict=True)]
+        coded = [_Video(video_link.recorded(rgb, job.sensor, job.fps), tools) for rgb, tools in videos]
+        for video, (name, _) in zip(coded, _CAMERAS, strict=False):
+            task.writer.put(name, video.rgb)
+    return coded
 
 
 def _coded(job: Job) -> bool:
@@ -178,12 +173,10 @@ def _recover_flow(task: _Task, video: _Video) -> Track:
     job, writer = task.scene.job, task.writer
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
-        tissue = task.scene.tissue
-        recovered = track.recover_flow(video.rgb, video.tools, tissue, create(job.flow.backend))
+        recovered = track.recover_flow(*video, task.scene.tissue, create(job.flow.backend))
     with task.watch.stage("store"):
-        for t in range(job.frames):
-            writer.put_frame("flow_recovered", t, recovered.flow[t])
-            writer.put_frame("flow_confidence", t, recovered.confidence[t])
+        writer.put("flow_recovered", recovered.flow)
+        writer.put("flow_confidence", recovered.confidence)
     return recovered
 
 
@@ -192,7 +185,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     scene, writer, job = task.scene, task.writer, task.scene.job
     lens = scene.renderer.right
     assert lens is not None
-    blocked = mask_detection.hidden(left.rgb, left.tools), mask_detection.hidden(right.rgb, right.tools)
+    blocked = mask_detection.hidden(*left), mask_detection.hidden(*right)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
             rig.Intrinsics(scene.view.K, scene.view.distortion),
@@ -219,8 +212,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
 def _seal(task: _Task) -> Path:
     """Seals the store with its attributes; returns its path."""
     scene = task.scene
-    case, view = scene.scenario, scene.view
-    extra: dict[str, Any] = {}
+    case, extra = scene.scenario, dict[str, Any]()
     series = None if scene.series is None else scene.series.points.tobytes()
     anatomy = identity.identify_anatomy(scene.job, case.relief.seed, series)
     if scene.brain is not None:
@@ -231,7 +223,7 @@ def _seal(task: _Task) -> Path:
     return task.writer.seal(
         scenario=case.as_dict(),
         anatomy_id=anatomy,
-        **_lens(view),
+        **_lens(scene.view),
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=scene.young_kpa,
         poisson=case.tissue.poisson,

@@ -385,8 +385,7 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
 def _near(colour: Colour, rng: Random) -> Colour:
     """A colour of slightly different brightness and hue."""
     value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
-    r, g, b = np.clip(value, 0.01, 0.95).tolist()
-    return r, g, b
+    return _vector(np.clip(value, 0.01, 0.95))
 
 
 def _uniform(rng: Random, ends: Range) -> float:

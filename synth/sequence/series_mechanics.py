@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError
 from synth.fem.deformation import Deformation
 from synth.fem.external.transfer import attach
@@ -51,10 +50,14 @@ class SeriesMechanics:
                     force = series.at(now, "force") @ turn.T
                     load[t] = transfer.bear(force)
                     lost[t] = force.sum(axis=0) - load[t].sum(axis=0)
-                    parts[t] = _by_nearest(load[t], rest.surface.vertices + moved[t], tip[t, ::2])
+                    if count:  # a vertex's load belongs to the nearest tip
+                        away = (rest.surface.vertices + moved[t])[:, None] - tip[t, ::2]
+                        nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
+                        parts[t] = [load[t][nearest == k].sum(axis=0) for k in range(count)]
                     work[t] = 0.5 * (load[t] * moved[t]).sum()
         step = float(np.linalg.norm(np.diff(moved, axis=0), axis=2).max())
-        if step > _cell_mm(series.points, series.faces):
+        corners = series.points[series.faces]
+        if step > np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)):
             jump = f"a vertex moves by {step:.2g} mm from frame to frame, more than a cell of the mesh"
             warnings.warn(f"mechanics.source: {jump}; store more states, or raise fps", Caution, stacklevel=1)
         whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm
@@ -76,17 +79,3 @@ class SeriesMechanics:
             shaft=shaft,
             tool_work=None if series.force is None else work,
         )
-
-
-def _by_nearest(load: Floats, vertices: Floats, tips: Floats) -> Floats:
-    """Parts (I, 3) of the load (V, 3) of vertices (V, 3): each belongs to the nearest of the tips (I, 3)."""
-    if not len(tips):
-        return np.zeros((0, 3))
-    nearest = np.linalg.norm(vertices[:, None] - tips, axis=2).argmin(axis=1)
-    return np.stack([load[nearest == k].sum(axis=0) for k in range(len(tips))])
-
-
-def _cell_mm(points: Floats, faces: Ints) -> float:
-    """Median length of an edge."""
-    corners = points[faces]
-    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))

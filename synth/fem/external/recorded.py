@@ -13,15 +13,13 @@ name none.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Ints
 from synth.errors import UserError, as_user_error
-from synth.fem.external.series import MeshSeries, Units, assemble, find_surface
+from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.fem.external.vtk_series import force_field
 from synth.geometry.skin import TRIANGLE
 from synth.system import checked_file
@@ -38,12 +36,10 @@ def find_run(folder: Path) -> Path | None:
 
 
 def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bool = False) -> MeshSeries:
-    """The series in an .npz; `force` as in `read_files`.
+    """The series in an .npz; `force` and what is raised as in `read_files`.
 
     `recorded`: a run of the published recorder. Its forces are an "intensity", scaled so that their peak is
     the total force; they are scaled back.
-
-    Raises UserError as `read_files`.
     """
     held = checked_file.read_arrays(file)
     if "points" in held and held["points"].ndim == 3 and len(held["points"]):
@@ -51,36 +47,26 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     elif {"rest", "displacement"} <= set(held) or {"rest", "displacements"} <= set(held):
         rest, moved = held["rest"].astype(np.float64), held.get("displacement", held.get("displacements"))
     else:
-        has = ", ".join(sorted(held))
-        raise UserError(f"{file}: needs points (S, N, 3), or rest and displacement; it has {has}")
+        what = "needs points (S, N, 3), or rest and displacement"
+        raise UserError(f"{file}: {what}; it has {', '.join(sorted(held))}")
     assert moved is not None
     fields = [name for name, one in held.items() if one.shape == moved.shape]
-    of = force_field(force, fields, file)
-    time = held.get("times", (units.dt_s or np.nan) * np.arange(len(moved)))
-    if (
-        moved.shape[1:] != rest.shape
-        or rest.shape[1:] != (3,)
-        or time.shape != moved.shape[:1]
-        or len(time) < 2
-    ):
+    name, per_area = force_field(force, fields, file)
+    time = held.get("times", np.full(len(moved), np.nan))
+    same = moved.shape == (len(time), *rest.shape) and time.ndim == 1
+    if not same or rest.shape[1:] != (3,) or len(time) < 2:
         shapes = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
         raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {shapes}")
-    if not (np.diff(time) > 0).all():
-        raise UserError(f"{file}: its times don't rise, or are missing (times, or mechanics.dt_s)")
-    cells = {kind: held[name].astype(np.int64) for name, kind in _CELLS.items() if name in held}
-    surface = find_surface(rest, {TRIANGLE: _faces_of(file, rest)} if recorded else cells, file)
-    moved = np.array([surface.pick(one, file) for one in moved.astype(np.float64)], np.float32)
-    load = None
-    if of is not None:
-        load = np.array([surface.total(one) for one in held[of[1]].astype(np.float64)], np.float32)
-        if recorded and of[1] == _RECORDED:
+    load = [None] * len(time) if name is None else held[name].astype(np.float64)
+    if recorded:
+        units = Units(mm=units.mm or 1.0, mn=units.mn or 1000.0, dt_s=units.dt_s)
+        if name == _RECORDED:
             peak, total = np.linalg.norm(load, axis=2).max(axis=1), np.linalg.norm(load.sum(axis=1), axis=1)
             load *= np.divide(peak, total, out=np.zeros_like(peak), where=total > 0)[:, None, None]
-    if recorded:
-        units = Units(mm=units.mm or 1.0, mn=units.mn or 1000.0)
-    per_area = of is not None and of[0] == "traction"
-    states = (np.asarray(time, np.float64), moved, fields, load, per_area)
-    return assemble(file, rest[surface.nodes], surface.faces, units, *states)
+    cells = {kind: held[one].astype(np.int64) for one, kind in _CELLS.items() if one in held}
+    surface = find_surface(rest, {TRIANGLE: _faces_of(file, rest)} if recorded else cells, file)
+    states = (State(file, *one) for one in zip(time.tolist(), moved.astype(np.float64), load, strict=True))
+    return assemble(file, surface, units, states, fields, per_area)
 
 
 def _faces_of(arrays: Path, rest: Floats) -> Ints:
@@ -94,8 +80,5 @@ def _faces_of(arrays: Path, rest: Floats) -> Ints:
         mesh = trimesh.load(found[0], force="mesh", process=False)
     away, nearest = cKDTree(rest).query(np.asarray(mesh.vertices))
     if len(away) == 0 or away.max() > _NEAR * np.ptp(rest, axis=0).max():
-        raise UserError(
-            f"{found[0]}: is not the surface of {arrays.name}: vertices differ from those at rest"
-        )
-    faces: NDArray[Any] = nearest[np.asarray(mesh.faces)]
-    return faces.astype(np.int64)
+        raise UserError(f"{found[0]}: its vertices are not those of {arrays.name} at rest")
+    return np.asarray(nearest[np.asarray(mesh.faces)], np.int64)

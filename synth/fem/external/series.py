@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,6 +17,7 @@ from synth.fem.surface_embedding import vertex_area
 from synth.geometry.skin import skin
 from synth.system.csv_table import read_csv, read_header
 
+_LENGTHS = {1.0: "mm", 1000.0: "m", 10.0: "cm"}
 _LIKELY_MM, _POSSIBLE_MM = (20.0, 400.0), (1.0, 2000.0)  # largest extent of a specimen
 _ROUNDING = 1e-5  # relative to an extent or a largest force: files are in single precision
 _LEAST_LOAD = 0.01  # share of the largest load below which a surface counts as unloaded
@@ -43,6 +45,7 @@ class MeshSeries:
     shaft: Floats  # (S, I, 3) unit vectors from tip to hand
     unit_mm: float  # millimetres in the files' unit of length
     fields: tuple[str, ...]  # names of the vector fields at nodes
+    timed: bool  # whether the files state times
     force: Map | None = None  # (S, N, 3) mN at nodes, on the surface from outside; None: not known
 
     @property
@@ -65,26 +68,22 @@ class MeshSeries:
         return np.asarray((1 - part) * values[after - 1] + part * values[after], np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class OuterSurface:
+class State(NamedTuple):
+    """One state of all M points of a mesh, in the units of its file."""
+
+    where: Path  # named in messages
+    time: float  # s; NaN: not stated
+    displacement: Floats  # (M, 3)
+    force: Floats | None  # (M, 3) on the nodes, or per area at rest; None: not known
+
+
+class OuterSurface(NamedTuple):
     """The outer surface among M points of a mesh; coincident points count once."""
 
-    nodes: Ints  # (N,) numbers of its points
+    points: Floats  # (N, 3) at rest
+    nodes: Ints  # (N,) their numbers in the mesh
     faces: Ints  # (F, 3) of the N
     place: Ints  # (M,) for each point the first one at the same place
-
-    def pick(self, values: Floats, where: Path) -> Floats:
-        """Motion (N, 3) of points (M, 3). UserError: coincident points move apart."""
-        first = values[self.place]
-        if np.abs(values - first).max(initial=0) > _ROUNDING * max(float(np.abs(values).max()), 1e-9):
-            raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
-        return values[self.nodes]
-
-    def total(self, values: Floats) -> Floats:
-        """Loads (N, 3) of points (M, 3), those of coincident ones added up."""
-        whole = np.zeros((len(values), 3))
-        np.add.at(whole, self.place, values)
-        return whole[self.nodes]
 
 
 def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> OuterSurface:
@@ -99,6 +98,8 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
     _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     place = first[place.ravel()]
     with as_user_error(str(where)):
+        if any(one.min(initial=0) < 0 for one in cells.values()):
+            raise ValueError("a cell refers to a missing point")
         cells = {kind: place[one] for kind, one in cells.items()}
         nodes, faces = np.unique(skin(points, cells), return_inverse=True)
     links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
@@ -106,42 +107,48 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
     bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
     if len(bodies) > 1:
         raise UserError(f"{where}: has {len(bodies)} separate bodies; write the tissue alone")
-    return OuterSurface(nodes, faces.reshape(-1, 3), place)
+    return OuterSurface(points[nodes], nodes, faces.reshape(-1, 3), place)
 
 
 def assemble(
     source: Path,
-    points: Floats,
-    faces: Ints,
+    surface: OuterSurface,
     units: Units,
-    time: Floats,
-    displacement: Map,
+    states: Iterable[State],
     fields: Sequence[str],
-    force: Map | None = None,
     per_area: bool = False,
 ) -> MeshSeries:
-    """A series of arrays in the files' units, checked, and converted in place.
+    """The series of states of a surface, checked and converted.
 
     Args:
         source: named in messages.
-        points: (N, 3) at rest.
-        faces: (F, 3).
-        units: of the arrays.
-        time: (S,) s, rising.
-        displacement: (S, N, 3) float32.
+        surface: at rest.
+        units: of the surface and the states.
+        states: two at least.
         fields: names of the vector fields at nodes.
-        force: (S, N, 3) float32, or none.
-        per_area: whether `force` is one per area at rest.
+        per_area: whether forces are those per area at rest.
 
     Raises:
-        UserError: a surface that is not at rest at first, values that are not finite, units that are missing
-            or can't be, a force that can't be one of contact.
+        UserError: times that do not rise, a surface that is not at rest at first, points that part, values
+            that are not finite, units that are missing or can't be, a force that can't be one of contact.
     """
-    scale = _length(points, units, source)
-    points = scale * points
-    displacement *= np.float32(scale)
+    place, nodes = surface.place, surface.nodes
+    files, times, moves, loads = list[Path](), list[float](), list[Map](), list[Map]()
+    for where, at, moved, load in states:
+        if np.abs(moved - moved[place]).max(initial=0) > _ROUNDING * max(float(np.abs(moved).max()), 1e-9):
+            raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
+        files.append(where)
+        times.append(at)
+        moves.append(moved[nodes].astype(np.float32))
+        if load is not None:
+            whole = np.zeros_like(moved)
+            np.add.at(whole, place, load)
+            loads.append(whole[nodes].astype(np.float32))
+    timed, time = not np.isnan(times).all(), _rising(times, files, units)
+    scale = _length(surface.points, units, source)
+    points, displacement = scale * surface.points, np.float32(scale) * np.array(moves)
     extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(displacement).max())
-    if not np.isfinite(extent + largest) or not (force is None or np.isfinite(force.sum())):
+    if not np.isfinite(extent + largest + sum(float(load.sum()) for load in loads)):
         raise UserError(f"{source}: has values that are not finite")
     if (start := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
         raise UserError(f"{source}: the first state is displaced by {start:.3g} mm; it has to be at rest")
@@ -150,15 +157,31 @@ def assemble(
         has = ", ".join(fields) or "none"
         hint = f"is unit_mm right, and which of its vectors ({has}) displacement?"
         raise UserError(f"{source}: its surface of {extent:.3g} mm moves by {largest:.2g} mm only; {hint}")
-    none = np.zeros((len(time), 0, 3))
-    found = MeshSeries(points, faces, time - time[0], displacement, none, none, scale, tuple(fields))
-    if force is None:
+    none = np.zeros((len(time), 0, 3))  # instruments
+    found = MeshSeries(points, surface.faces, time, displacement, none, none, scale, tuple(fields), timed)
+    if not loads:
         return found
+    each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
+    return bear(found, np.array(loads) * np.asarray(_force_mn(units, source) * each, np.float32), source)
+
+
+def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
+    """Times (S,) s from 0, as stated by the files or `dt_s`. UserError: none, or they don't rise."""
+    if np.isnan(times).all():
+        if units.dt_s is None:
+            raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
+        return np.arange(len(times)) * units.dt_s
+    if not (rises := np.diff(times) > 0).all():
+        at = int(np.argmin(rises)) + 1
+        raise UserError(f"{files[at]}: its time {times[at]:g} s does not follow {times[at - 1]:g} s")
+    return np.asarray(times) - times[0]
+
+
+def _force_mn(units: Units, where: Path) -> float:
+    """Millinewtons in the unit of force. UserError if it is not stated."""
     if units.mn is None:
-        raise UserError(f"{source}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
-    each = vertex_area(points, faces)[:, None] / scale**2 if per_area else 1.0
-    force *= np.asarray(units.mn * each, np.float32)
-    return bear(found, force, source)
+        raise UserError(f"{where}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
+    return units.mn
 
 
 def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
@@ -177,33 +200,25 @@ def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
 
 
 def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> MeshSeries:
-    """The series with the total force of a table, spread over the nodes around its point as 1 - (r/a)^2.
+    """The series with the total force of a table, spread as 1 - (r/a)^2 over the nodes within `patch_mm`, a.
 
-    Args:
-        series: without a force.
-        table: .csv with the columns time [s, that of the first state first], fx, fy, fz, and x, y, z of the
-            contact's centre at rest, in the files' units and axes.
-        units: of the table.
-        patch_mm: radius a.
-
-    Raises:
-        UserError: no such table, or no node around a point.
+    `table`: .csv with columns time [s, that of the first state first], fx, fy, fz, and x, y, z of the
+    contact's centre at rest, in the files' units and axes. UserError: no such table, or no node near a point.
     """
-    if units.mn is None:
-        raise UserError(f"{table}: mechanics.unit_mn is needed, the unit of forces: 1000 for N, 1 for mN")
+    unit_mn = _force_mn(units, table)
     rows = _at_states(series, table, ("fx", "fy", "fz", "x", "y", "z"))
     area, force = vertex_area(series.points, series.faces), np.zeros_like(series.displacement)
     for k, row in enumerate(rows):
-        away = np.linalg.norm(series.points - (units.mm or 1.0) * row[3:], axis=1)
+        away = np.linalg.norm(series.points - series.unit_mm * row[3:], axis=1)
         share = area * np.maximum(1 - np.square(away / patch_mm), 0)
         if not share.any() and row[:3].any():
             at = f"no node within {patch_mm:g} mm of the contact at {series.time[k]:g} s"
             raise UserError(f"{table}: {at}; is its unit that of the files?")
-        force[k] = units.mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
+        force[k] = unit_mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
     return bear(series, force, table)
 
 
-def equip(series: MeshSeries, table: Path, units: Units) -> MeshSeries:
+def equip(series: MeshSeries, table: Path) -> MeshSeries:
     """The series with instruments: columns time, and for each I from 0 on xI, yI, zI of the tip and uI, vI,
     wI from it to the hand. UserError: no such table."""
     count = 1 if "x1" not in (header := read_header(table)) else 2 if "x2" not in header else 3
@@ -212,7 +227,7 @@ def equip(series: MeshSeries, table: Path, units: Units) -> MeshSeries:
     size = np.linalg.norm(rows[..., 3:], axis=2, keepdims=True)
     if not size.all():
         raise UserError(f"{table}: a direction to the hand, u v w, is 0")
-    return replace(series, tip=(units.mm or 1.0) * rows[..., :3], shaft=rows[..., 3:] / size)
+    return replace(series, tip=series.unit_mm * rows[..., :3], shaft=rows[..., 3:] / size)
 
 
 def _at_states(series: MeshSeries, table: Path, names: tuple[str, ...] | list[str]) -> Floats:
@@ -231,13 +246,11 @@ def _length(points: Floats, units: Units, source: Path) -> float:
     """Millimetres in the unit of length. UserError if it is not stated, or can't be that of a specimen."""
     extent = float(np.ptp(points, axis=0).max())
     (low, high), (least, most) = _LIKELY_MM, _POSSIBLE_MM
-    likely = [
-        (name, mm) for name, mm in (("mm", 1.0), ("m", 1000.0), ("cm", 10.0)) if low <= mm * extent <= high
-    ]
-    hint = " or ".join(f"{mm:g} for {name}" for name, mm in likely) or "1 for mm, 1000 for m"
-    if units.mm is None and units.guess and likely:
-        return likely[0][1]
+    likely = {mm: name for mm, name in _LENGTHS.items() if low <= mm * extent <= high}
+    hint = " or ".join(f"{mm:g} for {name}" for mm, name in likely.items()) or "1 for mm, 1000 for m"
     if units.mm is None:
+        if units.guess and likely:
+            return next(iter(likely))
         wide = f"its surface is {extent:.3g} units wide"
         raise UserError(f"{source}: mechanics.unit_mm is needed; {wide}: {hint}?")
     if not least <= units.mm * extent <= most:

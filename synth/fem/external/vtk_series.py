@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error, did_you_mean
-from synth.fem.external.series import MeshSeries, Units, assemble, find_surface
+from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.geometry.mesh_file import SUFFIXES, MeshFile, read_mesh
+from synth.job.identity import COLLECTIONS
 from synth.system import checked_file
 
 _LARGEST, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file, of a collection
-COLLECTIONS = (".pvd", ".series")
 MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {
     ".frd": "ccx2paraview FILE vtu", ".xdmf": "pip install meshio; meshio convert FILE OUT.vtu per step",
@@ -29,37 +29,35 @@ _OTHERS = {
 def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeries:
     """The series of VTK files in `source`: a pattern with *, a collection, or a folder that holds either.
 
-    Args:
-        source: where.
-        units: what the files do not state.
-        force: the field of forces that act on the surface from outside, `nodal:NAME`, or of forces per area
-            at rest, `traction:NAME`. None: forces are not known.
+    `force`: the field of forces that act on the surface from outside, `nodal:NAME`, or of forces per area at
+    rest, `traction:NAME`; None: forces are not known.
 
     Raises:
         UserError: in one line, with the file's name: files that are missing, damaged or of other meshes,
-            times that do not rise, fields that are missing, and what `find_surface` and `assemble` refuse.
+            fields that are missing, and what `find_surface` and `assemble` refuse.
     """
     files, times = list_states(source)
     first = _read(files[0])
-    surface = find_surface(first.points, first.cells, files[0])
-    named = [name for name in vectors_in(first) if name.lower() in MOVED]
+    surface, fields = find_surface(first.points, first.cells, files[0]), vectors_in(first)
+    named = [name for name in fields if name.lower() in MOVED]
     field = named[0] if len(named) == 1 else None  # else the points themselves move
-    of = force_field(force, vectors_in(first), files[0])
-    stated: list[float | None] = []
-    moved, load = (np.empty((len(files), len(surface.nodes), 3), np.float32) for _ in range(2))
-    for k, file in enumerate(files):
-        state = first if k == 0 else _read(file)
-        same = state.cells.keys() == first.cells.keys() and len(state.points) == len(first.points)
-        if not same or not all(np.array_equal(state.cells[kind], first.cells[kind]) for kind in first.cells):
-            raise UserError(f"{file}: its mesh is not that of {files[0].name}; remeshing can't be followed")
-        stated.append(state.time)
-        moved[k] = surface.pick(_values(state, field, file) if field else state.points - first.points, file)
-        if of is not None:
-            load[k] = surface.total(_values(state, of[1], file))
-    per_area = of is not None and of[0] == "traction"
-    time, given = _rising(times or stated, files, units), None if of is None else load
-    states, points = (time, moved, vectors_in(first), given, per_area), first.points[surface.nodes]
-    return assemble(source, points, surface.faces, units, *states)
+    load, per_area = force_field(force, fields, files[0])
+
+    def states() -> Iterator[State]:
+        for k, file in enumerate(files):
+            state = first if k == 0 else _read(file)
+            same = state.cells.keys() == first.cells.keys() and len(state.points) == len(first.points)
+            if not same or not all(
+                np.array_equal(state.cells[kind], held) for kind, held in first.cells.items()
+            ):
+                raise UserError(
+                    f"{file}: its mesh is not that of {files[0].name}; remeshing can't be followed"
+                )
+            moved = _values(state, field, file) if field else state.points - first.points
+            given = _values(state, load, file) if load else None
+            yield State(file, times[k] if times else state.time, moved, given)
+
+    return assemble(source, surface, units, states(), fields, per_area)
 
 
 def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
@@ -119,15 +117,18 @@ def vectors_in(state: MeshFile) -> list[str]:
     return [name for name, values in state.point_data.items() if values.shape == state.points.shape]
 
 
-def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[str, str] | None:
-    """Kind and name of `mechanics.force`. UserError: it is not nodal:NAME or traction:NAME of a field."""
+def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[str | None, bool]:
+    """Name of the field in `mechanics.force`, and whether it is one per area; None if there is no force.
+
+    UserError: it is not nodal:NAME or traction:NAME of a field.
+    """
     if force is None:
-        return None
+        return None, False
     kind, _, name = force.partition(":")
     if kind not in ("nodal", "traction") or name not in fields:
         has = f"{where.name} has {', '.join(fields) or 'no vectors'}{did_you_mean(name, fields)}"
         raise UserError(f"mechanics.force {force}: nodal:NAME, traction:NAME or a table (.csv); {has}")
-    return kind, name
+    return name, kind == "traction"
 
 
 def _values(state: MeshFile, name: str, file: Path) -> Floats:
@@ -135,18 +136,3 @@ def _values(state: MeshFile, name: str, file: Path) -> Floats:
     if values is None or values.shape != state.points.shape:
         raise UserError(f"{file}: has no vectors {name} at its points")
     return np.asarray(values, np.float64)
-
-
-def _rising(times: Sequence[float | None], files: list[Path], units: Units) -> Floats:
-    """Times (S,) s, as stated or by `dt_s`. UserError if there are none, or they don't rise."""
-    found = np.array([np.nan if time is None else time for time in times], np.float64)
-    if np.isnan(found).all():
-        if units.dt_s is None:
-            raise UserError(
-                f"{files[0]}: states no time; mechanics.dt_s is needed, seconds from file to file"
-            )
-        return np.arange(len(files), dtype=np.float64) * units.dt_s
-    if not (rises := np.diff(found) > 0).all():
-        at = int(np.argmin(rises))
-        raise UserError(f"{files[at + 1]}: its time {found[at + 1]:g} s does not follow {found[at]:g} s")
-    return found

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synth.arrays import Array
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 
@@ -34,13 +33,12 @@ def write_npz(dataset: Dataset, target: Path) -> None:
         name = f"{sequence.index:06d}"
         (target / f"run_{name}").mkdir()
         path = target / f"run_{name}" / f"brain_surface_{name}_auto_projected_{name}_2d.npz"
-        arrays: dict[str, Any] = _arrays(sequence, count)
-        np.savez_compressed(path, times=sequence["time"][:], **arrays)
+        np.savez_compressed(path, times=sequence["time"][:], **_arrays(sequence, count))
         path.with_name(path.stem + "_meta.json").write_text(json.dumps(sequence.attrs, indent=1), "utf-8")
     (target / "README.txt").write_text(_NOTE, "utf-8")
 
 
-def _arrays(sequence: Sequence, count: int) -> dict[str, Array]:
+def _arrays(sequence: Sequence, count: int) -> dict[str, Any]:
     """Arrays over time of `count` points of the tissue, by name."""
     tissue = np.argwhere(sequence["tissue"][:])
     rows, columns = tissue[np.linspace(0, len(tissue) - 1, count).round().astype(int)].T

@@ -67,7 +67,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
         }
         if "rgb_right" in sequence:
             right = stereo.right_of(sequence)
-            maps = _maps(right, focal, between(optics.camera_of(sequence), right)[0].T)
+            maps = _maps(right, focal, between(left, right)[0].T)
             for t in range(sequence.frames):
                 write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))
             about["baseline_mm"] = sequence.attrs["right"]["baseline_mm"]
@@ -76,8 +76,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
 
 def _maps(view: Camera, focal: float, turn: Floats = np.eye(3)) -> _Maps:
     """Maps from a pinhole with the principal point (W // 2, H // 2), which these programs assume, turned."""
-    width, height = view.size
-    middle = np.array([[focal, 0, width // 2], [0, focal, height // 2], [0, 0, 1]], np.float64)
+    middle = np.array([[focal, 0, view.size[0] // 2], [0, focal, view.size[1] // 2], [0, 0, 1]], np.float64)
     x, y = cv2.initUndistortRectifyMap(view.K, view.distortion, turn, middle, view.size, cv2.CV_32FC1)
     return _Maps(np.asarray(x, np.float32), np.asarray(y, np.float32))
 
@@ -90,10 +89,9 @@ def _write_pictures(sequence: Sequence, maps: _Maps, here: Path) -> Floats:
         if depth.max() > np.iinfo(np.uint16).max:
             raise UserError(f"{sequence.path}: depth exceeds 16 bits at {UNIT_MM:g} mm")
         covered = maps.nearest(sequence["tool"][t].astype(np.uint8), outside=1).astype(bool) | (depth == 0)
-        picture = maps.smooth(sequence["rgb"][t])
-        drawn = {"images": picture, "depth": depth.astype(np.uint16), "masks": covered}
-        for name, picture in drawn.items():
-            write_png(here / name / f"{t:06d}.png", picture)
+        write_png(here / "images" / f"{t:06d}.png", maps.smooth(sequence["rgb"][t]))
+        write_png(here / "depth" / f"{t:06d}.png", depth.astype(np.uint16))
+        write_png(here / "masks" / f"{t:06d}.png", covered)
         free = depth[~covered]
         bounds.append([free.min(), free.max()] if free.size else [0.0, 0.0])
     return np.array(bounds)

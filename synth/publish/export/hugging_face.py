@@ -70,7 +70,7 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     """
     first, sides = dataset[0], index.group_by_side(dataset)
     framed = [name for name in first.fields if FIELDS[name].dims[0] == TIME]
-    frameless = [name for name in first.fields if FIELDS[name].dims[0] != TIME]
+    frameless = [name for name in first.fields if name not in framed]
     about = [column for column in index.COLUMNS if column.name not in _LEFT_OUT]
     frames = [*(_plain(name, kind) for name, (kind, _) in _ROWS.items()), *(_field(first, n) for n in framed)]
     each = [_plain(column.name, str(column.type).replace("double", "float64")) for column in about]
@@ -80,8 +80,7 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     for side, positions in sides.items():
         shown = (row for k in positions for row in _frames(dataset[k], framed))
         _write(target / "frames", side, frames, shown)
-        names = [column.name for column in about]
-        whole = (_sequence(dataset[k], {name: rows[k][name] for name in names}, frameless) for k in positions)
+        whole = (_sequence(dataset[k], rows[k], frameless) for k in positions)
         _write(target / "sequences", side, each, whole)
         for k in positions:
             rows[k]["split"] = side
@@ -103,23 +102,19 @@ def _plain(name: str, kind: str) -> ParquetColumn:
 def _field(sequence: Sequence, name: str) -> ParquetColumn:
     """The column of a field: pictures, numbers, or arrays."""
     dtype, shape = FIELDS[name].dtype, sequence[name].shape[FIELDS[name].dims[0] == TIME :]
-    if _is_picture(name):
+    if name in PICTURES or dtype == "bool":
         kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         return ParquetColumn(name, kind, {"_type": "Image"})
     if not shape:
         return _plain(name, dtype)
     value = pa.type_for_alias(dtype)
     if len(shape) == 1:
-        feature = {"feature": {"dtype": dtype, "_type": "Value"}, "length": shape[0], "_type": "Sequence"}
+        feature = {"feature": _plain(name, dtype).feature, "length": shape[0], "_type": "Sequence"}
         return ParquetColumn(name, pa.list_(value, shape[0]), feature)
     for _ in shape:
         value = pa.list_(value)
     feature = {"shape": list(shape), "dtype": dtype, "_type": f"Array{len(shape)}D"}
     return ParquetColumn(name, value, feature)
-
-
-def _is_picture(name: str) -> bool:
-    return name in PICTURES or FIELDS[name].dtype == "bool"
 
 
 def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
@@ -134,7 +129,7 @@ def _sequence(sequence: Sequence, row: dict[str, Any], frameless: list[str]) -> 
 
 
 def _cell(name: str, values: Array) -> Any:
-    if _is_picture(name):
+    if name in PICTURES or values.dtype == bool:
         return {"bytes": as_png(values), "path": None}
     return values if values.ndim else values.item()
 
@@ -146,7 +141,8 @@ def _write(folder: Path, side: str, columns: list[ParquetColumn], rows: Iterator
     schema = pa.schema([column.describe() for column in columns], about)
     folder.mkdir(exist_ok=True)
     first = next(rows)
-    rows, count = chain([first], rows), max(1, _GROUP_BYTES // sum(map(_bytes, first.values())))
+    size = sum(_bytes(first[column.name]) for column in columns)
+    rows, count = chain([first], rows), max(1, _GROUP_BYTES // size)
     groups = iter(lambda: list(islice(rows, count)), [])
     for part, group in enumerate(groups):
         path = folder / f"{side}-{part:05d}.parquet"

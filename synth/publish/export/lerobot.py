@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from synth.arrays import Array
 from synth.dataset.index import group_by_side, row_of
 from synth.dataset.store import Dataset, Sequence
+from synth.publish.export.encoding import PICTURES
 from synth.video.write import encode_video
 
 _FILES = 1000  # per folder
@@ -46,8 +47,8 @@ def write_episodes(dataset: Dataset, target: Path) -> None:
 
 def _cameras(sequence: Sequence) -> dict[str, str]:
     """Video features and their fields."""
-    names = {"left": "rgb", "right": "rgb_right"}
-    return {f"observation.images.{key}": name for key, name in names.items() if name in sequence}
+    named = zip(("left", "right"), PICTURES, strict=True)
+    return {f"observation.images.{key}": name for key, name in named if name in sequence}
 
 
 def _write_episode(
@@ -101,13 +102,8 @@ def _write_episode(
 
 def _statistics(values: Array, beyond: tuple[int, ...]) -> dict[str, Any]:
     """Statistics over the rows of (N, K), each (K, *beyond)."""
-    found = {
-        "min": values.min(0),
-        "max": values.max(0),
-        "mean": values.mean(0),
-        "std": values.std(0),
-        **{name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()},
-    }
+    found = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    found |= {name: np.quantile(values, q, axis=0) for name, q in _QUANTILES.items()}
     shaped = {name: np.asarray(one, float).reshape(-1, *beyond).tolist() for name, one in found.items()}
     return {**shaped, "count": [len(values)]}
 
@@ -117,12 +113,11 @@ def _pooled(rows: list[dict[str, Any]], key: str) -> dict[str, Any]:
     names = ("min", "max", "mean", "std", "count", *_QUANTILES)
     get = {name: np.array([row[f"stats/{key}/{name}"] for row in rows]) for name in names}
     count = get["count"][:, 0].astype(float)
-    found = {name: np.average(get[name], axis=0, weights=count) for name in ("mean", *_QUANTILES)}
+    found = {"min": get["min"].min(0), "max": get["max"].max(0)}
+    found |= {name: np.average(get[name], axis=0, weights=count) for name in ("mean", "std", *_QUANTILES)}
     squares = get["std"] ** 2 + (get["mean"] - found["mean"]) ** 2
-    spread = np.sqrt(np.average(squares, axis=0, weights=count))
-    ends = {"min": get["min"].min(0), "max": get["max"].max(0), "mean": found.pop("mean"), "std": spread}
-    pooled = {name: value.tolist() for name, value in {**ends, **found}.items()}
-    return {**pooled, "count": [int(count.sum())]}
+    found["std"] = np.sqrt(np.average(squares, axis=0, weights=count))
+    return {name: value.tolist() for name, value in found.items()} | {"count": [int(count.sum())]}
 
 
 def _write_meta(
@@ -131,7 +126,6 @@ def _write_meta(
     """Writes `meta/info.json`, `stats.json`, `tasks.parquet` and the table of episodes."""
     height, width = (side // 2 * 2 for side in first.size)
     fps = float(first.attrs["fps"])
-    features: dict[str, Any] = {}
     video = {
         "video.height": height,
         "video.width": width,
@@ -142,9 +136,8 @@ def _write_meta(
         "video.channels": 3,
         "has_audio": False,
     }
-    for key in _cameras(first):
-        picture = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
-        features[key] = {**picture, "info": video}
+    picture = {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"]}
+    features: dict[str, Any] = {key: {**picture, "info": video} for key in _cameras(first)}
     features["force"] = {"dtype": "float32", "shape": [3], "names": ["x_mn", "y_mn", "z_mn"]}
     for name in ("young_kpa", "scale_mm_per_px", *_COUNTS):
         kind = "int64" if name in _COUNTS[1:] else "float32"
@@ -177,13 +170,13 @@ def _indexed(tasks: list[str]) -> pa.Table:
     """The tasks as a pandas table indexed by their texts, by which LeRobot looks them up."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
     columns = [
-        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
-        {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"},
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
+        for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
     ]
     described = {
         "index_columns": ["task"],
         "column_indexes": [],
-        "columns": [{**column, "metadata": None} for column in columns],
+        "columns": columns,
         "pandas_version": "2.0.0",
     }
     return table.replace_schema_metadata({"pandas": json.dumps(described)})

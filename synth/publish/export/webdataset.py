@@ -24,17 +24,17 @@ def write_shards(dataset: Dataset, target: Path) -> None:
     """
     for side, positions in group_by_side(dataset).items():
         samples, shards = _samples(dataset, positions), itertools.count()
-        pending = next(samples, None)
-        while pending is not None:
+        for first in samples:
             with tarfile.open(target / f"{side}-{next(shards):05d}.tar", "w") as archive:
                 used = 0
-                while pending is not None and used <= _SHARD_BYTES:
-                    for name, data in pending.items():
+                for files in itertools.chain([first], samples):
+                    for name, data in files.items():
                         entry = tarfile.TarInfo(name)
                         entry.size = len(data)
                         archive.addfile(entry, io.BytesIO(data))
                         used += len(data)
-                    pending = next(samples, None)
+                    if used > _SHARD_BYTES:
+                        break
 
 
 def _samples(dataset: Dataset, positions: Iterable[int]) -> Iterator[dict[str, bytes]]:
