@@ -64,9 +64,13 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
     Compliance is 2 energy / |force|^2, the load-weighted mean of the displacement along the force, per force.
     With a pulse, the instruments' work on the motion that they cause replaces the energy; the pulse's own
     work is known to a tenth (the tissue's response to it is treated as linear). Motion with inertia or
-    relaxation is not checked.
+    relaxation is not checked. Another program's load must do no negative work: a share of the largest.
     """
     mechanics = sequence.attrs.get("mechanics") or {}
+    if "work_mn_mm" in mechanics:
+        done = np.asarray(mechanics["work_mn_mm"], np.float64)
+        yield Measure(-float(done.min() / np.abs(done).max(initial=1e-9)), 0.02, f"frame {done.argmin()}")
+        return
     raised, instruments = mechanics.get("pulse_work_mn_mm"), mechanics.get("instruments")
     known = mechanics.get("energy_mn_mm" if raised is None else "tool_work_mn_mm")
     if not (mechanics.get("elastic") or raised is not None) or known is None or not instruments:
@@ -88,14 +92,6 @@ def compliance(sequence: Sequence, frames: list[int]) -> Iterator[Measure | Noth
             step = float(np.exp(np.abs(np.log(now / before)))) - 1
             changed = float(np.linalg.norm(forces[t] - forces[t - 1])) / least
             yield Measure(step, _COMPLIANCE_STEP + changed + 2 * unsure, f"frame {t}")
-
-
-def work(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:
-    """Another program's load does no negative work on its motion (share of the largest work)."""
-    done = np.asarray((sequence.attrs.get("mechanics") or {}).get("work_mn_mm", []), np.float64)
-    if done.size and np.abs(done).max() > 0:
-        worst = int(done.argmin())
-        yield Measure(max(-float(done[worst] / np.abs(done).max()), 0.0), 0.02, f"frame {worst}")
 
 
 def visibility(sequence: Sequence, frames: list[int]) -> Iterator[Measure]:

@@ -30,7 +30,6 @@ INVARIANTS: dict[str, Invariant] = {
         physics.rest,
         physics.force,
         physics.compliance,
-        physics.work,
         physics.visibility,
         physics.warp,
         physics.forward_backward,
@@ -54,7 +53,6 @@ MEANINGS = {
 _NOTHING = {
     "contact": "no whole contact in view",
     "compliance": "no load in two frames in turn",
-    "work": "the package's own finite elements",
     "warp": "no 200 visible pixels move by over 3 px",
 }
 """The reason for which a check has measured nothing in any frame; else no tissue is visible."""

@@ -146,7 +146,9 @@ def assemble(
             loads.append(whole[nodes].astype(np.float32))
     timed, time = not np.isnan(times).all(), _rising(times, files, units)
     scale = _length(surface.points, units, source)
-    points, displacement = scale * surface.points, np.float32(scale) * np.array(moves)
+    points, displacement = scale * surface.points, np.array(moves)
+    moves.clear()  # in place from here on: series may be large
+    displacement *= np.float32(scale)
     extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(displacement).max())
     if not np.isfinite(extent + largest + sum(float(load.sum()) for load in loads)):
         raise UserError(f"{source}: has values that are not finite")
@@ -162,7 +164,10 @@ def assemble(
     if not loads:
         return found
     each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
-    return bear(found, np.array(loads) * np.asarray(_force_mn(units, source) * each, np.float32), source)
+    force = np.array(loads)
+    loads.clear()
+    force *= np.asarray(_force_mn(units, source) * each, np.float32)
+    return bear(found, force, source)
 
 
 def _rising(times: list[float], files: list[Path], units: Units) -> Floats:

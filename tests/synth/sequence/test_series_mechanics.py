@@ -49,7 +49,7 @@ def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp
     sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
     turn, true = np.array(sequence.attrs["rotation"]), -solve().scale[:, None] * solve().reaction
     np.testing.assert_allclose(sequence["force"][:], true @ turn.T, rtol=1e-4, atol=1e-4)
-    assert {one.name: one.count for one in found.checks}["work"] == 1
+    assert {one.name: one.count for one in found.checks}["compliance"] == 1
     assert sequence.attrs["mechanics"]["law"] == "external"
     run(app, "export", tmp_path / "a", tmp_path / "vtu", "--to", "vtu")
     place = "anatomy.craniotomy={point: [0, 0, 0], direction: [0, 0, 1], radius_mm: 10}"
