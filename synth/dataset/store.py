@@ -287,7 +287,14 @@ class Sequence:
         every: Any = range(len(found)) if field.framed else [...]
         for part in every:
             values = np.ascontiguousarray(found[part])
-            _check_limits(field, values, where)
+            if values.dtype.kind == "f" and values.size:
+                low, high = float(values.min()), float(values.max())  # both are NaN where one value is
+                if not np.isfinite(low + high):
+                    raise UserError(f"{where}: contains values that are not finite")
+                if (field.low is not None and low < field.low) or (
+                    field.high is not None and high > field.high
+                ):
+                    raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} are out of range")
             hasher.update(values.astype(found.stored, copy=False).data)
             yield values
         if hasher.hexdigest() != self.attrs["field_hashes"][name]:
@@ -389,14 +396,3 @@ def _field(name: str) -> Field:
     if name not in FIELDS:
         raise InvalidValue(f"{name}: is not in the field table{did_you_mean(str(name), FIELDS)}")
     return FIELDS[name]
-
-
-def _check_limits(field: Field, values: Array, where: str) -> None:
-    """Raises UserError if a value is not finite, or outside the table's limits."""
-    if values.dtype.kind != "f" or not values.size:
-        return
-    low, high = float(values.min()), float(values.max())  # both are NaN where one value is
-    if not np.isfinite(low + high):
-        raise UserError(f"{where}: contains values that are not finite")
-    if (field.low is not None and low < field.low) or (field.high is not None and high > field.high):
-        raise UserError(f"{where}: values from {low:g} to {high:g} {field.unit} are out of range")

@@ -52,13 +52,9 @@ CELLS: Mapping[int, _Cell] = {
 def skin(points: Floats, cells: Mapping[int, Ints]) -> Ints:
     """Triangles (F, 3) of the outer surface, counter-clockwise from outside where the cells are volumes.
 
-    Args:
-        points: (N, 3) at rest.
-        cells: nodes (C, n) by VTK's number of the type. Faces that two cells share are inside. Cells that are
-            faces themselves are used only where there are no volumes, as they are.
-
-    Raises:
-        ValueError: a type without a table here, none with a face, or a node that is not among the points.
+    `points`: (N, 3) at rest; `cells`: nodes (C, n) by VTK's number of the type. Faces of two cells are
+    inside. Cells that are faces themselves are used only where there are no volumes, as they are. ValueError:
+    a type without a table here or with other nodes, none with a face, a node that is not among the points.
     """
     known = {kind: nodes for kind, nodes in cells.items() if len(nodes) and kind not in IGNORED}
     if odd := sorted(set(known) - set(CELLS)):

@@ -91,10 +91,7 @@ class AnatomySection(Section):
     def opened(self, index: int) -> AnatomySection:
         """The section with only the craniotomy of sequence `index`."""
         where = self.craniotomy
-        if not where.also:
-            return self
-        turn = index % (len(where.also) + 1)
-        place = where if turn == 0 else where.also[turn - 1]
+        place = (where, *where.also)[index % (len(where.also) + 1)]
         moved = {"point": place.point, "direction": place.direction, "also": ()}
         return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
 

@@ -26,7 +26,7 @@ from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
-from synth.sequence.scene import Frame, Scene
+from synth.sequence.scene import Scene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -86,7 +86,7 @@ def write_scene(
         writer.put("disparity", renderer.disparity())
     task = _Task(scene, writer, watch, report)
     videos = _render_frames(task)
-    if _coded(job):
+    if job.sensor.bitrate_mbps is not None:  # a codec needs all frames at once
         videos = _encode(task, videos)
     if job.flow.backend != "ideal":
         recovered = _recover_flow(task, videos[0])
@@ -107,13 +107,6 @@ def _refuse_unseen(scene: Scene) -> None:
         )
 
 
-def _refuse_blank(rest: Frame, tissue: Mask) -> None:
-    """Raises UserError if the rest frame's tissue (H, W) is black or burnt out."""
-    free = tissue & ~rest.tool
-    if blank_share(rest.rgb[free] if free.any() else rest.rgb) > MOST_BLANK:
-        raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
-
-
 def _render_frames(task: _Task) -> list[_Video]:
     """Renders every frame and writes its fields, except videos that a codec follows; a video per camera."""
     scene, writer, job = task.scene, task.writer, task.scene.job
@@ -123,7 +116,7 @@ def _render_frames(task: _Task) -> list[_Video]:
         rng = scenario.label_rng(job, scene.index)
         labels = Published.begin(job.labels, scene.tissue, job.frames, rng)
     every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
-    later = ("rgb", "rgb_right") if _coded(job) else ()
+    later = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
     names = [name for name in every if FIELDS[name].framed and name not in later]
     shape = (job.frames, height, width)
     cameras = _CAMERAS if writer.wants("rgb_right") else _CAMERAS[:1]
@@ -134,7 +127,9 @@ def _render_frames(task: _Task) -> list[_Video]:
         with task.watch.stage("render"):
             frame = scene.frame(t)
         if t == 0:
-            _refuse_blank(frame, scene.tissue)
+            free = scene.tissue & ~frame.tool
+            if blank_share(frame.rgb[free] if free.any() else frame.rgb) > MOST_BLANK:
+                raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
         elif not frame.visible[scene.tissue].any():
             raise UserError(f"frame {t}: none of the tissue is visible any more; widen render.field_mm")
         with task.watch.stage("store"):
@@ -158,11 +153,6 @@ def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
         for video, (name, _) in zip(coded, _CAMERAS, strict=False):
             task.writer.put(name, video.rgb)
     return coded
-
-
-def _coded(job: Job) -> bool:
-    """Whether video passes through a codec, which needs all frames at once."""
-    return job.sensor.bitrate_mbps is not None
 
 
 def _recover_flow(task: _Task, video: _Video) -> Track:

@@ -87,11 +87,8 @@ class OuterSurface(NamedTuple):
 
 
 def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> OuterSurface:
-    """The outer surface of cells (see `skin`) of points (M, 3) at rest.
-
-    Raises:
-        UserError: no such surface, or points that are not finite or belong to several bodies.
-    """
+    """The outer surface of cells (see `skin`) of points (M, 3) at rest. UserError: there is none, or points
+    are not finite or belong to several bodies."""
     if not np.isfinite(points).all():
         raise UserError(f"{where}: has coordinates that are not finite")
     step = _ROUNDING * max(float(np.ptp(points, axis=0).max(initial=0)), 1e-12)
@@ -118,19 +115,11 @@ def assemble(
     fields: Sequence[str],
     per_area: bool = False,
 ) -> MeshSeries:
-    """The series of states of a surface, checked and converted.
+    """The series of two or more states of a surface at rest, checked, and converted from their units.
 
-    Args:
-        source: named in messages.
-        surface: at rest.
-        units: of the surface and the states.
-        states: two at least.
-        fields: names of the vector fields at nodes.
-        per_area: whether forces are those per area at rest.
-
-    Raises:
-        UserError: times that do not rise, a surface that is not at rest at first, points that part, values
-            that are not finite, units that are missing or can't be, a force that can't be one of contact.
+    `source` is named in messages; `fields`: names of vector fields at nodes; `per_area`: forces are those per
+    area at rest. UserError: times that don't rise, a surface not at rest at first, points that part, values
+    that are not finite, units that are missing or can't be, a force that can't be one of contact.
     """
     place, nodes = surface.place, surface.nodes
     files, times, moves, loads = list[Path](), list[float](), list[Map](), list[Map]()
@@ -226,7 +215,7 @@ def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> Mes
 def equip(series: MeshSeries, table: Path) -> MeshSeries:
     """The series with instruments: columns time, and for each I from 0 on xI, yI, zI of the tip and uI, vI,
     wI from it to the hand. UserError: no such table."""
-    count = 1 if "x1" not in (header := read_header(table)) else 2 if "x2" not in header else 3
+    count = 1 + len({"x1", "x2"} & set(read_header(table)))
     names = [f"{axis}{k}" for k in range(count) for axis in "xyzuvw"]
     rows = _at_states(series, table, names).reshape(len(series.time), count, 6)
     size = np.linalg.norm(rows[..., 3:], axis=2, keepdims=True)
@@ -235,7 +224,7 @@ def equip(series: MeshSeries, table: Path) -> MeshSeries:
     return replace(series, tip=series.unit_mm * rows[..., :3], shaft=rows[..., 3:] / size)
 
 
-def _at_states(series: MeshSeries, table: Path, names: tuple[str, ...] | list[str]) -> Floats:
+def _at_states(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
     """Columns (S, len(names)) of a table, linear between rows. UserError: it does not cover the states."""
     found = read_csv(table, ("time", *names))
     time = found["time"] - found["time"][0]

@@ -111,18 +111,12 @@ def _gradient(points: Floats, faces: Ints) -> list[sp.csr_array]:
     double = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
     area = np.bincount(faces.ravel(), np.repeat(double, 3), len(points))
     share = double[:, None] / np.maximum(area, 1e-300)[faces]  # (F, 3) of a face in the mean at its corners
-    parts = []
-    for k in range(3):
-        side = corner[:, (k + 2) % 3] - corner[:, (k + 1) % 3]
-        parts.append(np.cross(normal, side) / (double**2)[:, None])  # gradient of the k-th barycentric
-    found = []
-    for d in range(3):
-        values = np.stack([share * part[:, d : d + 1] for part in parts], axis=2)  # (F, node, k)
-        rows = np.broadcast_to(faces[:, :, None], values.shape)
-        columns = np.broadcast_to(faces[:, None, :], values.shape)
-        size = (len(points), len(points))
-        found.append(sp.coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=size).tocsr())
-    return found
+    side = np.roll(corner, 1, axis=1) - np.roll(corner, -1, axis=1)  # each opposite its corner
+    slope = np.cross(normal[:, None], side) / (double**2)[:, None, None]  # (F, k, 3) of the k-th barycentric
+    place = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
+    values = share[:, :, None, None] * slope[:, None]  # (F, node, k, 3)
+    size = (len(points), len(points))
+    return [sp.coo_array((values[..., d].ravel(), place), shape=size).tocsr() for d in range(3)]
 
 
 def _rotations(rest: Floats, now: Floats, faces: Ints) -> Floats:

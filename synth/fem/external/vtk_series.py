@@ -32,13 +32,13 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
     `force`: the field of forces that act on the surface from outside, `nodal:NAME`, or of forces per area at
     rest, `traction:NAME`; None: forces are not known.
 
-    Raises:
-        UserError: in one line, with the file's name: files that are missing, damaged or of other meshes,
-            fields that are missing, and what `find_surface` and `assemble` refuse.
+    UserError, with the file's name: files that are missing, damaged or of other meshes, fields that are
+    missing, and what `find_surface` and `assemble` refuse.
     """
     files, times = list_states(source)
     first = _read(files[0])
-    surface, fields = find_surface(first.points, first.cells, files[0]), vectors_in(first)
+    surface = find_surface(first.points, first.cells, files[0])
+    fields = [name for name, values in first.point_data.items() if values.shape == first.points.shape]
     named = [name for name in fields if name.lower() in MOVED]
     field = named[0] if len(named) == 1 else None  # else the points themselves move
     load, per_area = force_field(force, fields, files[0])
@@ -46,13 +46,10 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
     def states() -> Iterator[State]:
         for k, file in enumerate(files):
             state = first if k == 0 else _read(file)
-            same = state.cells.keys() == first.cells.keys() and len(state.points) == len(first.points)
-            if not same or not all(
-                np.array_equal(state.cells[kind], held) for kind, held in first.cells.items()
-            ):
-                raise UserError(
-                    f"{file}: its mesh is not that of {files[0].name}; remeshing can't be followed"
-                )
+            same = [np.array_equal(state.cells.get(kind, []), one) for kind, one in first.cells.items()]
+            if not all(same) or len(state.cells) > len(same) or len(state.points) != len(first.points):
+                what = f"its mesh is not that of {files[0].name}; remeshing can't be followed"
+                raise UserError(f"{file}: {what}")
             moved = _values(state, field, file) if field else state.points - first.points
             given = _values(state, load, file) if load else None
             yield State(file, times[k] if times else state.time, moved, given)
@@ -110,11 +107,6 @@ def _read(file: Path) -> MeshFile:
     data = checked_file.read_bytes(file, _LARGEST)
     with as_user_error(f"{file}: is not a readable mesh"):
         return read_mesh(data)
-
-
-def vectors_in(state: MeshFile) -> list[str]:
-    """Names of its vector fields at points."""
-    return [name for name, values in state.point_data.items() if values.shape == state.points.shape]
 
 
 def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[str | None, bool]:

@@ -80,7 +80,7 @@ def write_parquet(dataset: Dataset, target: Path) -> None:
     for side, positions in sides.items():
         shown = (row for k in positions for row in _frames(dataset[k], framed))
         _write(target / "frames", side, frames, shown)
-        whole = (_sequence(dataset[k], rows[k], frameless) for k in positions)
+        whole = (rows[k] | _frameless(dataset[k], frameless) for k in positions)
         _write(target / "sequences", side, each, whole)
         for k in positions:
             rows[k]["split"] = side
@@ -123,9 +123,9 @@ def _frames(sequence: Sequence, names: list[str]) -> Iterator[dict[str, Any]]:
         yield {"sequence": sequence.index, "frame": t, **cells}
 
 
-def _sequence(sequence: Sequence, row: dict[str, Any], frameless: list[str]) -> dict[str, Any]:
-    cells = {name: _cell(name, sequence[name][:]) for name in frameless}
-    return {**row, **cells, "attributes": json.dumps(sequence.attrs)}
+def _frameless(sequence: Sequence, names: list[str]) -> dict[str, Any]:
+    cells = {name: _cell(name, sequence[name][:]) for name in names}
+    return cells | {"attributes": json.dumps(sequence.attrs)}
 
 
 def _cell(name: str, values: Array) -> Any:
