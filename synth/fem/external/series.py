@@ -52,7 +52,7 @@ class MeshSeries:
     def summary(self) -> str:
         """What it is, in one line."""
         size = " x ".join(f"{one:.3g}" for one in np.ptp(self.points, axis=0))
-        most = float(np.linalg.norm(self.displacement, axis=2).max())
+        most = float(np.sqrt(np.einsum("snd,snd->sn", self.displacement, self.displacement).max()))
         load = "no force"
         if self.force is not None:
             load = f"force up to {np.linalg.norm(self.force.sum(axis=1), axis=1).max():.4g} mN"
@@ -138,7 +138,7 @@ def assemble(
     points, displacement = scale * surface.points, np.array(moves)
     moves.clear()  # in place from here on: series may be large
     displacement *= np.float32(scale)
-    extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(displacement).max())
+    extent, largest = float(np.ptp(points, axis=0).max()), float(max(displacement.max(), -displacement.min()))
     if not np.isfinite(extent + largest + sum(float(load.sum()) for load in loads)):
         raise UserError(f"{source}: has values that are not finite")
     if (start := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
@@ -164,7 +164,7 @@ def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
     if np.isnan(times).all():
         if units.dt_s is None:
             raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
-        return np.arange(len(times)) * units.dt_s
+        return np.arange(len(times), dtype=np.float64) * units.dt_s
     if not (rises := np.diff(times) > 0).all():
         at = int(np.argmin(rises)) + 1
         raise UserError(f"{files[at]}: its time {times[at]:g} s does not follow {times[at - 1]:g} s")

@@ -22,7 +22,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     "tapvid": tapvid.write_tracks,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
-    "vtu": vtu.write_surfaces,
+    "vtu": vtu.write_meshes,
     "video": sequence_video.write_videos,
 }
 """All formats by their names in `synth export --to`."""

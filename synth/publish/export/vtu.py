@@ -1,9 +1,9 @@
-"""Export for ParaView and other solvers: the deforming surface as VTK files (.vtu), a .pvd per sequence."""
+"""Export for ParaView and other solvers: the deforming surface and volume as VTK's .vtu and .pvd."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,33 +13,54 @@ from synth.dataset.folder import Folder
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.geometry.skin import TRIANGLE
-from synth.geometry.triangles import Shape
 from synth.render.camera import camera
+from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.scene import Scene
 from synth.sequence.simulation import simulate
 
+_TET = 24  # quadratic, in VTK
 _ROUNDING = 1e-3  # relative: another processor's last digits
 
 
-def write_surfaces(dataset: Dataset, target: Path) -> None:
+def write_meshes(dataset: Dataset, target: Path) -> None:
     """Writes `NNNNNN.pvd` and `NNNNNN/TTTT.vtu` of each sequence: its surface at rest, in world axes [mm].
 
     At points: `displacement` [mm], `traction` [kPa] and the nodal `force` [mN] if it is known, `flow` [px] in
-    the left camera. Stores hold pixels, so each sequence is simulated again. UserError: it then differs, as
-    one made by Python code does.
+    the left camera. With our own mechanics also `NNNNNN-volume.pvd`, with `displacement` and Cauchy's
+    `stress` [kPa] xx yy zz xy yz xz. Stores hold pixels, so each sequence is simulated again. UserError: it
+    then differs, as one made by Python code does.
     """
     job = Folder(dataset.root).job()
+    ours = FemMechanics(inside=True) if job.mechanics.source is None else None
     for sequence in dataset:
-        scene, name = simulate(job, sequence.index), f"{sequence.index:06d}"
+        scene, name = simulate(job, sequence.index, mechanics=ours), f"{sequence.index:06d}"
         if "force" in sequence and not np.allclose(sequence["force"][:], scene.force, _ROUNDING, 1e-6):
             raise UserError(f"{sequence.path}: can't be simulated again from the dataset's job")
-        (target / name).mkdir()
-        lines = []
-        for t in range(sequence.frames):
-            (target / name / f"{t:04d}.vtu").write_text(vtu(scene.shape, _fields(scene, t)), "utf-8")
-            lines.append(f'<DataSet timestep="{scene.time[t]:.9g}" file="{name}/{t:04d}.vtu"/>\n')
-        text = f'<VTKFile type="Collection"><Collection>\n{"".join(lines)}</Collection></VTKFile>\n'
-        (target / f"{name}.pvd").write_text(text, "utf-8")
+        _write(
+            target, name, scene.time, ((*scene.shape, TRIANGLE, _fields(scene, t)) for t in range(len(scene)))
+        )
+        if (under := scene.motion.volume) is not None:
+            each = zip(under.displacement, under.stress, strict=True)
+            fields = ({"displacement": moved, "stress": stress} for moved, stress in each)
+            _write(
+                target,
+                f"{name}-volume",
+                scene.time,
+                ((under.points, under.cells, _TET, one) for one in fields),
+            )
+
+
+def _write(
+    target: Path, name: str, times: Floats, meshes: Iterable[tuple[Floats, Array, int, dict[str, Floats]]]
+) -> None:
+    """Writes a collection of meshes, as `vtu` takes them, one per time [s]."""
+    (target / name).mkdir()
+    lines = []
+    for t, (time, mesh) in enumerate(zip(times, meshes, strict=True)):
+        (target / name / f"{t:04d}.vtu").write_text(vtu(*mesh), "utf-8")
+        lines.append(f'<DataSet timestep="{time:.9g}" file="{name}/{t:04d}.vtu"/>\n')
+    text = f'<VTKFile type="Collection"><Collection>\n{"".join(lines)}</Collection></VTKFile>\n'
+    (target / f"{name}.pvd").write_text(text, "utf-8")
 
 
 def _fields(scene: Scene, t: int) -> dict[str, Floats]:
@@ -52,26 +73,26 @@ def _fields(scene: Scene, t: int) -> dict[str, Floats]:
     return found
 
 
-def vtu(shape: Shape, fields: Mapping[str, Floats]) -> str:
-    """A mesh of triangles with vectors (V, 3) at its points, as the text of a .vtu file."""
+def vtu(points: Floats, cells: Array, kind: int, fields: Mapping[str, Floats]) -> str:
+    """A mesh of cells (C, n) of one of VTK's kinds with fields (N, k) at points (N, 3), as a .vtu file."""
 
-    def array(name: str, kind: str, values: Array) -> str:
-        data = np.ascontiguousarray(values, np.dtype(kind.lower()).newbyteorder("<")).tobytes()
+    def array(name: str, dtype: str, values: Array) -> str:
+        data = np.ascontiguousarray(values, np.dtype(dtype.lower()).newbyteorder("<")).tobytes()
         coded = base64.b64encode(np.array(len(data), "<u8").tobytes() + data).decode()
         parts = values.shape[1] if values.ndim == 2 else 1
-        about = f'type="{kind}" Name="{name}" NumberOfComponents="{parts}" format="binary"'
+        about = f'type="{dtype}" Name="{name}" NumberOfComponents="{parts}" format="binary"'
         return f"<DataArray {about}>{coded}</DataArray>\n"
 
-    count = len(shape.faces)
-    cells = [
-        array("connectivity", "Int64", shape.faces.ravel()),
-        array("offsets", "Int64", 3 * np.arange(1, count + 1)),
-        array("types", "UInt8", np.full(count, TRIANGLE)),
+    count, nodes = cells.shape
+    parts = [
+        array("connectivity", "Int64", cells.ravel()),
+        array("offsets", "Int64", nodes * np.arange(1, count + 1)),
+        array("types", "UInt8", np.full(count, kind)),
     ]
     return (
         '<VTKFile type="UnstructuredGrid" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
-        f'<UnstructuredGrid><Piece NumberOfPoints="{len(shape.vertices)}" NumberOfCells="{count}">\n'
-        f"<Points>{array('points', 'Float64', shape.vertices)}</Points>\n<Cells>{''.join(cells)}</Cells>\n"
+        f'<UnstructuredGrid><Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">\n'
+        f"<Points>{array('points', 'Float64', points)}</Points>\n<Cells>{''.join(parts)}</Cells>\n"
         f"<PointData>{''.join(array(name, 'Float32', one) for name, one in fields.items())}</PointData>\n"
         "</Piece></UnstructuredGrid></VTKFile>\n"
     )
