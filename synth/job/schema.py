@@ -91,7 +91,8 @@ class AnatomySection(Section):
     def opened(self, index: int) -> AnatomySection:
         """The section with only the craniotomy of sequence `index`."""
         where = self.craniotomy
-        place = (where, *where.also)[index % (len(where.also) + 1)]
+        places: tuple[CraniotomySection | PlaceSection, ...] = (where, *where.also)
+        place = places[index % len(places)]
         moved = {"point": place.point, "direction": place.direction, "also": ()}
         return self.model_copy(update={"craniotomy": where.model_copy(update=moved)})
 

@@ -114,7 +114,7 @@ def _render_frames(task: _Task) -> list[_Video]:
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
         rng = scenario.label_rng(job, scene.index)
-        labels = Published.begin(job.labels, scene.tissue, job.frames, rng)
+        labels = Published(job.labels, scene.tissue, job.frames, rng)
     every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
     later = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
     names = [name for name in every if FIELDS[name].framed and name not in later]

@@ -8,8 +8,6 @@ displacement and the label 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,23 +60,17 @@ def disturbed(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) 
     return flow, label
 
 
-@dataclass(frozen=True)
 class Published:
     """Both stages for one sequence; frames must be processed in order."""
 
-    share: float  # standard deviation of the first stage's noise over the label
-    tissue: Mask  # (H, W)
-    chosen: Mask  # (T,) frames that the second stage disturbs
-    rng: np.random.Generator
-
-    @classmethod
-    def begin(cls, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> Published:
+    def __init__(self, labels: str, tissue: Mask, frames: int, rng: np.random.Generator) -> None:
         """Draws the frames to disturb; `labels` is the job's key, `tissue` (H, W)."""
         ends = min(_MOST_FRAMES, frames // _ENDS)
-        candidates, chosen = np.arange(ends, frames - ends), np.zeros(frames, bool)
+        candidates = np.arange(ends, frames - ends)
         count = min(int(frames * _FRAMES), len(candidates))
-        chosen[rng.choice(candidates, count, replace=False)] = True
-        return cls(_FORCE_SHARE if labels == "published" else 0.0, tissue, chosen, rng)
+        self._disturbed = set(rng.choice(candidates, count, replace=False).tolist())
+        self._share = _FORCE_SHARE if labels == "published" else 0.0
+        self._tissue, self._rng = tissue, rng
 
     def frame(self, t: int, flow: Map, traction: NDArray[np.floating], force_mn: Floats) -> dict[str, Map]:
         """The fields `flow_noisy` (H, W, 2) px and `intensity` (H, W) mN of frame t.
@@ -88,8 +80,8 @@ class Published:
         """
         label = intensity(traction, float(np.linalg.norm(force_mn)))
         if t > 0:
-            label = with_noise(label, self.tissue, self.share, self.rng)
+            label = with_noise(label, self._tissue, self._share, self._rng)
         size = lengths(label)
-        if self.chosen[t] and t > 0:
-            flow, size = disturbed(flow, size, self.tissue, self.rng)
+        if t in self._disturbed and t > 0:
+            flow, size = disturbed(flow, size, self._tissue, self._rng)
         return {"flow_noisy": flow, "intensity": size.astype(np.float32)}

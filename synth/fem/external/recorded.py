@@ -57,15 +57,16 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     if not same or rest.shape[1:] != (3,) or len(time) < 2:
         shapes = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
         raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {shapes}")
-    load = [None] * len(time) if name is None else held[name].astype(np.float64)
+    load = None if name is None else held[name].astype(np.float64)
     if recorded:
         units = Units(mm=units.mm or 1.0, mn=units.mn or 1000.0, dt_s=units.dt_s)
-        if name == _RECORDED:
+        if load is not None and name == _RECORDED:
             peak, total = np.linalg.norm(load, axis=2).max(axis=1), np.linalg.norm(load.sum(axis=1), axis=1)
             load *= np.divide(peak, total, out=np.zeros_like(peak), where=total > 0)[:, None, None]
     cells = {kind: held[one].astype(np.int64) for one, kind in _CELLS.items() if one in held}
     surface = find_surface(rest, {TRIANGLE: _faces_of(file, rest)} if recorded else cells, file)
-    states = (State(file, *one) for one in zip(time.tolist(), moved.astype(np.float64), load, strict=True))
+    loads = [None] * len(time) if load is None else load
+    states = (State(file, *one) for one in zip(time.tolist(), moved.astype(np.float64), loads, strict=True))
     return assemble(file, surface, units, states, fields, per_area)
 
 

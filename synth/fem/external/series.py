@@ -168,7 +168,7 @@ def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
     if not (rises := np.diff(times) > 0).all():
         at = int(np.argmin(rises)) + 1
         raise UserError(f"{files[at]}: its time {times[at]:g} s does not follow {times[at - 1]:g} s")
-    return np.asarray(times) - times[0]
+    return np.asarray(times, np.float64) - times[0]
 
 
 def _force_mn(units: Units, where: Path) -> float:

@@ -91,17 +91,14 @@ def _nearest(points: Floats, faces: Ints, vertices: Floats) -> tuple[Ints, Float
 
 def _bend(points: Floats, close: Ints, nodes: Ints, bary: Floats) -> sp.csr_array:
     """(V, N) what the quadratic motion adds to the linear one: 4 b_i b_j (g_i - g_j) . (x_j - x_i) / 8."""
-    gradient = _gradient(points, close)
-    rows = np.arange(len(nodes))
-    whole = sp.csr_array((len(nodes), len(points)))
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        edge = points[nodes[:, j]] - points[nodes[:, i]]
-        weight = 0.5 * bary[:, i] * bary[:, j]
-        for d in range(3):
-            for end, sign in ((i, 1.0), (j, -1.0)):
-                pick = sp.csr_array((sign * weight * edge[:, d], (rows, nodes[:, end])), shape=whole.shape)
-                whole = whole + pick @ gradient[d]
-    return whole
+    edge = points[np.roll(nodes, -1, axis=1)] - points[nodes]  # (V, 3, 3) from corner i to j, the next one
+    part = 0.5 * (bary * np.roll(bary, -1, axis=1))[..., None] * edge
+    part -= np.roll(part, 1, axis=1)  # that of g_j
+    x, y, z = (
+        sparse_rows(part[..., d], nodes, len(points)) @ gradient
+        for d, gradient in enumerate(_gradient(points, close))
+    )
+    return sp.csr_array(x + y + z)
 
 
 def _gradient(points: Floats, faces: Ints) -> list[sp.csr_array]:

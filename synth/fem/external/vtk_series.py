@@ -64,13 +64,11 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     if source.suffix in COLLECTIONS:
         files, times = zip(*_collection(source), strict=True)
         return list(files), list(times)
-    if not source.is_dir():
-        found = [file for file in source.parent.glob(source.name) if file.suffix[1:] in SUFFIXES]
-    else:
-        lists = [file for file in source.iterdir() if file.suffix in COLLECTIONS]
-        if len(lists) == 1:
-            return list_states(lists[0])
-        found = [file for file in source.iterdir() if file.suffix[1:] in SUFFIXES]
+    every = list(source.iterdir() if source.is_dir() else source.parent.glob(source.name))
+    lists = [file for file in every if file.suffix in COLLECTIONS]
+    if len(lists) == 1:
+        return list_states(lists[0])
+    found = [file for file in every if file.suffix[1:] in SUFFIXES]
     stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in found})
     if len(stems) > 1:
         raise UserError(f"{source}: files of several series, {', '.join(stems[:3])}; choose one of these")

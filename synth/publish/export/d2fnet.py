@@ -45,24 +45,22 @@ def _arrays(sequence: Sequence, count: int) -> dict[str, Any]:
     scale = float(sequence.attrs["scale_mm_per_px"])
     shrink = min(1.0, _LARGEST_X / sequence.size[1])
     force = np.linalg.norm(sequence["force"][:], axis=1)
-    moved = np.empty((sequence.frames, count, 2), np.float32)
-    intensity = np.zeros((sequence.frames, count), np.float32)
-    pixels, depth = np.empty_like(moved), np.zeros_like(intensity)
-    visible = np.zeros(intensity.shape, bool)
-    rest = np.stack([columns, rows], axis=-1)
-    for t in range(sequence.frames):
-        flow = sequence["flow"][t][rows, columns]
-        size = np.linalg.norm(sequence["traction"][t], axis=-1)
-        moved[t] = scale * flow
-        pixels[t] = shrink * (rest + flow)
-        visible[t] = sequence["visible"][t][rows, columns]
-        if size.max() > 0:
-            intensity[t] = size[rows, columns] / size.max() * force[t] / 1000
-        if "depth" in sequence:
-            x, y = (rest + flow).astype(np.float32).T
-            depth[t] = cv2.remap(sequence["depth"][t], x, y, cv2.INTER_NEAREST)[:, 0]
-    found = {"disp2d": moved, "force_mag": intensity, "projected_pixels": pixels, "visible": visible}
-    return found | ({"depth": depth} if "depth" in sequence else {})
+    frames = range(sequence.frames)
+    flow = np.stack([sequence["flow"][t][rows, columns] for t in frames])
+    places = np.stack([columns, rows], axis=-1) + flow
+    sizes = (np.linalg.norm(sequence["traction"][t], axis=-1) for t in frames)
+    shares = [size[rows, columns] / (size.max() or 1) * force[t] / 1000 for t, size in enumerate(sizes)]
+    found = {
+        "disp2d": (scale * flow).astype(np.float32),
+        "force_mag": np.stack(shares).astype(np.float32),
+        "projected_pixels": (shrink * places).astype(np.float32),
+        "visible": np.stack([sequence["visible"][t][rows, columns] for t in frames]),
+    }
+    if "depth" in sequence:
+        x, y = places.astype(np.float32).transpose(2, 0, 1)[..., None].copy()  # (T, N, 1) each
+        depth = [cv2.remap(sequence["depth"][t], x[t], y[t], cv2.INTER_NEAREST)[:, 0] for t in frames]
+        found["depth"] = np.stack(depth)
+    return found
 
 
 _NOTE = """\
