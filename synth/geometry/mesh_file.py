@@ -99,7 +99,7 @@ def _read_xml(data: bytes) -> MeshFile:
         raise ValueError(f"it holds {root.get('type') or root.tag}, not an unstructured grid or polygons")
     array, found = _xml_arrays(root, rest), MeshFile()
     for piece in root.iter("Piece"):
-        if not int(piece.get("NumberOfPoints", 0)):
+        if piece.get("NumberOfPoints") == "0":
             continue
         before, here = len(found.points), array(piece.find("Points/DataArray")).reshape(-1, 3)
         found.points = np.concatenate([found.points, here.astype(np.float64)])
@@ -132,7 +132,7 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> Callable[[ET.Element | None], 
     word = np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(order)
     if (packer := root.get("compressor")) not in (None, *_PACKERS):
         raise ValueError(f"it is compressed by {packer}; write it with zlib or uncompressed")
-    appended = (one for one in root.iter("DataArray") if one.get("format") == "appended")
+    appended = (one for one in root.iter() if one.get("format") == "appended")
     starts = sorted({int(one.get("offset", 0)) for one in appended})
     ends = dict(zip(starts, [*starts[1:], len(tail)], strict=False))
 

@@ -180,8 +180,8 @@ def _force_mn(units: Units, where: Path) -> float:
 
 def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
     """The series with forces (S, N, 3) mN on its nodes. UserError: they can't be those of a contact."""
-    size = np.linalg.norm(force, axis=2).sum(axis=1)
-    moved = int(np.abs(series.displacement).max(axis=(1, 2)).argmax())
+    size, motion = np.sqrt(np.einsum("snd,snd->sn", force, force)).sum(axis=1), series.displacement
+    moved = int(np.maximum(motion.max(axis=(1, 2)), -motion.min(axis=(1, 2))).argmax())
     if size[0] > 1e-3 * size.max():
         raise UserError(f"{source}: the first state bears {size[0]:.3g} mN; it has to be at rest")
     if size[moved] <= _LEAST_LOAD * size.max():
