@@ -2,6 +2,7 @@
 
 import base64
 import struct
+import sys
 import warnings
 import zlib
 from pathlib import Path
@@ -9,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from command import run
 from egg_brain import OPENING, soup, written
 
+from synth.cli import app
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope
 from synth.geometry import brain_surface
@@ -168,3 +171,45 @@ def test_a_true_reason_names_the_unit_or_the_count(data: bytes, named: str, tmp_
     (tmp_path / "brain.stl").write_bytes(data)
     with pytest.raises(UserError, match=named):
         brain_surface.read_brain(tmp_path / "brain.stl")
+
+
+def stored(path: Path, encoding: str = "B64GZ") -> bytes:
+    """FreeSurfer's, or GIfTI with a matrix that scales to an atlas, as `mris_convert` writes it."""
+    nibabel = pytest.importorskip("nibabel", reason="the extra `readers` is not installed")
+    if path.suffix != ".gii":
+        nibabel.freesurfer.write_geometry(path, POINTS, FACES)
+        path.write_bytes(path.read_bytes() + b"valid = 1  # info valid\ncras   = 5.4 18 -3.5\n")
+        return path.read_bytes()
+    about = {"meta": nibabel.gifti.GiftiMetaData(VolGeomC_R="5.4", VolGeomC_A="18", VolGeomC_S="-3.5")}
+    about |= {"coordsys": nibabel.gifti.GiftiCoordSystem(0, 3, 1.2 * np.eye(4)), "encoding": encoding}
+    parts = {"POINTSET": np.float32(POINTS), "TRIANGLE": np.int32(FACES)}
+    arrays = [nibabel.gifti.GiftiDataArray(one, f"NIFTI_INTENT_{k}", **about) for k, one in parts.items()]
+    nibabel.save(nibabel.gifti.GiftiImage(darrays=arrays), path)
+    return path.read_bytes()
+
+
+def test_neuroimaging_is_read_as_stored_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("lh.pial.T1", "ASCII.gii", "B64BIN.gii", "B64GZ.gii"):
+        stored(tmp_path / name, name.removesuffix(".gii"))
+        with pytest.warns(match=r"surface RAS.*\[5\.4, 18\.0, -3\.5\]"):
+            vertices, faces = brain_surface.read_brain(tmp_path / name)
+        np.testing.assert_allclose(vertices[faces], POINTS[FACES], atol=1e-4)
+    gii, pial = stored(tmp_path / "a.gii"), stored(tmp_path / "a.pial")
+    cases = [(b"\xff\xff\xff" + pial[3:], "pial"), (pial[:5000], "readable"), (gii[:5000], "readable")]
+    for data, named in [*cases, (gii.replace(b"POINTSET", b"SHAPE"), "surf.gii"), (gii, "pip install nib")]:
+        (path := tmp_path / ("a.gii" if data[:1] == gii[:1] else "lh.thickness")).write_bytes(data)
+        monkeypatch.setitem(sys.modules, "nibabel", None if "pip" in named else sys.modules["nibabel"])
+        with pytest.raises(UserError, match=rf"^.*{named}.*\Z"):
+            brain_surface.read_brain(path)
+
+
+@pytest.mark.trial
+def test_openings_of_fsaverage5_are_found_and_rendered(tmp_path: Path) -> None:
+    nibabel, place = pytest.importorskip("nibabel"), "nilearn/datasets/data/fsaverage5/pial_[lr]*.gii.gz"
+    if len(files := [one for home in sys.path for one in Path(home).glob(place)]) != 2:
+        pytest.skip("fsaverage5 is not there: pip install --no-deps nilearn")
+    both = trimesh.util.concatenate([trimesh.Trimesh(*nibabel.load(one).agg_data()) for one in files])
+    nibabel.freesurfer.write_geometry(path := tmp_path / "both.pial", both.vertices, both.faces)
+    job = path.with_name("job.yaml")
+    job.write_text(run(app, "preview", path, "-n", 2, "-o", tmp_path / "a.png").stdout)
+    run(app, "render", job, "-o", tmp_path / "out", "sequences=1", "frames=3", "fem.tets=800", "render.spp=2")
