@@ -67,7 +67,7 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     surface = find_surface(rest, {TRIANGLE: _faces_of(file, rest)} if recorded else cells, file)
     loads = [None] * len(time) if load is None else load
     states = (State(file, *one) for one in zip(time.tolist(), moved.astype(np.float64), loads, strict=True))
-    return assemble(file, surface, units, states, fields, per_area)
+    return assemble(file, surface, units, len(time), states, fields, per_area)
 
 
 def _faces_of(arrays: Path, rest: Floats) -> Ints:

@@ -111,35 +111,36 @@ def assemble(
     source: Path,
     surface: OuterSurface,
     units: Units,
+    count: int,
     states: Iterable[State],
     fields: Sequence[str],
     per_area: bool = False,
 ) -> MeshSeries:
-    """The series of two or more states of a surface at rest, checked, and converted from their units.
+    """The series of `count` states, two at least, of a surface at rest, checked, and converted from units.
 
     `source` is named in messages; `fields`: names of vector fields at nodes; `per_area`: forces are those per
     area at rest. UserError: times that don't rise, a surface not at rest at first, points that part, values
     that are not finite, units that are missing or can't be, a force that can't be one of contact.
     """
     place, nodes = surface.place, surface.nodes
-    files, times, moves, loads = list[Path](), list[float](), list[Map](), list[Map]()
-    for where, at, moved, load in states:
+    files, times = list[Path](), list[float]()
+    displacement, force = np.empty((count, len(nodes), 3), np.float32), None
+    for k, (where, at, moved, load) in enumerate(states):
         if np.abs(moved - moved[place]).max(initial=0) > _ROUNDING * max(float(np.abs(moved).max()), 1e-9):
             raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
         files.append(where)
         times.append(at)
-        moves.append(moved[nodes].astype(np.float32))
+        displacement[k] = moved[nodes]
         if load is not None:
-            whole = np.zeros_like(moved)
+            force, whole = np.empty_like(displacement) if force is None else force, np.zeros_like(moved)
             np.add.at(whole, place, load)
-            loads.append(whole[nodes].astype(np.float32))
+            force[k] = whole[nodes]
     timed, time = not np.isnan(times).all(), _rising(times, files, units)
     scale = _length(surface.points, units, source)
-    points, displacement = scale * surface.points, np.array(moves)
-    moves.clear()  # in place from here on: series may be large
-    displacement *= np.float32(scale)
+    points = scale * surface.points
+    displacement *= np.float32(scale)  # in place: series may be large
     extent, largest = float(np.ptp(points, axis=0).max()), float(max(displacement.max(), -displacement.min()))
-    if not np.isfinite(extent + largest + sum(float(load.sum()) for load in loads)):
+    if not np.isfinite(extent + largest + (0.0 if force is None else float(force.sum()))):
         raise UserError(f"{source}: has values that are not finite")
     if (start := float(np.abs(displacement[0]).max())) > _ROUNDING * extent:
         raise UserError(f"{source}: the first state is displaced by {start:.3g} mm; it has to be at rest")
@@ -150,11 +151,9 @@ def assemble(
         raise UserError(f"{source}: its surface of {extent:.3g} mm moves by {largest:.2g} mm only; {hint}")
     none = np.zeros((len(time), 0, 3))  # instruments
     found = MeshSeries(points, surface.faces, time, displacement, none, none, scale, tuple(fields), timed)
-    if not loads:
+    if force is None:
         return found
     each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
-    force = np.array(loads)
-    loads.clear()
     force *= np.asarray(_force_mn(units, source) * each, np.float32)
     return bear(found, force, source)
 

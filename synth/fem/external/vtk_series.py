@@ -54,7 +54,7 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
             given = _values(state, load, file) if load else None
             yield State(file, times[k] if times else state.time, moved, given)
 
-    return assemble(source, surface, units, states(), fields, per_area)
+    return assemble(source, surface, units, len(files), states(), fields, per_area)
 
 
 def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
