@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Ints, Mask
+from synth.arrays import Floats, Ints
 from synth.fem.surface_embedding import nearest, sparse_rows, vertex_area
 from synth.geometry.triangles import Shape
 
@@ -35,7 +35,6 @@ class Transfer:
     motion: sp.csr_array  # (V, N) weights of the nodes' displacement
     corner: sp.csr_array  # (V, N) barycentrics of the nearest points
     load: sp.csr_array  # (V, N) share of each node's force that a vertex bears
-    distance: Floats  # (V,) mm to the engine's surface
     points: Floats  # (N, 3) mm of the nodes at rest
     faces: Ints  # (F, 3) the triangles that vertices lie on, and their neighbours
     arm: Floats  # (V, 3) mm from the nearest points
@@ -50,11 +49,6 @@ class Transfer:
         """Forces (V, 3) on the vertices, from nodal forces (N, 3); those of nodes elsewhere are left out."""
         return np.asarray(self.load @ force)
 
-    @property
-    def borne(self) -> Mask:
-        """(N,) nodes whose force is borne by vertices."""
-        return np.asarray(self.load.sum(axis=0) > 0.5)
-
 
 def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
     """Attaches the vertices of a scene to the nearest triangles (F, 3) of points (N, 3) mm."""
@@ -68,8 +62,15 @@ def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
     area = vertex_area(*scene)
     share = sp.csr_array(corner.multiply(area[:, None]))
     whole = np.asarray(share.sum(axis=0)).ravel()
-    load = sp.csr_array(share.multiply(np.where(whole > 0, 1 / np.where(whole > 0, whole, 1), 0)[None, :]))
-    return Transfer(motion, corner, load, np.linalg.norm(arm, axis=1), points, close, arm)
+    # Nodes between the vertices, on triangles without any, are borne by the nearest vertex.
+    between = np.flatnonzero(whole == 0)
+    away, at = cKDTree(vertices).query(points[between], distance_upper_bound=2 * float(np.sqrt(area.max())))
+    found = np.isfinite(away)
+    rest = sp.csr_array((np.ones(found.sum()), (at[found], between[found])), shape=share.shape)
+    load = sp.csr_array(
+        share.multiply(np.where(whole > 0, 1 / np.where(whole > 0, whole, 1), 0)[None, :]) + rest
+    )
+    return Transfer(motion, corner, load, points, close, arm)
 
 
 def _nearest(points: Floats, faces: Ints, vertices: Floats) -> tuple[Ints, Floats]:
