@@ -32,9 +32,7 @@ Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
 Masks = Annotated[str, Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png.")]
-ModelFolder = Annotated[
-    Path | None, Option("--model", "-m", help="Model folder of `learn train`, mono or stereo.")
-]
+ModelFolder = Annotated[Path | None, Option("--model", "-m", help="A model's folder, mono or stereo.")]
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
 
@@ -174,7 +172,7 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, or pictures' folder."),
+        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, pictures' folder."),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
@@ -228,13 +226,10 @@ def from_dataset(
     out: Annotated[Path, Option("--out", "-o", help="Folder for one recording per sequence.")],
     sequence: Annotated[int | None, Option(help="Only this sequence.")] = None,
     unseen_by: Annotated[
-        list[Path] | None,
-        Option(help="Only the first sequence this model was not trained on; repeat for more models."),
+        list[Path] | None, Option(help="Only the first sequence a model was not trained on; repeatable.")
     ] = None,
     footage: Annotated[Literal["png", "mp4"], Option(help="Lossless pictures or H.264.")] = "png",
-    instrument: Annotated[
-        int | None, Option(help="Force of this instrument alone, from 1; else of all.")
-    ] = None,
+    instrument: Annotated[int | None, Option(help="Force of this instrument alone, from 1.")] = None,
     json: Json = False,
 ) -> None:
     """Writes sealed sequences as recording folders, to be scored like real recordings."""
@@ -270,10 +265,7 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
-    video: Annotated[
-        Path,
-        Argument(help="Video; its first frame is the rest frame, tissue.png next to it the mask."),
-    ],
+    video: Annotated[Path, Argument(help="Its first frame is at rest; tissue.png next to it: the mask.")],
     model: ModelFolder = None,
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; needed with a model.")] = None,
     young: Young = None,

@@ -52,8 +52,7 @@ Json = Annotated[bool, Option("--json", help="Print JSON on stdout instead of a 
 def train_command(
     dataset: Root,
     changes: Annotated[
-        list[str] | None,
-        Argument(help="Settings of config.json, KEY=VALUE or --KEY VALUE: --input mixed arch.width=32."),
+        list[str] | None, Argument(help="Settings of config.json, as --input mixed or arch.width=32.")
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
@@ -201,7 +200,7 @@ def predict_command(
     model: Annotated[Path, Argument(help="Folder, mono or stereo. Default: the pretrained one that fits.")],
     source: Annotated[
         Path | None,
-        Argument(help="Dataset, .zarr store, video, folder of PNGs, or .npz of flow.", show_default=False),
+        Argument(help="Dataset, store, video, PNGs' folder, or .npz of flow.", show_default=False),
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for NAME.npz and .force.csv.")] = Path("forces"),
     input: Input = None,
@@ -258,7 +257,7 @@ def calibrate_command(
     model: Annotated[Path, Argument(help="Model folder.")],
     data: Annotated[
         list[Path],
-        Argument(help="Presses of known force (.zarr or .npz), or datasets: the training data and new ones."),
+        Argument(help="Presses of known force (.zarr, .npz), or datasets: old training data and new."),
     ],
     input: Input = None,
     from_test: Annotated[bool, Option("--from-test", help="Use half of the datasets' test brains.")] = False,

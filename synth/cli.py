@@ -93,10 +93,7 @@ def _refuse_to_replace(out: Path) -> None:
 @app.command(epilog="Example: synth new job.yaml")
 def new(
     path: Annotated[Path, Argument(help="The job file to write.")] = Path("job.yaml"),
-    series: Annotated[
-        Path | None,
-        Option("--from-series", help="Files of another program's simulation: see mechanics.source."),
-    ] = None,
+    series: Annotated[Path | None, Option("--from-series", help="For files as of mechanics.source.")] = None,
 ) -> None:
     """Writes a job file in which every key is explained, or one for another program's simulation."""
     from synth.job import writer
@@ -329,9 +326,7 @@ def verify(
 def view(
     out: Out,
     sequence: Index = 0,
-    save: Annotated[
-        Path | None, Option(help="Write a recording (.rrd) or a picture (.png, .jpg) instead.")
-    ] = None,
+    save: Annotated[Path | None, Option(help="Write an .rrd, or a picture (.png, .jpg), instead.")] = None,
     frame: Annotated[
         list[int] | None,
         Option("--frame", "-f", help="Of a picture; repeatable; default: the largest force."),
