@@ -77,16 +77,9 @@ def passes(
     Tissue that is not given is found before them, in a few frames. The caller takes all `frames` of a pass
     before the next one.
 
-    Args:
-        footage: the video.
-        settings: of the tracking.
-        free_s: spans known to be without contact [s].
-        flow: computes the flow and is closed by the caller; None: in this process.
-        watch: collects the time spent; None: a new one.
-        progress: called after every decoded picture of a pass with their number.
-
-    Raises:
-        UserError: unreadable video, no tissue, masks or frames of another size, no such estimator.
+    `free_s`: spans known to be without contact [s]; `flow`: computes the flow and is closed by the caller,
+    None: in this process; `watch` collects the time spent; `progress` is called after every decoded picture
+    of a pass with their number. UserError: unreadable video, no tissue, sizes that differ, no such estimator.
     """
     flow, watch = flow or LocalFlow(), watch or Stopwatch()
     if footage.tissue is None:

@@ -55,11 +55,9 @@ class HeightMap:
 def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: Field) -> Floats:
     """Bends a box so that its upper side lies on a height field; only that side's edges are curved then.
 
-    Args:
-        points: (N, 3) mm, z from -depth to 0; midsides in the middle of their sides.
-        cells, faces: (M, 10), and (F, 6) of the upper side.
-        ground: smooth; the whole box is bent after it.
-        height: of the upper side; followed only in part where elements would become too flat.
+    `points`: (N, 3) mm, z from -depth to 0, midsides in the middle of their sides; `cells` (M, 10), `faces`
+    (F, 6) of the upper side; `ground`: smooth, the whole box is bent after it; `height`: of the upper side, followed
+    only in part where elements would become too flat.
     """
     corners = int(cells[:, :4].max()) + 1
     sinking = 1 + points[:, 2] / -points[:, 2].min()

@@ -64,16 +64,9 @@ def block(
 ) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull around the opening.
 
-    Args:
-        anatomy: dome_mm, craniotomy and attachments are used.
-        tets: number of tetrahedra to aim for.
-        focus: contacts, under which the mesh is finest. Empty: finest in the whole opening.
-        height: of the surface over the opening and its rim. None: the bare dome.
-        slips: tissue slips along the skull around the opening, rather than being bonded to it.
-        size_mm: width, height, depth.
-
-    Raises:
-        UserError: the dome is too round for the block, or an attachment holds nothing.
+    Of about `tets` tetrahedra, finest under the contacts `focus`, or in the whole opening if none. `height`:
+    of the surface over opening and rim, None: the bare dome; `slips`: along the skull, rather than bonded
+    to it; `size_mm`: width, height, depth. UserError: too round a dome; an attachment holds nothing.
     """
     size = np.asarray(size_mm)
     fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]

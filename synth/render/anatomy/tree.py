@@ -41,15 +41,9 @@ def grow(
 ) -> tuple[Floats, Ints]:
     """Space colonisation: nodes step towards the attractors nearest to them until none is left in reach.
 
-    Args:
-        nodes, parent: (N, 2) mm, where growth starts, and (N,).
-        attractors: (A, 2) mm.
-        buds: (N,) which of these nodes may sprout; new ones all may.
-        step, kill: length of a segment; distance within which an attractor is used up [mm].
-        wander, rng: random part of a step's direction, as a share, and its source.
-
-    Returns:
-        All nodes (M, 2) and parents (M,), those at the start first.
+    `nodes` (N, 2) mm, `parent` (N,): where growth starts; `buds` (N,): which of them may sprout, new ones all
+    may; `attractors`: (A, 2) mm; `step`, `kill`: length of a segment, distance within which an attractor is
+    used up [mm]; `wander`: random share of a step's direction. Returns all nodes (M, 2) and parents (M,).
     """
     all_nodes, all_parent = [nodes], [parent]
     distance, nearest = cKDTree(nodes[buds]).query(attractors)
