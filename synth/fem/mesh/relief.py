@@ -56,8 +56,8 @@ def raise_top(points: Floats, cells: Ints, faces: Ints, ground: Field, height: F
     """Bends a box so that its upper side lies on a height field; only that side's edges are curved then.
 
     `points`: (N, 3) mm, z from -depth to 0, midsides in the middle of their sides; `cells` (M, 10), `faces`
-    (F, 6) of the upper side; `ground`: smooth, the whole box is bent after it; `height`: of the upper side, followed
-    only in part where elements would become too flat.
+    (F, 6) of the upper side; `ground`: smooth, the whole box is bent after it; `height`: of the upper side,
+    followed only in part where elements would become too flat.
     """
     corners = int(cells[:, :4].max()) + 1
     sinking = 1 + points[:, 2] / -points[:, 2].min()
