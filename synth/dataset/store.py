@@ -303,7 +303,8 @@ class Sequence:
     def __getitem__(self, name: str) -> FieldReader:
         field, where = _field(name), f"{self._location.name}: {name}"
         if name not in self:
-            raise UserError(f"{where}: the sequence has no such field")
+            hint = "; it was made without mechanics.force" if name in ("force", "traction") else ""
+            raise UserError(f"{where}: the sequence has no such field{hint}")
         try:
             array = self._group[name]
         except Exception as error:  # as in FieldReader

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ FILES: dict[tuple[str, str], int] = {
     ("render", "calibration"): camera_file.LARGEST_FILE,
 }
 """Keys of a job that are files, as (section, key), and the largest size of such a file in bytes."""
-_LARGEST_STATE = 2 << 30
+_LARGEST_STATE, _LARGEST_LIST = 2 << 30, 32 << 20
 COLLECTIONS = (".pvd", ".series")  # suffixes of files that name those of a series
+_NAMED = re.compile(r'(?:\bfile=|"name"\s*:\s*)"([^"]+)"')
+_OF_SERIES = (*COLLECTIONS, ".vtu", ".vtk", ".vtp", ".npz", ".obj")
 
 
 def canonical(value: Any) -> bytes:
@@ -56,17 +59,26 @@ def list_sources(mechanics: MechanicsSection) -> list[Path]:
 
 
 def list_files(mechanics: MechanicsSection) -> list[Path]:
-    """Files that series and tables of all sequences may consist of. UserError: there are none."""
+    """Files that series and tables of all sequences consist of. UserError: there are none."""
     found = list[Path]()
     for source in list_sources(mechanics):
         folder = source if source.is_dir() else source.parent
-        whole = folder == source or source.suffix in COLLECTIONS  # which name files in folders below
-        tables = [mechanics.force, mechanics.instruments]
-        named = [folder / one for one in tables if one is not None and one.lower().endswith(".csv")]
-        found += [*named, *sorted(folder.rglob("*") if whole else folder.glob(source.name))]
-    if not (files := [file for file in dict.fromkeys(found) if file.is_file()]):
+        files = (
+            [source]
+            if source.is_file()
+            else folder.iterdir()
+            if source.is_dir()
+            else folder.glob(source.name)
+        )
+        found += [one for one in sorted(files) if one.suffix in _OF_SERIES]
+        for one in [one for one in found if one.suffix in COLLECTIONS]:
+            text = checked_file.read_text(one, _LARGEST_LIST)
+            found += [one.parent / name for name in _NAMED.findall(text)]
+        force = mechanics.force if (mechanics.force or "").lower().endswith(".csv") else None
+        found += [folder / one for one in (force, mechanics.instruments) if one is not None]
+    if not (named := [file for file in dict.fromkeys(found) if file.is_file()]):
         raise UserError(f"mechanics.source: no file is named by {mechanics.source}")
-    return files
+    return named
 
 
 def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:

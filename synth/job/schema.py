@@ -178,7 +178,7 @@ class CardSection(Section):
     """Authors of the dataset."""
 
 
-_WITH_SERIES = {"young_kpa", "poisson", "footprint_mm", "instrument", "gestures"}
+_WITH_SERIES = {"young_kpa", "poisson", "footprint_mm", "instrument"}
 """Keys of `fem` that mean something where another program's files hold the motion."""
 
 
@@ -238,7 +238,13 @@ class Job(Section):
             raise ValueError("mechanics.source needs craniotomy.point and direction, and no anatomy.mesh")
         if self.mechanics.force is None and (labels := {"intensity", "flow_noisy"} & set(self.store.extra)):
             raise ValueError(f"store.extra: {min(labels)} needs mechanics.force")
-        if unused := _changed(self.fem) - _WITH_SERIES:
+        if lost := _changed(self.anatomy) & {"fill_holes", "dome_mm", "attachments"}:
+            raise ValueError(
+                f"anatomy.{min(lost)} is not used: the files of mechanics.source hold the motion"
+            )
+        usual = FemSection(instrument=self.fem.instrument)  # whose gestures are those of the instruments
+        derived = {"gestures"} if self.fem.gestures == usual.gestures else set[str]()
+        if unused := _changed(self.fem) - _WITH_SERIES - derived:
             raise ValueError(f"fem.{min(unused)} is not used: the files of mechanics.source hold the motion")
         if self.mechanics.force is not None and self.fem.young_kpa[0] != self.fem.young_kpa[1]:
             raise ValueError("mechanics.force needs one value of fem.young_kpa, that of the files' tissue")

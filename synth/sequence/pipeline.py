@@ -216,7 +216,7 @@ def _seal(task: _Task) -> Path:
         **_lens(scene.view),
         scale_mm_per_px=scene.scale_mm_per_px,
         young_kpa=scene.young_kpa,
-        poisson=case.tissue.poisson,
+        poisson=None if scene.young_kpa is None else case.tissue.poisson,
         mechanics=_mechanics(scene),
         variant=scene.renderer.variant,
         timings=task.watch.report(),

@@ -62,7 +62,7 @@ class SeriesMechanics:
             warnings.warn(f"mechanics.source: {jump}; store more states, or raise fps", Caution, stacklevel=1)
         whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm
         outside = float(np.linalg.norm(lost + load[:, hidden].sum(axis=1), axis=1).max())
-        if outside > _LOST * (most := float(np.linalg.norm(whole + lost, axis=1).max())):
+        if outside > _LOST * (most := max(float(np.linalg.norm(whole + lost, axis=1).max()), outside)):
             share = f"{outside:.3g} mN, {100 * outside / most:.0f}% of the load"
             beyond = f"{np.linalg.norm(lost, axis=1).max():.2f} mN beyond the drawn surface are in no label"
             why = f"mechanics.force: {share}, act outside the opening; {beyond}"

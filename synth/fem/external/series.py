@@ -98,7 +98,10 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
         if any(one.min(initial=0) < 0 for one in cells.values()):
             raise ValueError("a cell refers to a missing point")
         cells = {kind: place[one] for kind, one in cells.items()}
-        nodes, faces = np.unique(skin(points, cells), return_inverse=True)
+        outer = skin(points, cells)
+        sides = np.cross(points[outer[:, 1]] - points[outer[:, 0]], points[outer[:, 2]] - points[outer[:, 0]])
+        area = np.linalg.norm(sides, axis=1)  # cells may be collapsed
+        nodes, faces = np.unique(outer[area > _ROUNDING**2 * area.max()], return_inverse=True)
     links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
     graph = sp.coo_array((np.ones(sum(one.shape[1] for one in links)), np.hstack(links)), [len(points)] * 2)
     bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
@@ -134,7 +137,7 @@ def assemble(
         if load is not None:
             force, whole = np.empty_like(displacement) if force is None else force, np.zeros_like(moved)
             np.add.at(whole, place, load)
-            force[k] = whole[nodes]
+            force[k] = whole[nodes] / (np.bincount(place)[nodes][:, None] if per_area else 1)
     timed, time = not np.isnan(times).all(), _rising(times, files, units)
     scale = _length(surface.points, units, source)
     points = scale * surface.points
@@ -214,7 +217,10 @@ def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> Mes
 def equip(series: MeshSeries, table: Path) -> MeshSeries:
     """The series with instruments: columns time, and for each I from 0 on xI, yI, zI of the tip and uI, vI,
     wI from it to the hand. UserError: no such table."""
-    count = 1 + len({"x1", "x2"} & set(read_header(table)))
+    if (count := sum(name.startswith("x") for name in read_header(table))) not in (1, 2, 3):
+        raise UserError(
+            f"{table}: has the tips x0, x1, ... of {count} instruments, one to three are possible"
+        )
     names = [f"{axis}{k}" for k in range(count) for axis in "xyzuvw"]
     rows = _at_states(series, table, names).reshape(len(series.time), count, 6)
     size = np.linalg.norm(rows[..., 3:], axis=2, keepdims=True)
