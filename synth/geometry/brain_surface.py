@@ -31,6 +31,7 @@ _BRAIN_MM = 20.0, 400.0  # greatest extent: of a small phantom, of more than a h
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 _CLICKED_MM = 0.03  # a point read in a viewer is that close to the surface, or closer than its mirrors
 _STEEPEST = 0.5  # cosine of the angle between an opening's direction and the normal of the surface in it
+_THIN = 0.1  # share of the area that both sides of a sheet, which cancel, leave
 _STATED = rb"SPACE(?:=|\s+1\s+1\s+string\s+)([RL][AP][SI])\b"  # in a header or comment of 3D Slicer's
 _OPEN = 0.25  # missing share of a surface's area above which it counts as open: a hemisphere lacks a half
 
@@ -129,15 +130,15 @@ def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_
     """
     from trimesh.triangles import closest_point
 
-    def nearest(at: Floats) -> tuple[float, Floats]:
+    def nearest(at: Floats) -> tuple[float, Floats, int]:
         found = np.asarray(closest_point(corners, np.broadcast_to(at, (len(corners), 3))))
         away = np.linalg.norm(found - at, axis=1)
-        return float(away.min()), found[away.argmin()]
+        return float(away.min()), found[away.argmin()], int(away.argmin())
 
     def text(vector: Floats) -> str:
         return "[" + ", ".join(f"{x:.2f}" for x in vector) + "]"
 
-    (gap, foot), turned = nearest(point), []
+    (gap, foot, face), turned = nearest(point), []
     for what, sign in (("x and y", [-1, -1, 1]), ("x", [-1, 1, 1]), ("y", [1, -1, 1]), ("z", [1, 1, -1])):
         turned.append((nearest(point * sign)[0], f"; with {what} negated, {text(point * sign)}, it is "))
     left, hint = min(turned)
@@ -149,7 +150,10 @@ def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_
         )
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     middle = corners.mean(axis=1)
-    near = normals[np.linalg.norm(middle - foot, axis=1) <= radius_mm].sum(axis=0)
+    opened = np.linalg.norm(middle - foot, axis=1) <= radius_mm
+    near = normals[opened].sum(axis=0)
+    if np.linalg.norm(near) < _THIN * np.linalg.norm(normals[opened], axis=1).sum():
+        near = normals[opened & (normals @ normals[face] > 0)].sum(axis=0)
     near *= np.sign(((middle - middle.mean(axis=0)) * normals).sum())  # all may face inwards
     if near.any() and out @ near < _STEEPEST * np.linalg.norm(near):
         where = "into the tissue" if out @ near < 0 else "along the surface"
