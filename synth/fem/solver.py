@@ -42,17 +42,11 @@ def deform(
 ) -> Deformation:
     """Deformation of a brain by the gestures of its instruments.
 
-    Args:
-        fem, tissue: the job's section; stiffness and law.
-        gestures: one per instrument, all at the same time; none where only the pulse moves the tissue.
-        tets, surface: the volume, and the fine surface on it, faces counter-clockwise from outside.
-        frames, fps: T >= 2, and their rate in 1/s.
-        pulse, opening_mm: no part of force and traction; radius of the craniotomy, which is exposed to it.
-        motions: of the gestures, over T frames each; their own trajectories if there are none.
-        inside: whether the volume's motion and stress are returned too.
-
-    Raises UserError: the load is past the law's range, or the contact is not on the surface; and as
-    `equilibrium.solve_path`.
+    `gestures`: one per instrument, all at once, none where only the pulse moves the tissue; `surface`: on the
+    volume, faces counter-clockwise from outside; `frames`: T >= 2; `pulse`: no part of force and traction, the
+    craniotomy of radius `opening_mm` is exposed to it; `motions`: of the gestures over T frames each, their own
+    trajectories if none; `inside`: return the volume too. UserError: the load is past the law's range, or the
+    contact is not on the surface; and as `equilibrium.solve_path`.
     """
     motions = motions or [tool_gesture.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))

@@ -126,12 +126,9 @@ def describe(
 ) -> Map:
     """`FEATURES` (CHANNELS, h, w) float32 of a frame and its flow on cells of 4 x 4 px.
 
-    Args:
-        rest, now: (H, W, 3) uint8.
-        rest_usable: (H, W), unmasked tissue in the rest frame.
-        greys: (H, W) each, the contrast-normalised rest frame and frame now, the latter warped by the flow.
-        visible: (H, W) 1 where the sampled pixels of the frame now are usable, else 0; see `image.warp`.
-        flow, agreed: (H, W, 2) px, and (H, W) in 0..1, its agreement.
+    `rest`, `now`: (H, W, 3) uint8; `rest_usable`: (H, W), unmasked tissue at rest; `greys`: (H, W) each, the
+    contrast-normalised rest frame, and frame now warped by `flow` (H, W, 2) px; `visible`: (H, W) 1 where
+    pixels sampled now are usable, else 0, see `image.warp`; `agreed`: (H, W) 0..1, agreement of the flow.
     """
     height, width = agreed.shape
     u, v = cv2.split(flow)

@@ -35,13 +35,9 @@ def describe(
 ) -> Map:
     """`FEATURES` (CHANNELS, h, w) float32 of a frame on the cells of the solver.
 
-    Args:
-        change, solver: the solver's solution, by the rectified flow (2, H, W) px of the left camera.
-        flow: as there.
-        visible: (h, w) share of a cell that is unmasked tissue in the left picture.
-        spread: (h, w) px, standard deviation of a flow component.
-        px_per_mm: as in `Solver.solve`.
-        mm_per_px: size of a pixel at the tissue.
+    `change` of `solver` is by the left camera's rectified `flow` (2, H, W) px; `visible`: (h, w) share of a
+    cell that is unmasked tissue in the left picture; `spread`: (h, w) px, deviation of a flow component;
+    `px_per_mm` as in `Solver.solve`; `mm_per_px`: size of a pixel at the tissue.
     """
     coarse, across = solver.coarse, [mm_per_px * solver.coarse(part) for part in flow]
     here = coarse(change.px)

@@ -58,16 +58,10 @@ class StereoTracker:
         right_blocked: Mask,
         tissue: Mask,
     ) -> None:
-        """Starts at the rest frame.
+        """Starts at the rest frame, 0, with the first n frames (n, H, W, 3) uint8, all at rest.
 
-        Args:
-            rig: the pair of cameras.
-            lefts, rights: (n, H, W, 3) uint8, the first n frames, all at rest; frame 0 is the rest frame.
-            left_blocked, right_blocked: (H, W), instrument and glare masks of the rest frame.
-            tissue: (H, W), in the left rest frame.
-
-        Raises:
-            UserError: the rest pictures do not match, or shapes differ.
+        `left_blocked`, `right_blocked`: (H, W), instruments and glare in the rest frame; `tissue`: (H, W), in
+        the left one. UserError: the rest pictures do not match, or shapes differ.
         """
         width, height = rig.size
         if lefts.shape != rights.shape or not lefts.shape[1:3] == tissue.shape == (height, width):
