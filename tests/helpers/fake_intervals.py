@@ -14,13 +14,8 @@ from learn.uncertainty.out_of_distribution import MotionDistribution
 FACTORS = {"0.9": 2.0, "0.68": 1.0}
 
 
-def make(
-    size: float = 5.0,
-    axes: tuple[float, float, float] = (3.0, 4.0, 50.0),
-    frame_limit: float = 1e6,
-    source: str = "recovered",
-) -> Intervals:
-    """Half widths of the 68% interval, per unit stiffness; half of those of the 90% one.
+def make(frame_limit: float = 1e6) -> Intervals:
+    """Half widths of the 68% interval are, per unit stiffness, 5 of size and 3, 4 and 50 of x, y and z.
 
     `frame_limit`: distance, in logarithm of motion from 1 mm, beyond which a frame is out of distribution.
     """
@@ -33,9 +28,9 @@ def make(
 
     count = len(names) - len(ESTIMATE)
     along = tuple(tuple(float(i == j == 0) for j in range(count)) for i in range(count))
-    x, y, z = (spread(half, len(names)) for half in axes)
+    size, *axes = (spread(half, len(names)) for half in (5.0, 3.0, 4.0, 50.0))
     distribution = MotionDistribution((0.0,) * count, along, frame_limit)
-    return Intervals(names, 100.0, spread(size, len(names)), (x, y, z), distribution, source, 19, 19)
+    return Intervals(names, 100.0, size, tuple(axes), distribution, "recovered", 19, 19)
 
 
 def give(folder: Path, intervals: Intervals) -> Path:

@@ -46,7 +46,6 @@ class Maker:
         size: tuple[int, int] = (96, 128),
         meta: Mapping[str, Any] | None = None,
         footage: str = "png",
-        force: bool = True,
     ) -> Path:
         folder = self.root / name
         (folder / "frames").mkdir(parents=True)
@@ -60,9 +59,8 @@ class Maker:
         else:
             (folder / "frames").rmdir()
             writer.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
-        if force:
-            t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
-            writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
+        t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
+        writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
         known = {"membrane": "stripped", "poisson": [0.45, 0.45]}  # two tissues to solve, not twelve
         writer.write_meta(folder, {**about, **known, **(meta or {})})

@@ -85,7 +85,6 @@ def test_imported_data_equal_the_source(
     assert np.array([p.time_s for p in pictures]) == pytest.approx(TIMES, abs=1e-6)
     got = np.stack([p.rgb for p in pictures]).astype(int)
     assert np.abs(got - footage()).max() <= 3  # RGB to YUV and back
-    assert recording.force is not None
     assert recording.force.force_mn == pytest.approx(1000 * FORCE, abs=1e-6)
 
 
@@ -128,16 +127,11 @@ def test_truncated_sequence_leaves_nothing_behind(tmp_path: Path) -> None:
 VIDEO = np.stack([texture(48, 64, seed) for seed in range(12)])
 
 
-@pytest.fixture
-def pictures(tmp_path: Path) -> Path:
-    folder = tmp_path / "cam"
-    folder.mkdir()
+def test_a_folder_of_pictures_with_a_ros_table_becomes_a_recording(tmp_path: Path) -> None:
+    pictures = tmp_path / "cam"
+    pictures.mkdir()
     for k, rgb in enumerate(VIDEO):
-        cv2.imwrite(str(folder / f"img{k}.png"), rgb[..., ::-1])  # img10 comes after img9
-    return folder
-
-
-def test_a_folder_of_pictures_with_a_ros_table_becomes_a_recording(pictures: Path, tmp_path: Path) -> None:
+        cv2.imwrite(str(pictures / f"img{k}.png"), rgb[..., ::-1])  # img10 comes after img9
     table = tmp_path / "ft.csv"
     rows = "\n".join(f"{(17 * 10**8 + k) * 10**9},{k},{0.1 * k},0,-0.5" for k in range(4))
     table.write_text(
@@ -149,7 +143,6 @@ def test_a_folder_of_pictures_with_a_ros_table_becomes_a_recording(pictures: Pat
     times = ["--use", f"force={table}", "--use", f"frame_time={stamps}"]
     run(app, "import", pictures, "-o", out, "--scale", 0.1, *times)
     recording = open_recording(out)
-    assert recording.force is not None
     assert recording.force.time_s == pytest.approx([0, 1, 2, 3], abs=1e-5)
     assert recording.force.force_mn[3] == pytest.approx([300.0, 0.0, -500.0])
     frames = list(recording.frames())

@@ -19,24 +19,21 @@ def estimate(forces: list[Floats], deviations: list[float], weights: list[float]
     return ForceEstimate(mixture.mean, likely=mixture)
 
 
-def fuse_one(network: ForceEstimate, physics: ForceEstimate) -> tuple[ForceEstimate, Fusion]:
-    method = Fusion("network", "physics")
-    return method.fuse([{"network": network, "physics": physics}], SCENE, 2)[0], method
+def fuse_one(network: ForceEstimate, physics: ForceEstimate) -> ForceEstimate:
+    return Fusion("network", "physics").fuse([{"network": network, "physics": physics}], SCENE, 2)[0]
 
 
 def test_gaussians_are_weighted_by_their_precisions() -> None:
     a, b = np.array([3.0, 0.0, 1.0]), np.array([1.0, 2.0, 0.0])
     physics = estimate([b], [0.5], [1.0])
-    found, _ = fuse_one(estimate([a], [1 / CAUTION], [1.0]), physics)
+    found = fuse_one(estimate([a], [1 / CAUTION], [1.0]), physics)
     np.testing.assert_allclose(found.force_mn, (a + 4 * b) / 5)
-    assert physics.likely is not None
     np.testing.assert_allclose(physics.likely.observe(a, np.eye(3)).covariance[0], np.eye(3) / 5, atol=1e-12)
 
 
 def test_components_that_contradict_the_network_lose_weight() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([5.0, 0.0, 0.0])
     physics = estimate([near, far], [0.8, 0.8], [0.3, 0.7]).likely
-    assert physics is not None
     odds = 0.7 / 0.3 * np.exp(-(3.0**2) / 2)  # variances add up to 1
     found = physics.observe(near, 0.36 * np.eye(3))
     np.testing.assert_allclose(found.weight, [1 / (1 + odds), odds / (1 + odds)])
@@ -44,7 +41,7 @@ def test_components_that_contradict_the_network_lose_weight() -> None:
 
 def test_without_a_stated_error_the_network_is_used_alone() -> None:
     network, physics = estimate([np.ones(3)], [1.0], [1.0]), ForceEstimate(np.zeros(3))
-    np.testing.assert_array_equal(fuse_one(network, physics)[0].force_mn, network.force_mn)
+    np.testing.assert_array_equal(fuse_one(network, physics).force_mn, network.force_mn)
 
 
 def test_intervals_have_90_percent_coverage() -> None:
@@ -53,7 +50,7 @@ def test_intervals_have_90_percent_coverage() -> None:
         true = rng.normal(size=3) * 5
         factor = np.exp(0.3 * rng.normal())
         forces = [true * factor + deviation * rng.normal(size=3) for deviation in (1.0, 0.7)]
-        found, _ = fuse_one(estimate([forces[0]], [1 / CAUTION], [1.0]), estimate([forces[1]], [0.7], [1.0]))
+        found = fuse_one(estimate([forces[0]], [1 / CAUTION], [1.0]), estimate([forces[1]], [0.7], [1.0]))
         inside += found.low_mn <= np.linalg.norm(true) <= found.high_mn
     assert inside / count == pytest.approx(0.9, abs=0.05)
 

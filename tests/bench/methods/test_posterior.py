@@ -126,9 +126,8 @@ def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
     disc = disc[np.hypot(*disc.T) < radius]
     share = 1 - np.square(disc).sum(axis=1) / radius**2
     share /= share.sum()
-    apart = basis.known.points[:, None] - disc[None]
-    r = np.hypot(apart[..., 0], apart[..., 1]).clip(0.05)
-    x, y = apart[..., 0], apart[..., 1]
+    x, y = np.moveaxis(basis.known.points[:, None] - disc, -1, 0)
+    r = np.hypot(x, y).clip(0.05)
     shear = 1 / (2 * (1 + nu))
     p, q = force[2] / (4 * np.pi * shear), force[0] / (4 * np.pi * shear)
     u = -p * (1 - 2 * nu) * x / r**2 + q * (2 * (1 - nu) / r + 2 * nu * x**2 / r**3)

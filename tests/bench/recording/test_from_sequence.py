@@ -18,11 +18,11 @@ from synth.dataset.store import Dataset, open_sequence
 from synth.job.schema import Job
 
 SIZE = (33, 48)
+JOB = Job(frames=4, render={"size": SIZE[::-1]}, flow={"backend": "ideal"})
 
 
 def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path) -> None:
-    job = Job(frames=4, render={"size": SIZE[::-1]}, flow={"backend": "ideal"})
-    fake_work.sequence(job, 0, tmp_path, lambda *_: None)
+    fake_work.sequence(JOB, 0, tmp_path, lambda *_: None)
     sequence = open_sequence(tmp_path / "000000.zarr")
     folder = export_recording(sequence, tmp_path / "rec")
     names = {path.name for path in folder.iterdir()}
@@ -31,22 +31,18 @@ def test_pictures_forces_and_masks_come_back_without_ground_truth(tmp_path: Path
     frames = list(recording.frames())
     assert np.array_equal([f.rgb for f in frames], sequence["rgb"][:])
     assert [f.time_s for f in frames] == pytest.approx(sequence["time"][:])
-    assert recording.force is not None
     assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
     assert recording.meta.scale_mm_per_px == pytest.approx(0.1)
     assert recording.meta.young_kpa == pytest.approx(sequence.attrs["young_kpa"])
     assert np.array_equal(recording.tissue_mask(SIZE), sequence["tissue"][:])
     mask = recording.masks.read(2, SIZE)
-    assert mask is not None
     assert np.array_equal(mask, sequence["tool"][2])
 
 
 def test_the_force_of_one_instrument(tmp_path: Path) -> None:
-    job = Job(frames=4, render={"size": SIZE[::-1]}, flow={"backend": "ideal"})
-    fake_work.consistent(job, 0, tmp_path, lambda *_: None)
+    fake_work.consistent(JOB, 0, tmp_path, lambda *_: None)
     sequence = open_sequence(tmp_path / "000000.zarr")
     recording = open_recording(export_recording(sequence, tmp_path / "one", instrument=1))
-    assert recording.force is not None
     assert recording.force.force_mn == pytest.approx(sequence["force"][:], abs=1e-5)
     done = run(app, "from-dataset", tmp_path, "-o", tmp_path / "two", "--instrument", "2", code=2)
     assert "instrument 2" in done.output

@@ -60,8 +60,6 @@ def test_given_mask_is_masked_and_pictured(tmp_path: Path) -> None:
     assert found.summary.shares["masked"] == pytest.approx(0.25, abs=0.05)
     assert found.trusted == [True] * 4
     picture = picture_masks(found)
-    assert picture is not None
-    assert found.rest is not None
     assert np.abs(picture.astype(int) - found.rest)[:, 40:].mean() < 1
     assert np.abs(picture.astype(int) - found.rest)[:, :30].mean() > 20
 

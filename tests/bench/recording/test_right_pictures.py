@@ -25,6 +25,8 @@ from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, RO
 FPS = 6.0
 DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
 SETTINGS = RecordingFlowSettings(rate_hz=None, pulse=False, masks="none")
+CALIBRATION = {"K1": K, "D1": np.zeros(5), "K2": K_RIGHT, "D2": np.zeros(5)}
+CALIBRATION |= {"R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}
 Make = Callable[..., Path]
 
 
@@ -48,14 +50,6 @@ def rise(amount: float) -> np.ndarray:
     return np.asarray(FOCAL * BASE / (FOCAL * BASE / AWAY - amount * DENT) - AWAY)
 
 
-def write_pair(folder: Path) -> dict[str, object]:
-    """Writes the calibration and returns its section of meta.yaml."""
-    pair = {"K1": K, "D1": np.zeros(5), "K2": K_RIGHT, "D2": np.zeros(5)}
-    pair |= {"R": np.eye(3), "T": np.array([[-1.0], [0], [0]])}
-    writer.write_storage(folder / "pair.yaml", pair)
-    return {"calibration": "pair.yaml", "mm_per_unit": BASE}
-
-
 @pytest.fixture
 def make(tmp_path: Path) -> Make:
     """Frames by the size of the dent and the height of the whole surface, at rest where disparity is 0."""
@@ -73,7 +67,9 @@ def make(tmp_path: Path) -> Make:
                 now = cv2.remap(depth, *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
                 np.save(tmp_path / f"depth/{t:03d}.npy", np.dstack([0 * now, 0 * now, now]) if t else now)
         about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": FPS}
-        about |= {"stereo": write_pair(tmp_path)} if second == "right" else {"depth": {"focal_px": FOCAL}}
+        writer.write_storage(tmp_path / "pair.yaml", CALIBRATION)
+        pair = {"calibration": "pair.yaml", "mm_per_unit": BASE}
+        about |= {"stereo": pair} if second == "right" else {"depth": {"focal_px": FOCAL}}
         writer.write_meta(tmp_path, about)
         return tmp_path
 
@@ -87,17 +83,14 @@ class Recorder:
         self.inputs: list[Moved] = []
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
-        moved = frame.motion
-        assert moved is not None
-        self.inputs.append(moved)
-        return ForceEstimate(moved.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
+        self.inputs.append(frame.motion)
+        return ForceEstimate(frame.motion.motion[50:70, 70:90].mean(axis=(0, 1)).astype(np.float64))
 
 
 @pytest.mark.parametrize("second", ["right", "depth"])
 def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> None:
     method = Recorder()
     done = track_recording(open_recording(make(second)), {"it": method}, AWAY / FOCAL, SETTINGS)
-    assert len(method.inputs) == 3
     assert not method.inputs[0].motion.any()
     inner = (slice(15, -15), slice(15, -15))
     for moved, amount in zip(method.inputs[1:], (0.3, 0.6), strict=True):
@@ -107,7 +100,6 @@ def test_motion_in_three_dimensions_is_recovered(make: Make, second: str) -> Non
         assert moved.motion[60, 80, 2] == pytest.approx(rise(amount)[60, 80], rel=0.15)
         assert moved.motion[60, 80, 0] == pytest.approx(2.5 * amount * AWAY / FOCAL, abs=0.05)
         assert (moved.deviation[inner] > 0).all()
-    assert done.stereo is not None
     assert done.stereo.noise_mm > 0
     assert np.isnan(done.stereo.baseline_mm) == (second == "depth")
     if second == "right":
@@ -147,12 +139,9 @@ def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, seco
     assert after < 0.12
     deepest = int(np.argmax(load))
     assert motion[1, deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
-    assert done.stereo is not None
 
 
 PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
-
-
 FAULTS: dict[str, float] = {"copied": True, "frozen": 3, "tool_behind_px": 2.0, "lag_s": -0.1}
 FAULTS |= {"epipolar_px": 3.0, "last_rows_px": 1.8}
 

@@ -17,8 +17,6 @@ from synth.arrays import Mask, Pixels
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 
-SIZE = (96, 128)
-
 
 class Known(LocalFlow):
     """A flow proportional to the force, which loses the given frames."""
@@ -114,8 +112,7 @@ def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Make
     about = {"sync": {"method": "correlate", "calibration_s": [3.0, 9.0], "search_s": 2.5}}
     folder = make(frames=130, meta=about)
     result = run(folder)
-    assert result.sync is not None
-    assert result.sync.refused
+    assert "ambiguous" in result.sync.refused
     assert "clocks" in {one.cause for one in result.findings}
     assert result.methods["bump"].scores["r"] > 0.99, "scored at the stated offset"
     offsets, r = np.array(result.sync.correlogram).T

@@ -119,7 +119,6 @@ def test_recordings_without_texture_or_motion_have_no_scores(make: Maker, pictur
         cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), picture)
     result = scored(folder, backend="dis")
     assert result.lost.all()
-    assert np.isnan(result.methods["bump"].size_mn).all()
     assert headline(result).refused
 
 
@@ -128,4 +127,3 @@ def test_a_single_black_frame_is_lost(make: Maker) -> None:
     cv2.imwrite(str(folder / "frames" / "0004.png"), BLACK)
     result = scored(folder, backend="dis")
     assert np.flatnonzero(result.lost).tolist() == [4]
-    assert headline(result).refused == ""

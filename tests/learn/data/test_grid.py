@@ -47,15 +47,11 @@ def test_grid_values_on_the_picture() -> None:
     np.testing.assert_allclose(np.diff(back[36, 5:-5]), 0.5, atol=1e-5)
 
 
-def spread(strain_x: float, strain_y: float) -> torch.Tensor:
-    node = (torch.arange(64) - 31.5) * GRID.pitch_mm
-    return torch.stack([strain_x * node.expand(64, 64), strain_y * node.expand(64, 64).T])[None]
-
-
 def test_divergence_of_a_stretch_is_the_sum_of_its_strains_up_to_the_masks_edge() -> None:
     mask = torch.zeros(1, 1, 64, 64)
     mask[..., 10:50, 8:56] = 1
-    got = divergence(spread(0.03, 0.01), mask, GRID.pitch_mm)
+    node = ((torch.arange(64) - 31.5) * GRID.pitch_mm).expand(64, 64)
+    got = divergence(torch.stack([0.03 * node, 0.01 * node.T])[None], mask, GRID.pitch_mm)
     assert torch.all(got[mask == 0] == 0)
     inner = got[..., 14:46, 12:52]
     torch.testing.assert_close(inner, torch.full_like(inner, 0.04), rtol=1e-4, atol=1e-5)

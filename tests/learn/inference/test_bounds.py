@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import fake_intervals
-import fake_model
 import numpy as np
 import pytest
 from fake_model import write_model
@@ -30,29 +29,22 @@ def flow(size_mm: float) -> NDArray[np.float32]:
 
 
 def estimate(
-    folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0, notes: list[str] | None = None
-) -> FrameForce:
+    folder: Path, size_mm: float = 0.4, young_kpa: float | None = 2.0
+) -> tuple[FrameForce, list[str]]:
+    """The force and the notes on its interval."""
     estimator = ForceEstimator(load_model(folder), np.ones(SHAPE, bool), SCALE, young_kpa)
     found = estimator.estimate(FrameMotion(flow(size_mm), np.ones(SHAPE, np.float32)))
-    if notes is not None:
-        notes += estimator.interval_notes
-    return found
+    return found, estimator.interval_notes
 
 
 @pytest.fixture
 def vector(tmp_path: Path) -> Path:
-    return fake_model.write_model(tmp_path / "vector", "arch.output=vector")
-
-
-@pytest.fixture
-def sizes(tmp_path: Path) -> Path:
-    return fake_model.write_model(tmp_path / "sizes", "arch.output=magnitude")
+    return write_model(tmp_path / "vector", "arch.output=vector")
 
 
 @pytest.mark.parametrize("young_kpa", [2.0, None])
 def test_bounds_are_those_of_the_card_in_mn(vector: Path, young_kpa: float | None) -> None:
-    notes: list[str] = []
-    found = estimate(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa, notes=notes)
+    found, notes = estimate(fake_intervals.give(vector, fake_intervals.make()), young_kpa=young_kpa)
     force, young = found.force_mn, young_kpa or 1.0
     size = np.linalg.norm(force)
     for level, factor in fake_intervals.FACTORS.items():
@@ -64,17 +56,16 @@ def test_bounds_are_those_of_the_card_in_mn(vector: Path, young_kpa: float | Non
     assert notes == []
 
 
-def test_without_direction_components_are_around_zero(sizes: Path) -> None:
-    band = estimate(fake_intervals.give(sizes, fake_intervals.make())).bands[LEVEL]
+def test_without_direction_components_are_around_zero(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "sizes", "arch.output=magnitude")
+    band = estimate(fake_intervals.give(model, fake_intervals.make()))[0].bands[LEVEL]
     assert band.axes_high[0] == pytest.approx([12, 16, 200])
     assert band.axes_low[0] == pytest.approx([-12, -16, -200])
 
 
 def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> None:
     limit = 0.1
-    notes: list[str] = []
-    found = estimate(fake_intervals.give(vector, fake_intervals.make(frame_limit=limit)), notes=notes)
-    assert found.map.motion is not None
+    found, notes = estimate(fake_intervals.give(vector, fake_intervals.make(frame_limit=limit)))
     distance = abs(found.map.motion[0])
     # From 1 mm; half of the tissue moved.
     assert distance == pytest.approx(abs(np.log(0.4 * np.sqrt(0.5) + 0.005)), rel=0.03)
@@ -82,15 +73,15 @@ def test_out_of_distribution_is_reported_and_widens_intervals(vector: Path) -> N
     assert wider == pytest.approx(10 * distance / limit)
     assert len(notes) == 1
     assert "log motion (low)" in notes[0]
-    at_rest: list[str] = []
-    assert estimate(vector, 0.0, notes=at_rest).bands
-    assert at_rest == []
+    resting, notes = estimate(vector, 0.0)
+    assert resting.bands
+    assert notes == []
 
 
-@pytest.mark.parametrize("kind", ["vector", "sizes"])
-def test_fitting_and_estimation_use_the_same_force(kind: str, request: pytest.FixtureRequest) -> None:
-    folder = request.getfixturevalue(kind)
-    moved, still = estimate(folder), estimate(folder, 0.0)
+@pytest.mark.parametrize("output", ["vector", "magnitude"])
+def test_fitting_and_estimation_use_the_same_force(output: str, tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "model", f"arch.output={output}")
+    (moved, _), (still, _) = estimate(folder), estimate(folder, 0.0)
     found = net_force(moved.map.density[None], still.map.density[None], moved.map.grid)
     assert found[0] == pytest.approx(moved.force_mn, nan_ok=True, rel=1e-5, abs=1e-5)
 
@@ -160,5 +151,4 @@ def test_force_is_that_of_the_part_that_moves(tmp_path: Path) -> None:
     ignoring = ForceEstimator(predictor, _WIDE[cut], _MM_PER_PX, 1.0, "intact")
     assert np.array_equal(ignoring.estimate(part).force_mn, alone)
     assert [len(one.notes) for one in (estimator, ignoring)] == [1, 1]
-    assert middle is not None
     assert float(np.linalg.norm(middle - found.map.force_mn)) > 0.2 * float(np.linalg.norm(alone))

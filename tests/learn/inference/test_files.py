@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import onnxruntime
-import phantom
 import pytest
 from command import run
 from fake_model import write_model
@@ -163,30 +161,17 @@ def test_stiffness_from_a_press(clips: list[Clip]) -> None:
             found(wrong)
 
 
-FILES = ["000000.force.csv", "000000.force.mp4", "000000.npz"]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("predicted")
-    phantom.write(folder, 0, anatomy_seed=0)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def vector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_model(tmp_path_factory.mktemp("model"), "arch.output=vector")
 
 
-def frames(path: Path) -> list[np.ndarray]:
-    with av.open(str(path)) as container:
-        return [one.to_ndarray(format="rgb24") for one in container.decode(video=0)]
-
-
-def test_a_dataset_gives_the_three_files(data: Path, vector: Path, tmp_path: Path) -> None:
-    run(app, "predict", vector, data, "--out", tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == FILES
-    sequence = Dataset(data)[0]
+def test_a_dataset_gives_the_three_files(dataset: Path, vector: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset / "000000.zarr", tmp_path / "data/000000.zarr")
+    run(app, "predict", vector, tmp_path / "data", "--out", tmp_path)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["000000.force.csv", "000000.force.mp4", "000000.npz", "data"]
+    sequence = Dataset(dataset)[0]
     with np.load(tmp_path / "000000.npz") as found:
         assert set(found.files) <= set(prediction_file.FIELDS)
         assert found["scale_mm_per_px"] == pytest.approx(sequence.attrs["scale_mm_per_px"])
@@ -195,14 +180,14 @@ def test_a_dataset_gives_the_three_files(data: Path, vector: Path, tmp_path: Pat
         columns = {"total_force_mn": found["total_force_mn"], "force_y_mn": found["force_mn"][:, 1]}
         for name, values in (columns | {"time_s": sequence["time"][:]}).items():
             assert [float(row[name]) for row in rows] == pytest.approx(values, rel=1e-5), name
-    overlay = frames(tmp_path / "000000.force.mp4")
+    overlay = list(read_video(tmp_path / "000000.force.mp4"))
     assert len(overlay) == sequence.frames
-    assert overlay[0].shape[0] > sequence.size[0], "the curve lies below the picture"
+    assert overlay[0].rgb.shape[0] > sequence.size[0], "the curve lies below the picture"
 
 
 @pytest.mark.slow
-def test_an_array_gives_what_its_pictures_give(data: Path, vector: Path, tmp_path: Path) -> None:
-    sequence = Dataset(data)[0]
+def test_an_array_gives_what_its_pictures_give(dataset: Path, vector: Path, tmp_path: Path) -> None:
+    sequence = Dataset(dataset)[0]
     rgb, tissue = sequence["rgb"][:], sequence["tissue"][:]
     (tmp_path / "frames").mkdir()
     for t, picture in enumerate(rgb):
@@ -220,17 +205,17 @@ def test_an_array_gives_what_its_pictures_give(data: Path, vector: Path, tmp_pat
             learn.predict(rgb, vector, **{"tissue": tissue, **how, **wrong})
 
 
-def test_motion_by_another_estimator_than_the_networks_own_is_noted(data: Path, tmp_path: Path) -> None:
+def test_motion_by_another_estimator_than_the_networks_own_is_noted(dataset: Path, tmp_path: Path) -> None:
     trained = write_model(tmp_path / "model", "arch.output=vector")
     write_card(trained, replace(read_card(trained), motion=["dis 1"]))
-    rgb, how = Dataset(data)[0]["rgb"][:], {"scale_mm_per_px": 0.3, "masks": "none"}
+    rgb, how = Dataset(dataset)[0]["rgb"][:], {"scale_mm_per_px": 0.3, "masks": "none"}
     notes = {name: learn.predict(rgb, trained, flow=name, **how)["notes"] for name in ("dis", "tvl1")}
     assert not any("dis 1" in note for note in notes["dis"])
     assert any("dis 1" in note and "tvl1" in note for note in notes["tvl1"])
 
 
-def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(data: Path, vector: Path) -> None:
-    (motion,) = motions(data / "000000.zarr", "ideal")
+def test_the_drawn_map_is_the_inverse_of_the_resampling_to_the_grid(dataset: Path, vector: Path) -> None:
+    (motion,) = motions(dataset / "000000.zarr", "ideal")
     predictor = load_model(vector)
     found = apply(predictor, motion)
     view = GridView(motion.tissue, motion.scale_mm_per_px, predictor.grid)

@@ -74,5 +74,4 @@ def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
     predicted = torch.zeros(1, 3, 1, 2, requires_grad=True)
     true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
     loss(predicted, true, ones, "off-target", 4.0, 1.0).backward()
-    assert predicted.grad is not None
     assert torch.isfinite(predicted.grad).all()

@@ -74,7 +74,6 @@ def cloud(rng: np.random.Generator, sequences: int, frames: int = 10) -> list[Fl
 def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
     rng = np.random.default_rng(0)
     found = fit_distribution(cloud(rng, 1000), cloud(rng, 1000))
-    assert found is not None
     assert found.frame_limit == pytest.approx(np.sqrt(chi2.ppf(0.99, 3)), rel=0.03)
     far = MEAN[None] + 9 * MIX[:, 2]
     assert found.distance(far)[0] == pytest.approx(9.0, rel=0.03)
@@ -84,7 +83,6 @@ def test_distance_is_mahalanobis_and_its_99th_that_of_chi_squared() -> None:
 def test_one_in_twenty_recordings_like_the_calibration_is_out_of_distribution() -> None:
     rng = np.random.default_rng(1)
     found = fit_distribution(cloud(rng, 300), cloud(rng, 300))
-    assert found is not None
     found = found.calibrated(cloud(rng, 400, frames=6))
     flags = [bool(describe_out_of_distribution(found, "abc", one)) for one in cloud(rng, 2000, frames=6)]
     assert np.mean(flags) == pytest.approx(0.05, abs=0.025)
@@ -98,7 +96,6 @@ def test_one_in_twenty_recordings_like_the_calibration_is_out_of_distribution() 
 def test_frames_at_rest_have_no_distance() -> None:
     rng = np.random.default_rng(2)
     found = fit_distribution(cloud(rng, 20), cloud(rng, 20))
-    assert found is not None
     assert found.distance(np.array([[-5.0, 80.0, 80.0]]))[0] == 0
     resting = [np.full((4, 3), -5.0)]
     assert fit_distribution(resting, cloud(rng, 3)) is None

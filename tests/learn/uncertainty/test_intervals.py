@@ -36,12 +36,11 @@ def example(drawn: tuple[Prediction, Floats], unit: int) -> Example:
     return make_example(*drawn, unit, UNIT_MN)
 
 
-def fitted(rng: np.random.Generator, count: int = 19, directed: bool = True) -> Intervals:
+def fitted(rng: np.random.Generator, count: int = 19, directed: bool = True, per_unit: int = 1) -> Intervals:
     """Intervals with factors from `count` sequences; error models and distribution are from others."""
     first = [example(draw(rng, directed), k) for k in range(30)]
-    last = [example(draw(rng, directed), k) for k in range(count)]
+    last = [example(draw(rng, directed), k // per_unit) for k in range(count)]
     distribution = fit_distribution([draw(rng)[0].motion for _ in range(60)], [one.motion for one in first])
-    assert distribution is not None
     return fit(first, last, distribution, MOTION, UNIT_MN, "recovered")
 
 
@@ -89,9 +88,5 @@ def test_sequences_of_one_brain_are_one_unit_and_too_few_are_refused() -> None:
     assert (found.units, found.sequences) == (9, 9)
     with pytest.raises(UserError, match="8"):
         fitted(rng, count=8)
-    first = [example(draw(rng), k) for k in range(5)]
-    last = [example(draw(rng), k // 3) for k in range(24)]
-    distribution = fit_distribution([one.motion for one in first], [one.motion for one in first])
-    assert distribution is not None
     with pytest.raises(UserError, match="8"):
-        fit(first, last, distribution, MOTION, UNIT_MN, "recovered")
+        fitted(rng, count=24, per_unit=3)
