@@ -43,10 +43,10 @@ def deform(
     """Deformation of a brain by the gestures of its instruments.
 
     `gestures`: one per instrument, all at once, none where only the pulse moves the tissue; `surface`: on the
-    volume, faces counter-clockwise from outside; `frames`: T >= 2; `pulse`: no part of the load, the
-    craniotomy of radius `opening_mm` is exposed to it; `motions`: of the gestures over T frames each, their own
-    trajectories if none; `inside`: return the volume too. UserError: the load is past the law's range, or the
-    contact is not on the surface; and as `equilibrium.solve_path`.
+    volume, faces counter-clockwise from outside; `frames`: T >= 2; `pulse`: no part of the load, moves the
+    craniotomy of radius `opening_mm`; `motions`: of the gestures over T frames each, their own trajectories
+    if none; `inside`: return the volume too. UserError: the load is past the law's range, or the contact is
+    not on the surface; and as `equilibrium.solve_path`.
     """
     motions = motions or [tool_gesture.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))
