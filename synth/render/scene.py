@@ -135,8 +135,8 @@ class Renderer:
         """Pixels and ground truth of one frame.
 
         `state`: the scene at the frame's time, for the ground truth; `seed`: of light paths and sensor noise;
-        `shutter`: states while it is open, over which the picture averages, `state` if none; `after`: the next
-        frame's state, for the flow to it.
+        `shutter`: states while it is open, over which the picture averages, `state` if none; `after`: that of
+        the next frame, for the flow to it.
         """
         camera = state.camera or self.camera
         radiance, *others = self._gathered(shutter or (state,), seed)

@@ -19,7 +19,7 @@ from synth.system.config_file import places
 BUDGET = {
     "synth, learn and bench": (36_500, 36_500),
     "evidence": (8_170, 8_500),
-    "tests": (14_480, 14_500),
+    "tests": (14_500, 14_500),
     "job keys": (94, 96),
     "training keys": (23, 24),
     "commands": (26, 26),

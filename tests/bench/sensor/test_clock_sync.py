@@ -15,13 +15,15 @@ def presses(t: np.ndarray, seed: int) -> np.ndarray:
     return out
 
 
-def recording(lag_s: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def recording(
+    lag_s: float, seed: int = 0, noise: float = 0.15, fps: float = 25.0, span_s: float = 8.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Frames, speed, sensor times and force; the sensor's clock is `lag_s` slow."""
     rng = np.random.default_rng([seed, 1])
-    frames = 1 + np.cumsum(rng.uniform(0.8, 1.2, 200) / 25)  # variable frame rate
-    speed = np.abs(np.diff(presses(frames, seed), prepend=0)) / np.diff(frames, prepend=frames[0] - 1 / 25)
+    frames = 1 + np.cumsum(rng.uniform(0.8, 1.2, round(span_s * fps)) / fps)  # variable frame rate
+    speed = np.abs(np.diff(presses(frames, seed), prepend=0)) / np.diff(frames, prepend=frames[0] - 1 / fps)
     speed[0] = 0
-    speed = 0.01 * (speed + 0.15 * speed.max() * np.abs(rng.normal(size=len(speed))))
+    speed = 0.01 * (speed + noise * speed.max() * np.abs(rng.normal(size=len(speed))))
     t = np.arange(0, 12, 0.002)
     force = presses(t, seed) + rng.normal(0, 0.3, len(t))
     return frames, speed, t - lag_s, np.stack([force, 0 * t, 0 * t], axis=1)
@@ -34,6 +36,16 @@ def test_known_lags_within_one_frame(lag_s: float, seed: int) -> None:
     assert found.refused == ""
     assert found.offset_s == pytest.approx(lag_s, abs=1 / 25)
     assert abs(found.offset_s - lag_s) < 5 * max(found.deviation_s, 0.004)
+
+
+def test_periodic_presses_are_ambiguous() -> None:
+    frames = np.arange(0, 8, 0.04)
+    t = np.arange(-1, 9, 0.002)
+    rng = np.random.default_rng(0)
+    force = 100 * np.clip(np.sin(2 * np.pi * 2 * t), 0, None)
+    speed = np.abs(np.gradient(100 * np.clip(np.sin(2 * np.pi * 2 * frames), 0, None), 0.04))
+    speed = speed + rng.normal(0, 40, len(speed))
+    assert clock_sync.find_offset(frames, speed, t, np.stack([force] * 3, 1), 0.6).refused
 
 
 def test_intervals_that_were_not_tracked_are_left_out() -> None:
