@@ -82,6 +82,8 @@ def test_npz_of_the_published_code(root: Path, tmp_path: Path) -> None:
         column, row = first["projected_pixels"][0, 100].astype(int)
         expected = sequence["flow"][2][row, column] * sequence.attrs["scale_mm_per_px"]
         assert first["disp2d"][2, 100] == pytest.approx(expected, rel=1e-5)
+        x, y = first["projected_pixels"][2, 100].round().astype(int)
+        assert first["depth"][2, 100] == sequence["depth"][2][y, x]
 
 
 def test_frames_are_those_of_the_store(root: Path) -> None:

@@ -52,8 +52,7 @@ def test_sequence_is_sealed_verified_and_has_the_engines_force(source: Path, tmp
     assert {one.name: one.count for one in found.checks}["compliance"] == 1
     assert sequence.attrs["mechanics"]["law"] == "external"
     run(app, "export", tmp_path / "a", tmp_path / "vtu", "--to", "vtu")
-    place = "anatomy.craniotomy={point: [0, 0, 0], direction: [0, 0, 1], radius_mm: 10}"
-    again = job_of(tmp_path / "vtu" / "000000.pvd", *FORCE, place, "mechanics.force=nodal:force")
+    again = job_of(tmp_path / "vtu" / "000000.pvd", *FORCE, "mechanics.force=nodal:force")
     second = synth.simulate(again, 0)
     np.testing.assert_allclose(second.force, sequence["force"][:], rtol=1e-3, atol=1e-3)
 
