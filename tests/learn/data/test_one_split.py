@@ -61,7 +61,7 @@ def divided(*datasets: Path) -> tuple[ModelCard, Split]:
 
 def exported(dataset: Path, target: Path) -> dict[str, dict[int, str]]:
     """The side of every sequence by its index, in each export."""
-    formats = sorted(FORMATS.keys() - {"endonerf"})  # phantoms have no camera
+    formats = sorted(FORMATS.keys() - {"endonerf", "vtu"})  # phantoms have no camera, no mechanics
     for to in formats:
         export_dataset(dataset, target / to, to)
     tables = [csv.reader((target / to / "split.csv").read_text().splitlines()[1:]) for to in formats]
