@@ -97,9 +97,12 @@ def new(
 ) -> None:
     """Writes a job file in which every key is explained, or one for another program's simulation."""
     from synth.job import writer
-    from synth.publish import series_job
 
-    text = writer.commented() if series is None else series_job.as_job(series)
+    text = writer.commented()
+    if series is not None:
+        from synth.publish.series_job import as_job  # here, as it imports the finite elements
+
+        text = as_job(series)
     with as_user_error(f"{path}: cannot be written"), path.open("x", encoding="utf-8") as file:
         file.write(text)
     print(f"wrote {path}; render it with: synth render {path} -o out")

@@ -96,10 +96,8 @@ def _sequences(path: Path) -> Iterator[Sequence]:
 
 def _stored(sequence: Sequence, source: str) -> Motion:
     check_readable(sequence, [source])
-    scale, time_s, tissue = (
-        float(sequence.attrs["scale_mm_per_px"]),
-        *map(sequence.read_whole, ("time", "tissue")),
-    )
+    scale = float(sequence.attrs["scale_mm_per_px"])
+    time_s, tissue = map(sequence.read_whole, ("time", "tissue"))
 
     def frames() -> Iterator[FrameMotion]:
         confidences: Iterator[Any] = repeat(np.ones(tissue.shape, np.float32), sequence.frames)

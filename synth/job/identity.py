@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-from synth.errors import UserError
-from synth.job.schema import Job, MechanicsSection
+from synth.errors import UserError, as_user_error
+from synth.job.schema import Job, MechanicsSection, table_of
 from synth.system import camera_file, checked_file
 
 FILES: dict[tuple[str, str], int] = {
@@ -18,9 +18,8 @@ FILES: dict[tuple[str, str], int] = {
     ("render", "calibration"): camera_file.LARGEST_FILE,
 }
 """Keys of a job that are files, as (section, key), and the largest size of such a file in bytes."""
-_LARGEST_STATE, _LARGEST_LIST = 2 << 30, 32 << 20
+LARGEST_STATE, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file of a series, of a collection of them
 COLLECTIONS = (".pvd", ".series")  # suffixes of files that name those of a series
-_NAMED = re.compile(r'(?:\bfile=|"name"\s*:\s*)"([^"]+)"')
 _OF_SERIES = (*COLLECTIONS, ".vtu", ".vtk", ".vtp", ".npz", ".obj")
 
 
@@ -46,7 +45,7 @@ def identify_job(job: Job) -> str:
         described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
     if job.mechanics.source is not None:
         files = list_files(job.mechanics)
-        described["mechanics"]["source"] = [_digest_file(file, _LARGEST_STATE) for file in files]
+        described["mechanics"]["source"] = [_digest_file(file, LARGEST_STATE) for file in files]
     return digest(described)
 
 
@@ -60,25 +59,36 @@ def list_sources(mechanics: MechanicsSection) -> list[Path]:
 
 def list_files(mechanics: MechanicsSection) -> list[Path]:
     """Files that series and tables of all sequences consist of. UserError: there are none."""
-    found = list[Path]()
+    found, tables = list[Path](), (table_of(mechanics.force), mechanics.instruments)
     for source in list_sources(mechanics):
         folder = source if source.is_dir() else source.parent
-        files = (
-            [source]
-            if source.is_file()
-            else folder.iterdir()
-            if source.is_dir()
-            else folder.glob(source.name)
-        )
-        found += [one for one in sorted(files) if one.suffix in _OF_SERIES]
-        for one in [one for one in found if one.suffix in COLLECTIONS]:
-            text = checked_file.read_text(one, _LARGEST_LIST)
-            found += [one.parent / name for name in _NAMED.findall(text)]
-        force = mechanics.force if (mechanics.force or "").lower().endswith(".csv") else None
-        found += [folder / one for one in (force, mechanics.instruments) if one is not None]
-    if not (named := [file for file in dict.fromkeys(found) if file.is_file()]):
+        named = folder.iterdir() if source.is_dir() else folder.glob(source.name)
+        files = [source] if source.is_file() else sorted(one for one in named if one.suffix in _OF_SERIES)
+        lists = [one for one in files if one.suffix in COLLECTIONS]
+        if len(lists) == 1:  # which is then read instead of numbered files
+            files += [file for file, _ in read_collection(lists[0])]
+        found += [*files, *(folder / one for one in tables if one is not None)]
+    if not (found := [file for file in dict.fromkeys(found) if file.is_file()]):
         raise UserError(f"mechanics.source: no file is named by {mechanics.source}")
-    return named
+    return found
+
+
+def read_collection(source: Path) -> list[tuple[Path, float]]:
+    """Files and times of a .pvd or .series file. UserError if it is neither, or lists fewer than two."""
+    text = checked_file.read_text(source, _LARGEST_LIST)
+    with as_user_error(f"{source}: is not a collection of files"):
+        if source.suffix == ".pvd":
+            sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
+            if len({one.get("part", "0") for one in sets}) > 1:
+                raise ValueError("it has several parts at a time; choose one by a pattern")
+            found = [(one["file"], float(one["timestep"])) for one in sets]
+        else:
+            found = [(one["name"], float(one["time"])) for one in json.loads(text)["files"]]
+        if len(found) < 2:
+            raise ValueError("it lists fewer than two files")
+        if outside := [name for name, _ in found if Path(name).is_absolute() or ".." in Path(name).parts]:
+            raise ValueError(f"{outside[0]} is not in its folder")
+        return [(source.parent / name, time) for name, time in found]
 
 
 def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:

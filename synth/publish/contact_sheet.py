@@ -20,7 +20,7 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera.camera import resized
 from synth.render.scene import SceneState
 from synth.sequence import pipeline, scenario
-from synth.sequence.scene import Scene, at_rest
+from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.sequence.simulation import refuse_untouched, simulate
 from synth.system.stopwatch import Stopwatch
 from synth.system.terminal import ProgressCallback
@@ -56,14 +56,15 @@ def draw_sheet(job: Job, count: int, report: ProgressCallback) -> tuple[Rgb, dic
 
 def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     """A scenario's picture, (H, W, 3); for a stereo job those of the left and right camera side by side."""
-    scene = at_rest(job, index)
-    if scene.series is None:
+    scene: RestScene
+    if job.mechanics.source is not None:
+        scene = deformed = simulate(job, index)
+        state = replace(deformed.state(deformed.strongest), camera=None)
+    else:
+        scene = at_rest(job, index)
         ready = [poised(gesture, scene.surface) for gesture in scene.scenario.gestures]
         tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
         state = SceneState(scene.surface.vertices, tips, shafts)
-    else:
-        deformed = simulate(job, index)
-        state = replace(deformed.state(deformed.strongest), camera=None)
     scene = replace(scene, view=resized(scene.view, size))
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])

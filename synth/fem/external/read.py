@@ -10,7 +10,7 @@ from synth.fem.external.recorded import find_run, read_arrays
 from synth.fem.external.series import MeshSeries, Units
 from synth.fem.external.vtk_series import read_files
 from synth.job import identity
-from synth.job.schema import Job, MechanicsSection
+from synth.job.schema import Job, MechanicsSection, table_of
 
 
 def read_job_series(job: Job, index: int) -> MeshSeries:
@@ -43,8 +43,7 @@ def read_series(
     `patch_mm`: radius of the contact that a table's force is spread over. UserError: they can't be used.
     """
     folder = source if source.is_dir() else source.parent
-    run = find_run(source) if source.is_dir() else None
-    table = force if force is not None and force.lower().endswith(".csv") else None
+    run, table = find_run(source) if source.is_dir() else None, table_of(force)
     field = force if table is None else None
     if source.is_dir() and len(alone := list(source.glob("*.npz"))) == 1:
         source = alone[0]

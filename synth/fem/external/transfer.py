@@ -67,9 +67,8 @@ def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
     away, at = cKDTree(vertices).query(points[between], distance_upper_bound=2 * float(np.sqrt(area.max())))
     found = np.isfinite(away)
     rest = sp.csr_array((np.ones(found.sum()), (at[found], between[found])), shape=share.shape)
-    load = sp.csr_array(
-        share.multiply(np.where(whole > 0, 1 / np.where(whole > 0, whole, 1), 0)[None, :]) + rest
-    )
+    scale = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
+    load = sp.csr_array(share.multiply(scale[None, :]) + rest)
     return Transfer(motion, corner, load, points, close, arm)
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -14,10 +12,9 @@ from synth.arrays import Floats
 from synth.errors import UserError, as_user_error, did_you_mean
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.geometry.mesh_file import SUFFIXES, MeshFile, read_mesh
-from synth.job.identity import COLLECTIONS
+from synth.job.identity import COLLECTIONS, LARGEST_STATE, read_collection
 from synth.system import checked_file
 
-_LARGEST, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file, of a collection
 MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {
     ".frd": "ccx2paraview FILE vtu", ".xdmf": "pip install meshio; meshio convert FILE OUT.vtu per step",
@@ -62,7 +59,7 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     if (how := _OTHERS.get(source.suffix.lower())) is not None:
         raise UserError(f"{source}: can't be read; convert it to VTU: {how}")
     if source.suffix in COLLECTIONS:
-        files, times = zip(*_collection(source), strict=True)
+        files, times = zip(*read_collection(source), strict=True)
         return list(files), list(times)
     every = list(source.iterdir() if source.is_dir() else source.parent.glob(source.name))
     lists = [file for file in every if file.suffix in COLLECTIONS]
@@ -83,26 +80,8 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     return [file for _, file in order], None
 
 
-def _collection(source: Path) -> list[tuple[Path, float]]:
-    """Files and times of a .pvd or .series file. UserError if it is neither, or lists fewer than two."""
-    text = checked_file.read_text(source, _LARGEST_LIST)
-    with as_user_error(f"{source}: is not a collection of files"):
-        if source.suffix == ".pvd":
-            sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
-            if len({one.get("part", "0") for one in sets}) > 1:
-                raise ValueError("it has several parts at a time; choose one by a pattern")
-            found = [(one["file"], float(one["timestep"])) for one in sets]
-        else:
-            found = [(one["name"], float(one["time"])) for one in json.loads(text)["files"]]
-        if len(found) < 2:
-            raise ValueError("it lists fewer than two files")
-        if outside := [name for name, _ in found if Path(name).is_absolute() or ".." in Path(name).parts]:
-            raise ValueError(f"{outside[0]} is not in its folder")
-        return [(source.parent / name, time) for name, time in found]
-
-
 def _read(file: Path) -> MeshFile:
-    data = checked_file.read_bytes(file, _LARGEST)
+    data = checked_file.read_bytes(file, LARGEST_STATE)
     with as_user_error(f"{file}: is not a readable mesh"):
         return read_mesh(data)
 
