@@ -7,7 +7,7 @@ import shlex
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
@@ -46,7 +46,6 @@ def score(
     rate: Annotated[float, Option(min=0.0, help="Largest number of frames a second; 0: all.")] = 10.0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from the motion.")] = True,
     title: Annotated[str, Option(help="Heading of the report.")] = "",
-    train: Annotated[Path | None, Option(help="The model's training data, to fit baselines too.")] = None,
     also: Annotated[list[str] | None, Option(help="A further model, as NAME=FOLDER.")] = None,
     phantom: Phantom = False,
     masks: Masks = "auto",
@@ -77,7 +76,6 @@ def score(
         opened,
         model or choose_model(opened.has_stereo),
         methods={name: Model(Path(at)) for name, at in others.items()},
-        train=train,
         settings=scoring.Settings(flow, shrink, rate or None, pulse, kind),
         out=folder,
         title=title,
@@ -114,14 +112,13 @@ def _print_result(result: Result, folder: Path) -> None:
 def pool(
     scores: Annotated[list[Path], Argument(help="Folders that `bench score` wrote, or their score.json.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for the pooled result.")],
-    by: Annotated[str, Option(help="Command shown on the page; default: this one.")] = "",
     json: Json = False,
 ) -> None:
-    """Pools the scores of several recordings: means, intervals over specimens, one table and chart."""
+    """Pools the scores of several recordings: means, intervals over specimens, one table."""
     from bench.scoring import pool as pooling
 
     tree = pooling.pool(pooling.read(scores))
-    pooling.write(tree, out, by or shlex.join(["bench", *sys.argv[1:]]))
+    pooling.write(tree, out, shlex.join(["bench", *sys.argv[1:]]))
     print(json_.dumps(tree) if json else out / "README.md")
 
 
@@ -218,9 +215,7 @@ def import_(
         print(out)
 
 
-@app.command(
-    "from-dataset", epilog="Example: bench from-dataset out --out recordings --sequence 3 --footage mp4"
-)
+@app.command("from-dataset", epilog="Example: bench from-dataset out --out recordings --sequence 3")
 def from_dataset(
     dataset: Annotated[Path, Argument(help="A rendered dataset.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder for one recording per sequence.")],
@@ -228,7 +223,6 @@ def from_dataset(
     unseen_by: Annotated[
         list[Path] | None, Option(help="Only the first sequence a model was not trained on; repeatable.")
     ] = None,
-    footage: Annotated[Literal["png", "mp4"], Option(help="Lossless pictures or H.264.")] = "png",
     instrument: Annotated[int | None, Option(help="Force of this instrument alone, from 1.")] = None,
     json: Json = False,
 ) -> None:
@@ -248,7 +242,7 @@ def from_dataset(
         raise UserError(f"{dataset}: a model was fitted or chosen on each of these sequences")
     for one in chosen:
         force_of(one, instrument)  # refused before anything is written
-    names = [str(export_recording(s, out / f"{s.index:06d}", footage, instrument)) for s in chosen]
+    names = [str(export_recording(s, out / f"{s.index:06d}", instrument)) for s in chosen]
     print(json_.dumps({"recordings": names}) if json else "\n".join(names))
 
 
@@ -273,7 +267,6 @@ def live(
     shrink: Annotated[int, Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
     masks: Masks = "auto",
     every: Annotated[bool, Option("--every", help="Process every frame, however late.")] = False,
-    out: Annotated[Path | None, Option("--out", "-o", help="Folder for live.json, with latencies.")] = None,
     json: Json = False,
 ) -> None:
     """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""
@@ -312,9 +305,6 @@ def live(
         typer.echo(f"{one.severity}: {one.cause}: {one.message}", err=True)
     if scale == "unknown":
         typer.echo(f"note: {UNKNOWN_NOTE}", err=True)
-    if out is not None:
-        how: dict[str, str | int | bool] = {"backend": flow, "shrink": shrink, "masks": masks}
-        live.write_live(out, summary, **how, paced=not every, model=model is not None)
     print(json_.dumps(summary) if json else ", ".join(f"{name} {one:.4g}" for name, one in summary.items()))
 
 

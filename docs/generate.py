@@ -77,7 +77,7 @@ _FIELDS_HEAD = """\
 # What a sequence holds
 
 Written by `make docs`; do not edit. Sizes: a frame of 640 x 480 px; on disk by the ratio measured on rendered
-sequences. `synth schema --fields` prints the same.
+sequences.
 
 `store.flow: float16` halves the flows. A value is then rounded to 11 bits: by 0.004 px at most below 16 px of
 motion, 0.008 px below 32. The largest error of a sequence is measured while it is written: attribute

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json as json_
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -139,12 +138,11 @@ def _note(text: str) -> None:
     _console.print(f"note: {text}", style="yellow", markup=False, highlight=False)
 
 
-@app.command("eval", epilog="Example: learn eval model out --against other-model")
+@app.command("eval", epilog="Example: learn eval model out")
 def eval_command(
     model: Annotated[Path, Argument(help="Model folder.")],
     dataset: Root,
     input: Input = None,
-    against: Annotated[Path | None, Option(help="A second model, for tests on what is new to both.")] = None,
     all: Annotated[bool, Option("--all", help="Print all scores, not just four.")] = False,
     threads: Threads = None,
     cache: Cache = None,
@@ -153,8 +151,8 @@ def eval_command(
     """Score a model on sequences that it was not trained on; forces in mN."""
     from learn.data.clips import scored_source
     from learn.evaluation.coverage import cover
-    from learn.evaluation.evaluate import compare, evaluate
-    from learn.evaluation.tables import coverage_table, paired_table, score_table
+    from learn.evaluation.evaluate import evaluate
+    from learn.evaluation.tables import coverage_table, score_table
     from learn.inference.predict import load_model
     from learn.split import choose_unseen, find_unit
     from learn.training.threads import set_threads
@@ -165,25 +163,16 @@ def eval_command(
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
-    others = [load_model(one) for one in (against,) if one is not None]
-    for other in others:
-        other.readable(source)
-        if other.grid != predictor.grid:
-            raise UserError(f"{against}: differs from {model} in its grid; choose another --against")
-    cards = [one.card for one in (predictor, *others)]
-    chosen = choose_unseen(clips, dataset, cards, _console.print)
-    for note in {note for card in cards for clip in chosen for note in card.doubt(clip.recovered_by)}:
+    chosen = choose_unseen(clips, dataset, [predictor.card], _console.print)
+    for note in {note for clip in chosen for note in predictor.card.doubt(clip.recovered_by)}:
         _note(note)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
-        pairs = [compare(evaluate(other, chosen, source, progress), report) for other in others]
     covered = cover(predictor, chosen, source) if predictor.card.intervals and (all or json) else []
     if json:
         found = {"model": str(model), "input": source, **report.as_dict()}
         if covered:
             found["coverage"] = [one.as_dict() for one in covered]
-        for one in pairs:
-            found["against"] = {"model": str(against), "paired": {k: asdict(v) for k, v in one.items()}}
         print(json_.dumps(found))
         return
     screen = Console(markup=False)  # "[mN]" is a unit
@@ -191,8 +180,6 @@ def eval_command(
     screen.print(score_table(report, title, all))
     if covered and all:
         screen.print(coverage_table(covered))
-    for one in pairs:
-        screen.print(paired_table(one, f"against {against}, paired by sequence", all))
 
 
 @app.command("predict", epilog="Example: learn predict model video.mp4 --scale 0.05 --young 1.5")

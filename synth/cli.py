@@ -109,14 +109,11 @@ def new(
 
 
 @app.command(epilog="Example: synth schema > job.schema.json")
-def schema(
-    fields: Annotated[bool, Option("--fields", help="Print the fields of a sequence instead.")] = False,
-) -> None:
+def schema() -> None:
     """Prints the JSON schema of job files, for editors."""
-    from synth.dataset.size_forecast import describe_fields
     from synth.job import writer
 
-    print("\n".join(describe_fields()) if fields else json_.dumps(writer.schema(), indent=2))
+    print(json_.dumps(writer.schema(), indent=2))
 
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
@@ -128,7 +125,7 @@ def preview(
     radius: Annotated[float, Option(min=3, max=60, help="Radius of a brain's craniotomy [mm].")] = 12.0,
     json: Json = False,
 ) -> None:
-    """Draws a contact sheet of a job's scenarios and prints the time and disk that the whole job needs.
+    """Draws a contact sheet of a job's scenarios and prints the disk that the whole job needs.
 
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
@@ -153,19 +150,17 @@ def preview(
     read = reader.load_job(job, overrides or [])
     if read.mechanics.source is not None and not json:
         print(read_job_series(read, 0).summary)
-    with counting("Compiling the first time, measuring the cost of a sequence, then drawing") as progress:
-        picture, spent_s = contact_sheet.draw_sheet(read, count, progress)
+    with counting("Compiling the first time, then drawing") as progress:
+        picture = contact_sheet.draw_sheet(read, count, progress)
     write_picture(out, picture)
-    cpu_s, disk_bytes = sum(spent_s.values()), estimate(read) * read.sequences
+    disk_bytes = estimate(read) * read.sequences
     if json:
-        about = {"cpu_s": cpu_s, "stages_cpu_s": spent_s, "disk_bytes": disk_bytes}
-        print(json_.dumps({"sheet": str(out), "render_cpu_s": spent_s["render"], **about}))
+        print(json_.dumps({"sheet": str(out), "disk_bytes": disk_bytes}))
         return
-    stages = ", ".join(f"{name} {seconds / 60:.1f}" for name, seconds in spent_s.items())
     print(
         f"wrote {out}, each view at most {contact_sheet.TILE_PX} px wide\n"
-        f"the whole job: {read.sequences} sequences of {read.frames} frames, about "
-        f"{cpu_s / 60:.1f} CPU-minutes ({stages}), {amount(disk_bytes)} of disk"
+        f"the whole job: {read.sequences} sequences of {read.frames} frames, {amount(disk_bytes)} of disk; "
+        "`synth status` gives its time once a sequence is done"
     )
 
 
@@ -228,7 +223,7 @@ def status(out: Out, json: Json = False) -> None:
 @app.command("split", epilog="Example: synth split out --by anatomy --hold-out calf")
 def split_command(
     out: Out,
-    by: Annotated[str, Option(help="anatomy, opening, family, gesture, stiffness or sequence.")] = "anatomy",
+    by: Annotated[str, Option(help="anatomy, opening or sequence.")] = "anatomy",
     shares: Annotated[str, Option(help="Of train, validation and test.")] = "0.7,0.15,0.15",
     hold_out: Annotated[list[str] | None, Option(help="An appearance family for testing only.")] = None,
     share_anatomy: Annotated[bool, Option("--share-anatomy", help="Allow one brain on all sides.")] = False,
@@ -237,41 +232,32 @@ def split_command(
     """Replaces the split of a dataset. No anatomy is on two sides, no held-out family in training."""
     from synth.dataset import index, split
     from synth.dataset.folder import Folder
-    from synth.publish.card import write_card, write_page
-    from synth.publish.croissant import write_croissant
+    from synth.publish.card import write_card
 
     folder = Folder(out)
     radius_mm = folder.job().anatomy.craniotomy.radius_mm
     chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening"))
     rows = index.write_index(folder, chosen)
     write_card(folder)
-    write_croissant(folder)
-    if (page := out / "report.html").exists():
-        write_page(out, page)
     counts = split.count(rows)
     if chosen.share_anatomy:
         print("warning: sides may share a brain: test scores don't hold for other brains", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
 
 
-@app.command(epilog="Example: synth report out --to report.html")
-def report(
-    out: Out, to: Annotated[Path | None, Option("--to", help="The page; default: report.html in OUT.")] = None
-) -> None:
-    """Writes the description of a dataset again: report.html, its card README.md, and croissant.json."""
+@app.command(epilog="Example: synth report out")
+def report(out: Out) -> None:
+    """Writes a dataset's description, README.md, again; new sequences get a side of the split."""
     from synth.dataset.folder import Folder
     from synth.dataset.index import write_index
-    from synth.publish.card import write_card, write_page
-    from synth.publish.croissant import write_croissant
+    from synth.publish.card import write_card
 
     folder = Folder(out)
     stated = folder.job().card
     write_index(folder)
     print(write_card(folder))
-    print(write_croissant(folder))
     if missing := ", ".join(name for name in ("authors", "licence") if not getattr(stated, name)):
         print(f"not in the job's card, so not in the description: {missing}", file=sys.stderr)
-    print(write_page(out, to or out / "report.html"))
 
 
 @app.command(epilog="Example: synth export out out-hf --to hf")
@@ -329,33 +315,29 @@ def verify(
 def view(
     out: Out,
     sequence: Index = 0,
-    save: Annotated[Path | None, Option(help="Write an .rrd, or a picture (.png, .jpg), instead.")] = None,
+    save: Annotated[Path, Option(help="A picture (.png, .jpg), or an .rrd.")] = Path("view.png"),
     frame: Annotated[
         list[int] | None,
         Option("--frame", "-f", help="Of a picture; repeatable; default: the largest force."),
     ] = None,
-    web: Annotated[bool, Option("--web", help="In a browser, where there is no window system.")] = False,
 ) -> None:
-    """Opens a sequence in the viewer rerun: frames, depth, flow, traction and force over time.
+    """Draws frames of a sequence with their flow and force map side by side, as in the README.
 
-    A picture shows frames with their flow and force map side by side, as in the README.
+    Or writes all of it for the viewer rerun: frames, depth, flow, traction and force over time.
     """
     from synth.dataset import location
     from synth.dataset.store import open_sequence
     from synth.publish.picture import draw_sequence, strongest
-    from synth.publish.rerun_view import save_recording, show_sequence
+    from synth.publish.rerun_view import save_recording
     from synth.system.checked_file import write_picture
 
-    if save is not None and save.suffix.lower() not in (".rrd", ".png", ".jpg", ".jpeg"):
+    if save.suffix.lower() not in (".rrd", ".png", ".jpg", ".jpeg"):
         raise UserError(f"{save}: its name must end with .rrd for a recording, .png or .jpg for a picture")
-    pictured = save is not None and save.suffix.lower() != ".rrd"
+    pictured = save.suffix.lower() != ".rrd"
     if frame and not pictured:
         raise UserError("--frame needs --save with a name that ends with .png or .jpg")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it as Ctrl-C does
     chosen = open_sequence(location.store(out, sequence))
-    if save is None:
-        show_sequence(chosen, web=web)
-    elif pictured:
+    if pictured:
         rows = draw_sequence(chosen, frame or [strongest(chosen)])
         save.parent.mkdir(parents=True, exist_ok=True)
         write_picture(save, rows)
@@ -363,6 +345,9 @@ def view(
     else:
         save_recording(chosen, save)
         print(f"wrote {save}; open it with: rerun {save}")
+        print(
+            "rerun sends anonymous usage data to its makers until `rerun analytics disable`", file=sys.stderr
+        )
 
 
 @app.command(epilog="Example: synth doctor .")

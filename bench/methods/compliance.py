@@ -6,6 +6,7 @@ the camera's pose nor the brain's shape; for each `TissueKind` once, in a cache 
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import Delaunay
 
-from bench.methods.matrix_cache import cached_matrix
 from synth.arrays import Floats, Map
 from synth.dataset import provenance
 from synth.fem import surface_embedding
@@ -24,6 +24,7 @@ from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
 from synth.job import schema
+from synth.system import cache
 
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
@@ -111,7 +112,17 @@ def _stored(tissue: TissueKind) -> Map:
     """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
     code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
     key = code + f"{tissue}".encode()
-    return cached_matrix("compliance", key, lambda: _solved(tissue).astype(np.float32), _STORED)
+    faults = ValueError, EOFError  # of files that were cut off by a full disk: they are computed again
+    return cache.cached("compliance/npy", key, lambda: _solved(tissue), _dump, _load, faults, _STORED)
+
+
+def _dump(matrix: Map) -> bytes:
+    np.save(held := io.BytesIO(), matrix)
+    return held.getvalue()
+
+
+def _load(data: bytes) -> Map:
+    return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
 
 
 def _lattices() -> tuple[Floats, Floats]:
@@ -119,11 +130,11 @@ def _lattices() -> tuple[Floats, Floats]:
     return _disc(_POINT_MM, OPENING_MM), _disc(_NODE_MM, OPENING_MM - _NODE_MM)
 
 
-def _solved(tissue: TissueKind) -> Floats:
+def _solved(tissue: TissueKind) -> Map:
     """The matrix: one linear problem per node and axis, with one factorisation."""
     block, (points, nodes) = ElasticBlock.build(_TETS, tissue), _lattices()
     observed, loaded = block.embed(points), block.embed(nodes)
-    columns = np.empty((len(nodes), 3, 3, len(points)))
+    columns = np.empty((len(nodes), 3, 3, len(points)), np.float32)
     for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
         for axis in range(3):
             unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])

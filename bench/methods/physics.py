@@ -15,17 +15,18 @@ from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
 from bench.methods import posterior
-from bench.methods.baselines import GRID
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from learn.data.clips import assumed_young
-from learn.data.grid import GridView, to_image
+from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
 from synth.job.types import MembraneState
 from synth.recording_flow.find_tissue import touches_border
+
+GRID = Grid(48)
 
 
 @dataclass(frozen=True)

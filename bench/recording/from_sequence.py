@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -22,22 +21,18 @@ _PAIR = "stereo.yaml"
 def export_recording(
     sequence: Sequence,
     folder: str | Path,
-    frames: Literal["png", "mp4"] = "png",
     instrument: int | None = None,
 ) -> Path:
-    """Writes one recording: frames or video, times, force in camera axes, tool masks, tissue, meta.yaml.
+    """Writes one recording: frames, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     A stereo sequence adds the right camera and the calibration. Ground truth that a real recording lacks is
     not written: no true flow, no traction, no glare mask.
 
-    `frames`: `png` is lossless, `mp4` is H.264; `instrument`: number, from 1, of the one that the sensor is
-    on; None: all. Raises UserError if the folder exists, or there is no such instrument.
+    `instrument`: number, from 1, of the one that the sensor is on; None: all. Raises UserError if the folder
+    exists, or there is no such instrument.
     """
     force = force_of(sequence, instrument)
     time = np.asarray(sequence["time"][:], np.float64)
-    even = (slice(None), slice(None))
-    if frames == "mp4":  # the codec requires even sizes; masks must have the video's size
-        even = tuple(slice(0, side // 2 * 2) for side in sequence.size)  # type: ignore[assignment]
     about: dict[str, object] = {
         "scale_mm_per_px": float(sequence.attrs["scale_mm_per_px"]),
         "scale_uncertainty": 0.0,
@@ -49,17 +44,17 @@ def export_recording(
     }
     with checked_file.folder_of(Path(folder)) as part:
         (part / "masks").mkdir()
-        _write_pictures(sequence, "rgb", part, "video", frames)
+        _write_pictures(sequence, "rgb", part / "frames")
         for t in range(sequence.frames):
-            tool = np.asarray(sequence["tool"][t], bool)[even]
+            tool = np.asarray(sequence["tool"][t], bool)
             if tool.any():
                 checked_file.write_picture(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
-        tissue = np.asarray(sequence["tissue"][:], bool)[even]
+        tissue = np.asarray(sequence["tissue"][:], bool)
         checked_file.write_picture(part / "tissue.png", tissue.astype(np.uint8) * 255)
         writer.write_force(part, time, force / 1000)
         writer.write_frames(part, time)
         if "rgb_right" in sequence:
-            _write_pictures(sequence, "rgb_right", part, "right", frames)
+            _write_pictures(sequence, "rgb_right", part / "right")
             writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
             about["stereo"] = {"calibration": _PAIR}
         writer.write_meta(part, about)
@@ -77,15 +72,8 @@ def force_of(sequence: Sequence, instrument: int | None) -> Floats:
     return np.asarray(each[instrument - 1]["force_mn"], np.float64)
 
 
-def _write_pictures(
-    sequence: Sequence, field: str, part: Path, name: str, kind: Literal["png", "mp4"]
-) -> None:
-    """Writes a camera's pictures as NAME.mp4 or into a folder."""
-    pictures = (np.asarray(sequence[field][t], np.uint8) for t in range(sequence.frames))
-    if kind == "mp4":
-        writer.write_video(part / f"{name}.mp4", pictures, np.asarray(sequence["time"][:], np.float64))
-        return
-    folder = part / {"video": "frames"}.get(name, name)
+def _write_pictures(sequence: Sequence, field: str, folder: Path) -> None:
+    """Writes a camera's pictures into a new folder."""
     folder.mkdir()
-    for t, rgb in enumerate(pictures):
-        checked_file.write_picture(folder / f"{t:06d}.png", rgb)
+    for t in range(sequence.frames):
+        checked_file.write_picture(folder / f"{t:06d}.png", np.asarray(sequence[field][t], np.uint8))

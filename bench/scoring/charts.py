@@ -11,7 +11,6 @@ import numpy as np
 from bench.methods.comparison import FUSION, PHYSICS
 from bench.scoring import metrics
 from bench.scoring.result import Result
-from bench.sensor.clock_sync import Offset
 from synth.arrays import Floats
 from synth.publish.svg import svg
 
@@ -96,30 +95,6 @@ def draw_components(result: Result) -> str:
 
     unit = "force [mN]" if result.absolute else "force [mN a kPa]"
     return _chart((_WIDE, _HIGH), draw, "time [s]", unit, columns=6)
-
-
-def draw_correlogram(found: Offset) -> str:
-    """Correlation of force and motion at every offset that was tried, and the best offset."""
-    offsets, r = np.array(found.correlogram).T
-
-    def draw(axes: Axes) -> None:
-        axes.plot(offsets, r, color=_MAIN)
-        axes.plot([found.offset_s], [found.r], "o", color=_RED, label="best")
-
-    return _chart((_WIDE, _HIGH), draw, "offset added to the sensor's times [s]", "correlation")
-
-
-def draw_scatter(result: Result) -> str:
-    """Predicted against measured force, with the line of agreement."""
-    x, y = _scored_pairs(result)
-    top = 1.05 * max(_largest(x), _largest(y))
-
-    def draw(axes: Axes) -> None:
-        axes.plot([0, top], [0, top], ":", color=_SENSOR, label="equal")
-        _dots(axes, x, y)
-        axes.set(xlim=(-0.02 * top, top), ylim=(-0.02 * top, top))
-
-    return _chart((_HALF, _HIGH), draw, "sensor [mN]", "predicted [mN]")
 
 
 def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:

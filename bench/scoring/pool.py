@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +17,8 @@ from learn.evaluation.statistics import LEAST_GROUPS, as_plain, over_groups
 from synth.arrays import Floats
 from synth.errors import UserError
 from synth.formats import SCORE, check_format
-from synth.publish.svg import svg
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _SHOWN = (
     "mae_mn", "mae_of_peak", "r", "shape_error", "ccc", "r2", "contact_f1", "false_positive_rate", "peak_mae",
@@ -143,12 +139,11 @@ def _mean(values: Floats, specimens: Sequence[str]) -> dict[str, float | None]:
 
 
 def write(tree: dict[str, Any], out: Path, command: str) -> None:
-    """Writes pool.json, README.md and chart.svg into the folder `out`."""
+    """Writes pool.json and README.md into the folder `out`."""
     tree = tree | {"command": command}
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "pool.json", json.dumps(tree, indent=1, allow_nan=False) + "\n", durable=False)
     write_whole(out / "README.md", page(tree), durable=False)
-    write_whole(out / "chart.svg", chart(tree), durable=False)
 
 
 def page(tree: Mapping[str, Any]) -> str:
@@ -172,7 +167,6 @@ def page(tree: Mapping[str, Any]) -> str:
         else f"Means over recordings, without intervals: those need at least {LEAST_GROUPS} specimens.",
         *(f"{name} is left out: not all recordings were scored with it." for name in tree["of_some"]),
         *(f"Recording {lost} is left out: {why}." for lost, why in tree["left_out"].items()),
-        f"![{count}](chart.svg)",
         _table(rows),
         f"## By recording, {tree['main']}",
         _table([_row(one) for one in tree["each"]]),
@@ -205,23 +199,3 @@ def _text(value: Mapping[str, float | None], digits: int) -> str:
         "–" if value[key] is None else f"{value[key]:.{digits}f}" for key in ("mean", "low", "high")
     )
     return mean if value["low"] is None else f"{mean} [{low}, {high}]"
-
-
-def chart(tree: Mapping[str, Any]) -> str:
-    """The SVG chart of every method's mean error and its interval."""
-    errors = {name: found["scores"]["mae_of_peak"] for name, found in tree["methods"].items()}
-    at = np.arange(len(errors))
-    colours = ["#1f6feb" if name == tree["main"] else "#c2352b" for name in errors]
-    mean, low, high = np.array([[e[key] for e in errors.values()] for key in ("mean", "low", "high")], float)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.hlines(at, low, high, color=colours, linewidth=2)
-        axes.scatter(mean, at, 26, colours)
-        title = f"{len(tree['recordings'])} recordings"
-        axes.set(title=title, xlabel="mean error as a share of the event peak")
-        axes.set_yticks(at, list(errors))
-        axes.set_ylim(len(errors) - 0.4, -0.6)
-        axes.set_xlim(left=0)
-
-    return svg(960, 70 + 19 * len(errors), draw)

@@ -44,10 +44,7 @@ def render_report(result: Result, title: str = "") -> str:
     if np.isfinite(main.force_mn).any(axis=0).all():
         figures["components"] = charts.draw_components(result)
     if math.isfinite(main.scores.get("mae_mn", math.nan)):
-        figures["scatter"] = charts.draw_scatter(result)
         figures["bland"] = charts.draw_bland_altman(result, limits_of_agreement(result))
-    if result.sync is not None and result.sync.correlogram:
-        figures["correlogram"] = charts.draw_correlogram(result.sync)
     panels, flow_px, force_kpa = pictures(result)
     columns, mae = _columns(result), main.scores.get("mae_mn", math.nan)
     lower = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
@@ -60,7 +57,6 @@ def render_report(result: Result, title: str = "") -> str:
         first={key: metric for key, metric in columns.items() if key in _NARROW},
         more={key: metric for key, metric in columns.items() if key not in _NARROW},
         headline=headline(result),
-        best=_best(result, columns),
         better=better,
         in_hindsight=in_hindsight,
         origin=result.settings.get("networks", {}).get(result.main, {}).get("origin", ""),
@@ -201,17 +197,6 @@ def _caption(result: Result, snap: Snapshot) -> str:
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
         caption += f", sensor {shown(result.sensor_mn[k])} mN"
     return caption
-
-
-def _best(result: Result, columns: dict[str, Metric]) -> dict[str, float]:
-    """The best value of each column, for bold type."""
-    best = {}
-    for key, metric in columns.items():
-        found = [method.scores.get(key, math.nan) for method in result.methods.values()]
-        values = {value for value in found if math.isfinite(value)}
-        if len(values) > 1 and metric.ideal is not None:
-            best[key] = min((abs(value - metric.ideal), value) for value in values)[1]
-    return best
 
 
 def _cost(result: Result) -> list[tuple[str, str, str]]:

@@ -43,7 +43,6 @@ def score(
     *,
     methods: Mapping[str, Method] | None = None,
     baselines: bool = True,
-    train: str | Path | None = None,
     settings: Settings | None = None,
     out: str | Path | None = None,
     title: str = "",
@@ -57,8 +56,7 @@ def score(
         model: from `learn.load_model`, its folder, mono or stereo; its name in the tables is D2FNet. Without
             model and methods, the pretrained model for the recording's cameras.
         methods: further methods by name; without a model the result is about the first.
-        baselines: whether physics and the baselines are scored too.
-        train: the dataset the model was trained on, to fit baselines on the same sequences.
+        baselines: whether physics and the plug-ins' methods are scored too.
         settings: flow back end, rate, masks; None: the command's defaults.
         out: folder for score.json and report.html, which are written together.
         title: heading of the report.
@@ -74,7 +72,7 @@ def score(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(Path(recording))
-    model = _choose_model(model, methods or {}, train, recording.has_stereo)
+    model = _choose_model(model, methods or {}, recording.has_stereo)
     frames = len(recording.numbers()) or None
     bar: AbstractContextManager[Progress]
     bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
@@ -84,10 +82,9 @@ def score(
         flow, used = None, settings or Settings()
         # Another process is given an estimator by its name.
         if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
-            # The process takes seconds to start, during which the baselines are fitted.
             flow = stack.enter_context(open_flow_process(set_threads))
         network = None if model is None else Model(model, name_motion(used.backend))
-        chosen = _choose_methods(network, model, methods or {}, recording.has_stereo, baselines, train)
+        chosen = _choose_methods(network, model, methods or {}, baselines)
         scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
         about = _describe(chosen)
         with bar as done:
@@ -98,11 +95,9 @@ def score(
 
 
 def _choose_model(
-    model: str | Path | Predictor | None, own: Mapping[str, Method], train: str | Path | None, stereo: bool
+    model: str | Path | Predictor | None, own: Mapping[str, Method], stereo: bool
 ) -> Path | Predictor | None:
     """The model to score, None: only own methods. UserError if the arguments don't fit each other."""
-    if train is not None and (isinstance(model, Predictor) or (model is None and own)):
-        raise UserError("score: train needs the model's folder, whose card names the sequences to fit on")
     if taken := {FUSION, *([MAIN] if model is not None or not own else [])} & set(own):
         raise UserError(f"methods: the name {min(taken)} is reserved; choose another")
     if model is None and not own:
@@ -114,17 +109,14 @@ def _choose_methods(
     network: Model | None,
     model: Path | Predictor | None,
     own: Mapping[str, Method],
-    stereo: bool,
     baselines: bool,
-    train: str | Path | None,
 ) -> dict[str, Method]:
     """All methods by name, in the table's order; the result is about the first."""
     chosen: dict[str, Method] = {} if network is None else {MAIN: network}
     for name, one in own.items():
         chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
     if baselines:
-        folder = model if isinstance(model, Path) else None
-        simple = comparison.simpler_methods(Path(train) if train else None, folder, stereo)
+        simple = comparison.simpler_methods()
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
     if model is not None and isinstance(chosen.get(PHYSICS), Physics):
         chosen = {FUSION: Fusion(MAIN, PHYSICS), **chosen}

@@ -30,7 +30,6 @@ class Offset:
     r_at_zero: float = np.nan  # correlation without an offset
     deviation_s: float = np.nan  # standard deviation over all bootstrap resamples, including other peaks [s]
     refused: str = ""  # why the offset must not be used; empty if it may be
-    correlogram: tuple[tuple[float, float], ...] = ()  # offset [s] and correlation of every candidate
 
 
 def find_offset(
@@ -78,9 +77,8 @@ def find_offset(
         refused = f"the correlation of force and motion is only {r[best]:.2f}"
     elif there.mean() < _SAME_PEAK:
         refused = f"ambiguous: the peak is elsewhere in {100 * (1 - there.mean()):.0f}% of resamples"
-    tried = tuple(zip(offsets.tolist(), r.tolist(), strict=True))
     at_zero, deviation_s = float(r[len(offsets) // 2]), float(again.std())
-    return Offset(_refined(offsets, r, best), float(r[best]), at_zero, deviation_s, refused, tried)
+    return Offset(_refined(offsets, r, best), float(r[best]), at_zero, deviation_s, refused)
 
 
 def _change(frame_s: Floats, sensor_s: Floats, force_mn: Floats) -> Floats:

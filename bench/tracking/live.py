@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -16,8 +14,6 @@ from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, problems
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.passes import VideoPass
-from synth.system.checked_file import write_whole
-from synth.system.packages import machine
 from synth.video.pixel_scale import StatedScale, pixel_mm
 
 
@@ -128,10 +124,3 @@ class _VideoClock:
 
     def spare_s(self, time_s: float) -> float:
         return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter()) if self.paced else 0.0
-
-
-def write_live(out: Path, summary: dict[str, float | int], **how: str | int | bool) -> None:
-    """Writes `live.json`: the summary, the options of the stream, and the machine."""
-    out.mkdir(parents=True, exist_ok=True)
-    record = {"command": "bench live", **how, "machine": machine(), **summary}
-    write_whole(out / "live.json", json.dumps(record, indent=1) + "\n", durable=False)

@@ -6,14 +6,17 @@ which the network draws at random.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.linear_model import RidgeCV
+from sklearn.model_selection import PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods import baselines, physics, posterior
+from bench.methods import physics, posterior
 from bench.methods.compliance import TissueKind
 from bench.methods.protocol import Field
 from learn.data.clips import Clip
@@ -59,8 +62,11 @@ def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
     # Every sequence has the same weight, as in the score; a linear relation may be scaled.
     size = np.array([np.sqrt(np.square(force[group == k]).sum(axis=1).mean()) for k in np.unique(group)])
     x, force = x / size[group, None], force / size[group, None]
-    # The force along the line of sight is far less visible in flow than that across it.
-    return baselines.ridge(x, force, group % _FOLDS, _STRENGTHS, (slice(0, 2), slice(2, 3)))
+    # Across the line of sight force is far more visible in flow than along it. No motion is no force.
+    how: dict[str, Any] = {"fit_intercept": False, "scoring": "neg_mean_squared_error"}
+    how |= {"alphas": _STRENGTHS * np.square(x).sum() / x.shape[1], "cv": PredefinedSplit(group % _FOLDS)}
+    across, along = (RidgeCV(**how).fit(x, force[:, part]) for part in (slice(0, 2), 2))
+    return SimpleNamespace(predict=lambda rows: np.column_stack([across.predict(rows), along.predict(rows)]))
 
 
 def turned(clip: Clip) -> list[Clip]:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from bench.methods.baselines import GRID
+from bench.methods.physics import GRID
 from evidence import cache, datasets, report
 from evidence.end_to_end import models
 from evidence.intervals import difference, mean_of

@@ -11,7 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from bench.methods.baselines import GRID
+from bench.methods.physics import GRID
 from evidence import datasets, report
 from evidence.datasets import coarser
 from evidence.end_to_end import models

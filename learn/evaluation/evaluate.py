@@ -1,4 +1,4 @@
-"""Scores of a model by sequence, in mN, for E known, wrong by a factor of two, and unknown."""
+"""Scores of a model by sequence, in mN, for tissue of known E, to which forces are proportional."""
 
 from __future__ import annotations
 
@@ -9,25 +9,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from learn.checkpoint import ModelCard
 from learn.data.clips import Clip, amount, target
-from learn.data.grid import Grid
 from learn.evaluation.metrics import agreement, contact_mm, false_positive_share, line, moments
-from learn.evaluation.statistics import Interval, Paired, as_plain, interval, paired, pooled_r2
+from learn.evaluation.statistics import Interval, as_plain, interval, pooled_r2
 from learn.inference.predict import Predictor, force_size, length, total_force
-from synth.arrays import Floats, Map, Mask
+from synth.arrays import Floats, Map
 from synth.system.terminal import ProgressCallback
 
-PATCH_MM2 = math.pi * 4.0**2  # area of a contact of the jobs' mean radius, 4 mm
-FALSE_POSITIVE_MN = 5.0  # a contact-free patch that carries more is a false positive
-RIM_MM = 2.0  # width of the rim around a contact that `false_positive_far` leaves out
 # Shares of the training data's 99.9th percentile: cells are contact-free under the first, frames of low force
 # under the second, and relative false positives above it.
 FREE, LOW = 0.01, 0.05
-YOUNG = ("known", "half", "double", "unknown")
-"""Columns: the true E, half and twice of it, and the training data's typical E."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +64,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
         others["vector_error_mn"] = float(np.linalg.norm(total - clip.force, axis=1).mean())
     others |= {
         "peak_error_share": abs(float(predicted_mn.max()) - peak) / peak if peak > 0 else math.nan,
-        "false_positive": false_positive_share(size * PATCH_MM2, free, FALSE_POSITIVE_MN),
         "false_positive_relative": false_positive_share(size, free, LOW * unit),
-        "false_positive_far": false_positive_share(size, inside & _off_contact(contact, grid), LOW * unit),
         "off_target_mn": float((size * free).sum((1, 2)).mean() * pitch**2),
         "localisation_mm": float(np.median(off)) if off else math.nan,
         "low_over_mn": float(np.maximum(predicted_mn - true_mn, 0)[low].mean()) if low.any() else math.nan,
@@ -82,33 +73,19 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     return ClipScore(clip.name, young, agreed, true_mn, predicted_mn, others)
 
 
-def _off_contact(contact: Mask, grid: Grid) -> Mask:
-    """(T, N, N) cells further than `RIM_MM` from any contact in the same frame."""
-    out = np.ones_like(contact)
-    for t in np.flatnonzero(contact.any((1, 2))):
-        out[t] = ndimage.distance_transform_edt(~contact[t]) * grid.pitch_mm > RIM_MM
-    return out
-
-
 @dataclass(frozen=True)
 class EvaluationReport:
-    """A model's scores by sequence, in the columns of `YOUNG`."""
+    """A model's scores by sequence."""
 
-    columns: dict[str, list[ClipScore]]
-    card: ModelCard
+    clips: list[ClipScore]
 
-    @property
-    def clips(self) -> list[ClipScore]:
-        """With E known."""
-        return self.columns["known"]
+    def per_clip(self) -> list[dict[str, float]]:
+        """Scores of each sequence."""
+        return [c.as_row() for c in self.clips]
 
-    def per_clip(self, young: str = "known") -> list[dict[str, float]]:
-        """Scores of each sequence in one E column."""
-        return [c.as_row() for c in self.columns[young]]
-
-    def summary(self, young: str = "known") -> dict[str, float]:
-        """Means over sequences of every score, and pooled R² (`*_pooled`), in one E column."""
-        rows, clips = self.per_clip(young), self.columns[young]
+    def summary(self) -> dict[str, float]:
+        """Means over sequences of every score, and pooled R² (`*_pooled`)."""
+        rows, clips = self.per_clip(), self.clips
         out = {k: _mean([r[k] for r in rows]) for k in rows[0]}
         out["map_r2_pooled"] = agreement(np.sum([c.map for c in clips], axis=0))["r2"]
         true = np.concatenate([c.true_mn for c in clips])
@@ -130,7 +107,7 @@ class EvaluationReport:
         """JSON-ready; NaN as null."""
         found = {
             "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
-            "columns": {young: self.summary(young) for young in self.columns},
+            "summary": self.summary(),
             "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
         }
         return dict(as_plain(found))
@@ -145,26 +122,11 @@ def evaluate(
     predictor: Predictor, clips: Sequence[Clip], source: str, report: ProgressCallback = lambda done, of: None
 ) -> EvaluationReport:
     """Scores a model on clips, with displacement from `source`, as in `learn.data.clips.FIELDS`."""
-    columns: dict[str, list[ClipScore]] = {}
+    scores = []
     for i, clip in enumerate(clips):
         report(i, len(clips))
-        known, typical = clip.young_kpa, predictor.card.typical_young_kpa
-        young = dict(zip(YOUNG, (known, known * 0.5, known * 2.0, typical), strict=True))
-        # The prediction is proportional to E: one pass serves all columns.
         shift = np.asarray(clip.displacement[source])
-        per_kpa = predictor.density(shift, clip.mask, 1.0, clip.confidence_of(source))
-        for name, assumed in young.items():
-            columns.setdefault(name, []).append(score(clip, per_kpa * np.float32(assumed), predictor.card))
+        density = predictor.density(shift, clip.mask, clip.young_kpa, clip.confidence_of(source))
+        scores.append(score(clip, density, predictor.card))
     report(len(clips), len(clips))
-    return EvaluationReport(columns, predictor.card)
-
-
-def compare(a: EvaluationReport, b: EvaluationReport) -> dict[str, Paired]:
-    """Paired tests of B against A on the same sequences, for every score that both have."""
-    rows, rng = (a.per_clip(), b.per_clip()), np.random.default_rng(0)
-    out = {}
-    for key in rows[0][0]:
-        one, two = (np.array([row.get(key, math.nan) for row in side]) for side in rows)
-        if np.isfinite(two - one).any():
-            out[key] = paired(one, two, rng)
-    return out
+    return EvaluationReport(scores)

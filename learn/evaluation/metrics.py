@@ -17,7 +17,6 @@ class Metric:
     name: str
     unit: str = ""  # as displayed: ms and % are converted from s and shares; empty if dimensionless
     about: str = ""
-    ideal: float | None = None  # 0 or 1; None if there is none
     digits: int = 3  # significant digits displayed
     relative: bool = False  # whether a constant factor on the prediction doesn't change it
     column: str = ""  # heading in a narrow table; empty: not listed there
@@ -49,15 +48,9 @@ METRICS = {
     "map_rmse": Metric("force map: RMSE", "mN/mm²", column="map RMSE [mN/mm²]"),
     "map_r": Metric("force map: correlation"),  # over tissue cells
     "vector_r2": Metric("force map: R² of components"),  # x, y and z together
-    # Where a contact-sized patch would carry more.
-    "false_positive": Metric("false positives: contact-free area above 5 mN"),
     # The scale is the training data's 99.9th percentile.
     "false_positive_relative": Metric(
         "false positives: contact-free area above 5% of scale", column="false-positive area"
-    ),
-    # Without the rim, where a contact that is estimated one cell off counts too.
-    "false_positive_far": Metric(
-        "false positives: the same beyond 2 mm of a contact", column="false-positive area beyond 2 mm"
     ),
     "off_target_mn": Metric("off-target force: on contact-free area", "mN", column="off-target force [mN]"),
     "low_over_mn": Metric(

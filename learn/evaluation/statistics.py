@@ -1,4 +1,4 @@
-"""Intervals of means over sequences, whose frames are not independent, and paired tests of models."""
+"""Intervals of means over sequences, whose frames are not independent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from synth.arrays import Array, Floats
 
 LEAST_GROUPS = 5  # of fewer specimens a 95% interval would hardly exceed the range of their means
 _DRAWS = 4000
-_SIGNS = 10_000
 
 
 def as_plain(value: Any, digits: int | None = None) -> Any:
@@ -98,25 +97,3 @@ def _bootstrap(
             ).confidence_interval
         low, high = float(found.low), float(found.high)
     return Interval(value, low, high, n)
-
-
-@dataclass(frozen=True)
-class Paired:
-    """Model B against model A on the same sequences."""
-
-    difference: Interval  # B − A, mean over sequences
-    p: float  # two-sided, sign-flip permutation test of the mean difference
-    wins: float  # share of sequences on which B's value is the larger; ties count half
-
-
-def paired(a: Floats, b: Floats, rng: np.random.Generator) -> Paired:
-    """Compares two models, (n,) each, on the sequences that have both values, at least one; by an exact test
-    up to 13 sequences, by random sign patterns above."""
-    d = np.asarray(b, np.float64) - np.asarray(a, np.float64)
-    d = d[np.isfinite(d)]
-    p = 1.0  # of a single sequence: both sign patterns are equally extreme
-    if d.size > 1:
-        p = stats.permutation_test(
-            (d,), np.mean, permutation_type="samples", vectorized=True, n_resamples=_SIGNS, rng=rng
-        ).pvalue
-    return Paired(interval(d, rng), float(p), float((d > 0).mean() + 0.5 * (d == 0).mean()))

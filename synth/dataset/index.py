@@ -26,14 +26,14 @@ NAME = "index.parquet"
 
 
 class IndexColumn(NamedTuple):
-    """One fact about a sequence and its column: index, card, Croissant and exports follow from it."""
+    """One fact about a sequence and its column: index, card and exports follow from it."""
 
     name: str
     type: pa.DataType
     meaning: str
     unit: str = "-"
     source: str | Callable[[Sequence], Any] = ""  # path of the attribute (empty: `name`), or a function
-    title: str = ""  # heading of its chart and range in the card; empty: it has none
+    title: str = ""  # heading of its range in the card; empty: it has none
 
     def read(self, sequence: Sequence) -> Any:
         """The cell of a finished sequence; None if it has no such attribute."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,10 +11,9 @@ import numpy as np
 
 from synth.dataset import location
 from synth.errors import UserError
-from synth.fields import FIELDS, STORED_WHEN, Field
+from synth.fields import FIELDS, Field
 from synth.job.schema import Job
 from synth.system.checked_file import folder_bytes
-from synth.system.terminal import hang
 
 _MARGIN = 1.25  # safety factor of estimates from the field table, so that a started run can finish
 # Memory of the program with its libraries, per pixel, per vertex and frame, per pixel and frame.
@@ -51,15 +50,6 @@ def field_bytes(field: Field, frames: int, size: tuple[int, int], half: bool = F
     """Bytes of a field of `size` (height, width) in memory and on disk; `half`: `store.flow` is float16."""
     raw = float(np.prod(field.shape(frames, size))) * np.dtype(field.dtype).itemsize
     return raw, field.packed * (raw / 2 if half and field.half else raw)
-
-
-def describe_fields() -> Iterator[str]:
-    """Lines of text on all fields, two or more each; sizes are of a frame of 640 x 480 px."""
-    for field in FIELDS.values():
-        stored, axes = amount(field_bytes(field, 1, (480, 640))[1]), ", ".join(field.dims)
-        about = f"{axes}, {field.dtype}, {field.unit}, {stored} on disk"
-        yield f"{field.name}: {about}, {STORED_WHEN[field.stored]}"
-        yield from hang("    ", field.meaning)
 
 
 def estimate(job: Job) -> float:

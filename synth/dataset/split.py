@@ -23,13 +23,11 @@ from synth.job import identity
 from synth.system import checked_file
 from synth.system.config_file import validated
 
-By = Literal["anatomy", "opening", "family", "gesture", "stiffness", "sequence"]
-"""Groups that must not be on two sides: `opening` is the craniotomy of a user's brain, else the anatomy;
-`stiffness` splits at quantiles of Young's modulus."""
+By = Literal["anatomy", "opening", "sequence"]
+"""Groups that must not be on two sides: `opening` is the craniotomy of a user's brain, else the anatomy."""
 
 Side = Literal["train", "validation", "test"]
 SIDES: tuple[Side, ...] = get_args(Side)
-_CLASSES = 10
 Group = TypeVar("Group", int, str)
 NAME = "split.json"
 
@@ -103,8 +101,6 @@ def assign_sides(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> lis
     unknown = set(chosen.held_out) - {str(row["family"]) for row in done}
     if unknown and not chosen.sides:
         raise UserError(f"family {', '.join(sorted(unknown))}: no sequence has it")
-    if by == "stiffness" and any(row["young_kpa"] is None for row in done):
-        raise UserError("by stiffness: a sequence has no Young's modulus")
     groups, stored = _groups(done, chosen), [chosen.sides.get(row["content_hash"]) for row in done]
     on: dict[str, set[int]] = {}
     for group, side, row in zip(groups, stored, done, strict=True):
@@ -216,14 +212,10 @@ def name_anatomy(attrs: Mapping[str, Any]) -> str:
 
 def _groups(rows: Sequence[Mapping[str, Any]], chosen: DatasetSplit) -> list[str]:
     """The group of every row; groups that share an anatomy are merged unless the rule allows sharing."""
-    if chosen.by == "stiffness":
-        ordered = sorted(float(row["young_kpa"]) for row in rows)
-        edges = [ordered[k * len(ordered) // _CLASSES] for k in range(1, _CLASSES)]
-        names = [f"E{sum(row['young_kpa'] >= edge for edge in edges)}" for row in rows]
-    elif chosen.by == "opening":
+    if chosen.by == "opening":
         names = _join_openings([str(row.get("opening") or row["anatomy"]) for row in rows], chosen.apart_mm)
     else:
-        names = [str(row["content_hash" if chosen.by == "sequence" else chosen.by]) for row in rows]
+        names = [str(row["content_hash" if chosen.by == "sequence" else "anatomy"]) for row in rows]
     if chosen.share_anatomy:
         return names
     joined, first = join_groups(names, [row["anatomy"] for row in rows]), dict[int, str]()

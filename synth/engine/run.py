@@ -21,7 +21,7 @@ from synth.engine.journal import Journal, RunBars, Watcher
 from synth.errors import UserError, as_positive
 from synth.job.reader import as_job
 from synth.job.schema import Job
-from synth.publish import card, croissant, sequence_video
+from synth.publish import card
 
 _TRIES = 3  # attempts per sequence
 _VERDICT = 5  # the job is refused if so many sequences fail because of it before any succeeds
@@ -120,8 +120,8 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
                 done = _Pool(folder, slots[: max(1, len(todo))], todo).work(watchers)
         finally:
             rows = index.write_index(folder)
-        if done or not (root / "preview.mp4").exists():
-            _publish(folder)
+        if done or not (root / "README.md").exists():
+            card.write_card(folder)
         return Summary(
             total=job.sequences,
             already=len(finished),
@@ -134,7 +134,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 @checked
 @contextmanager
 def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
-    """A folder for custom scenes, written by `write_scene`; index, preview and card are written at the end.
+    """A folder for custom scenes, written by `write_scene`; index and card are written at the end.
 
     Example:
         with synth.open_dataset("out", job) as folder:
@@ -153,17 +153,11 @@ def open_dataset(root: str | Path, job: Job | str | Path) -> Iterator[Path]:
                 raise
             finally:
                 index.write_index(folder)
-            _publish(folder)
+            card.write_card(folder)
     except BaseException:
         if mine is not None:  # not that of the cleaning after it
             raise mine from mine.__cause__
         raise
-
-
-def _publish(folder: Folder) -> None:
-    sequence_video.write_preview(folder.root)
-    card.write_card(folder)
-    croissant.write_croissant(folder)
 
 
 class _Pool:

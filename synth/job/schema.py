@@ -158,7 +158,7 @@ def _among(known: tuple[str, ...]) -> AfterValidator:
 
 
 class StoreSection(Section):
-    """The fields stored of every sequence. `synth schema --fields` lists them with their sizes."""
+    """The fields stored of every sequence. docs/fields.md lists them with their sizes."""
 
     extra: Annotated[tuple[str, ...], _among(EXTRA)] = ()
     """Fields to store in addition to the usual ones."""

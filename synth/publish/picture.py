@@ -88,12 +88,6 @@ def tile(pictures: Sequence[Rgb]) -> Rgb:
     return np.vstack([np.hstack(full[k : k + columns]) for k in range(0, len(full), columns)])
 
 
-def side_by_side(sequence: Sequence_, t: int) -> Rgb:
-    """Frame t (H, W, 3); for a stereo sequence (H, 2W, 3), left and right picture side by side."""
-    left = sequence["rgb"][t]
-    return np.hstack([left, sequence["rgb_right"][t]]) if "rgb_right" in sequence else left
-
-
 def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
     """Picture (h, w, 3) of frames on common scales, a row each: the frame, flow and traction on the rest
     frame.

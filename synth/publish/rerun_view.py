@@ -1,12 +1,7 @@
-"""A sequence in the viewer rerun: frames, depth, flows, traction and force over time. Extra `view`."""
+"""A sequence as a recording for the viewer rerun: frames, depth, flows, traction, force. Extra `view`."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -39,26 +34,6 @@ def save_recording(sequence: Sequence, path: Path) -> None:
             part.replace(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def show_sequence(sequence: Sequence, *, web: bool) -> None:
-    """Shows a sequence in the viewer, or a browser (`web`), until it is closed. UserError: it can't start."""
-    print("rerun sends anonymous usage data to its makers until `rerun analytics disable`", file=sys.stderr)
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "sequence.rrd"
-        save_recording(sequence, path)
-        # Bound to localhost, and in its own process group, as it starts a process that must be ended too.
-        words = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto"]
-        viewer = subprocess.Popen([*words, *["--serve-web"] * web, str(path)], start_new_session=True)
-        try:
-            code = viewer.wait()
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGTERM)
-            viewer.wait()
-    if code:
-        hint = "" if web else "; without a window system use --web, or --save and open the file elsewhere"
-        raise UserError(f"the viewer ended with code {code}{hint}")
 
 
 def _log(rerun: Any, stream: Any, sequence: Sequence) -> None:

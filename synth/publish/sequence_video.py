@@ -1,4 +1,4 @@
-"""Videos: a dataset's preview, and sequences with overlays of force and flow."""
+"""Videos of sequences with overlays of force and flow."""
 
 from __future__ import annotations
 
@@ -19,29 +19,10 @@ from synth.video.write import encode_video
 
 OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}  # overlay -> its field
 
-_PREVIEW_PX, _PREVIEW_TILES = 1280, 9
 _QUALITY = 18
 _CURVE_PX, _LEFT_PX = 64, 4
 _ITERATIONS = 5
 _LINE = (200, 60, 20)
-
-
-def write_preview(root: Path) -> None:
-    """Writes `preview.mp4` of up to nine sequences spread over a dataset; nothing if there is none."""
-    if not any(root.glob("[0-9]*.zarr")):
-        return
-    dataset = Dataset(root)
-    chosen = np.unique(np.linspace(0, len(dataset) - 1, _PREVIEW_TILES).round().astype(int))
-    sequences = [dataset[int(k)] for k in chosen]
-    width = drawing.side_by_side(sequences[0], 0).shape[1] * int(np.ceil(np.sqrt(len(sequences))))
-    step = max(1, -(-width // _PREVIEW_PX))
-
-    def small(one: Sequence, t: int) -> Rgb:
-        return drawing.side_by_side(one, min(t, one.frames - 1))[::step, ::step]
-
-    count = max(one.frames for one in sequences)
-    frames = (drawing.tile([small(one, t) for one in sequences]) for t in range(count))
-    encode_video(root / "preview.mp4", frames, float(sequences[0].attrs["fps"]))
 
 
 def write_videos(

@@ -9,9 +9,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -53,22 +50,6 @@ def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
         file, nothing = io.StringIO(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(file, format="svg", metadata=nothing)
     return _slim(file.getvalue())
-
-
-def histogram(values: NDArray[np.floating], title: str, unit: str, bins: int = 24) -> str:
-    """Histogram of (N,) values as SVG; the title contains their number."""
-    values = values[np.isfinite(values)]
-    counts, edges = np.histogram(values, bins)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.bar(edges[:-1], counts, 0.94 * np.diff(edges), align="edge", color="#3b6ea5")
-        axes.set(title=f"{title} (n = {len(values)})", xlabel=unit)
-        axes.grid(visible=False, axis="x")
-        axes.locator_params(axis="x", nbins=4)
-        axes.locator_params(axis="y", nbins=3, integer=True)
-
-    return svg(320, 180, draw)
 
 
 def _slim(text: str) -> str:

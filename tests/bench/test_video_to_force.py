@@ -30,7 +30,7 @@ def test_predict_and_score_agree_at_every_frame(
     marked[8:-8, 40:-90] = 255
     cv2.imwrite(str(folder / "tissue.png"), marked)
     # The other methods are slow and not tested here.
-    monkeypatch.setattr(comparison, "simpler_methods", lambda train, model, stereo=False: {})
+    monkeypatch.setattr(comparison, "simpler_methods", dict)
 
     words = [model, folder / "video.mp4", "--scale", 0.2, "--tissue", folder / "tissue.png"]
     words += [] if young is None else ["--young", young]

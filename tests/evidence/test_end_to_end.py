@@ -60,16 +60,6 @@ def test_orientations_transform_places_and_vectors_alike() -> None:
     assert len({tuple(arrow(turn)) for turn in turns}) == 8
 
 
-@pytest.mark.slow
-def test_ridge_recovers_a_linear_relation_and_zero_force_without_motion() -> None:
-    rng = np.random.default_rng(2)
-    fit, fresh = [clip(rng, k) for k in range(12)], clip(rng, 12)
-    ridge = models.build(models.RIDGE, fit)
-    assert models.errors([ridge(fresh)], [fresh.force])["errors"][0] < 0.05
-    still = replace(fresh, displacement={"recovered": np.zeros((T, 2, N, N), np.float32)})
-    assert ridge(still) == pytest.approx(0)
-
-
 def test_cached_results_depend_on_inputs_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     computed: list[int] = []
 

@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.methods import baselines
-from bench.methods.protocol import Method
+from bench.methods.physics import GRID
+from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
 from evidence.end_to_end import models
 from evidence.scoring import exvivo
 from evidence.scoring import pulse as experiment
+from learn.data.grid import GridView
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.tune.search import changed
 
@@ -38,14 +39,18 @@ def test_a_stereo_stand_in_agrees_with_its_calibration(
 
 @pytest.mark.slow
 def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
+    def physics(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
+        view, mm = GridView(scene.tissue, scene.scale_mm_per_px, GRID), np.float32(scene.scale_mm_per_px)
+        moved, sure = view.mean(mm * frame.flow.transpose(2, 0, 1)), view.mean(frame.confidence)
+        return ForceEstimate((scene.young_kpa or 1.0) * models.read_bare(moved, view.mask, sure))
+
     size, name = 128, "physics, frame by frame"
-    methods: dict[str, Method] = {name: baselines.Baseline(models.read_bare)}
     contact = experiment.draw_contact(np.random.default_rng(3), 15.0, size)
     runs = {}
     for what, pulses, remove in (("still", 0, True), ("off", 1, True), ("in", 1, False)):
         folder = tmp_path / what
         experiment.record(folder, contact, pulses, size, remove, np.random.default_rng(4))
-        runs[what] = experiment.score(folder, methods, "dis")
+        runs[what] = experiment.score(folder, {name: physics}, "dis")
     assert runs["still"].tracked.pulse == []
     rates = [rhythm["rate_hz"] for rhythm in runs["off"].tracked.pulse]
     assert rates == pytest.approx([1.2, 0.25], rel=0.03)

@@ -99,4 +99,4 @@ def test_learn_loads_no_renderer_through_another_module() -> None:
     found = reached("learn")
     assert {"torch", "synth.dataset.store", "synth.job.schema"} <= found
     assert not [name for name in found if name.startswith(("mitsuba", "drjit", "bench", "synth.render"))]
-    assert "synth.sequence.pipeline" in reached("bench") | reached("synth"), "the walk finds no modules"
+    assert "synth.sequence.simulation" in reached("bench") | reached("synth"), "the walk finds no modules"

@@ -116,4 +116,4 @@ def test_no_method_takes_the_name_of_another(
         bench.score(recording, methods=own)
     installed(tmp_path, monkeypatch, physics="Push")
     with pytest.raises(UserError, match="physics"):
-        comparison.simpler_methods(None, None)
+        comparison.simpler_methods()

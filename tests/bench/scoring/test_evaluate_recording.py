@@ -47,7 +47,7 @@ def test_json_has_no_nan_and_the_page_stands_alone_and_escapes(make: Maker, tmp_
     assert tree["scores"]["n"] == 12
     assert len(tree["curve"]["predicted_mn"]["bump"]) == 12
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<svg") == 5
+    assert page.count("<svg") == 4
     for outside in ('src="http', "src='http", 'href="http', "@import", "<script>alert"):
         assert outside not in page
 

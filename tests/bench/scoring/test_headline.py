@@ -115,7 +115,3 @@ def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Make
     assert "ambiguous" in result.sync.refused
     assert "clocks" in {one.cause for one in result.findings}
     assert result.methods["bump"].scores["r"] > 0.99, "scored at the stated offset"
-    offsets, r = np.array(result.sync.correlogram).T
-    assert offsets[[0, -1]] == pytest.approx([-2.5, 2.5], abs=0.02)
-    near = [float(np.nanmax(r[np.abs(offsets - at) < 0.1])) for at in (-2, 0, 2)]
-    assert min(near) > 0.9, near

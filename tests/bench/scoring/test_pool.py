@@ -69,7 +69,7 @@ def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path:
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
     both, out = [store(tmp_path / name, score(name, 2.0, name)) for name in "ab"], tmp_path / "out"
     run(app, "pool", *both, "-o", out)
-    assert {path.name for path in out.iterdir()} == {"pool.json", "README.md", "chart.svg"}
+    assert {path.name for path in out.iterdir()} == {"pool.json", "README.md"}
     with pytest.raises(UserError, match="given twice"):
         pool.read([both[0], both[0]])
     with pytest.raises(UserError, match="no readable score"):

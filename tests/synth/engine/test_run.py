@@ -43,7 +43,7 @@ def test_a_dataset_is_extended_by_any_number_of_workers(tmp_path: Path, undistur
     whole = run(root, workers=3)
     assert (whole.already, whole.done, whole.failed, whole.content_hash) == (2, 4, {}, undisturbed)
     assert [row["index"] for row in index.read_index(root).to_pylist()] == list(range(6))
-    assert all((root / name).is_file() for name in ("preview.mp4", "job.yaml", "dataset.json"))
+    assert all((root / name).is_file() for name in ("README.md", "job.yaml", "dataset.json"))
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*/c/*")}
     assert run(root).already == 6
     assert before == {path: path.stat().st_mtime_ns for path in root.rglob("*/c/*")}

@@ -9,7 +9,6 @@ from fake_work import consistent
 from synth.dataset import index, split
 from synth.dataset.folder import Folder
 from synth.job.schema import Job
-from synth.publish import croissant
 
 ABOUT = {
     **{"title": "Pulls: a test", "licence": "cc-by-4.0"},
@@ -25,5 +24,4 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     job = Job(sequences=6, frames=3, render=render, flow={"backend": "ideal"}, card=ABOUT)
     in_process(job, out, consistent)
     index.write_index(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
-    croissant.write_croissant(Folder(out))
     return out

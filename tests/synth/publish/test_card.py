@@ -1,4 +1,4 @@
-"""Card, Croissant description, pictures and views of a dataset agree with it and can be read by others."""
+"""Card, pictures and views of a dataset agree with it and can be read by others."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from synth.cli import app
 from synth.dataset import index
 from synth.dataset.store import Dataset
-from synth.publish import card, croissant, picture
+from synth.publish import picture
 
 
 def test_the_card_agrees_with_the_dataset(root: Path) -> None:
@@ -35,29 +35,6 @@ def test_the_card_agrees_with_the_dataset(root: Path) -> None:
     # All pictures shown and all files named in it exist.
     for named in re.findall(r"\]\((\S+)\)|`(\w+\.(?:json|parquet|yaml|mp4))`", text):
         assert (root / (named[0] or named[1])).is_file(), named
-
-
-def test_the_page_is_self_contained(root: Path, tmp_path: Path) -> None:
-    text = card.write_page(root, tmp_path / "page.html").read_text("utf-8")
-    assert text.count("data:image/jpeg") == 6
-    assert text.count("<svg") == len(list((root / "card").glob("*.svg"))) > 0
-    ids = re.findall(r' id="(\w+-\w+)"', text)
-    assert len(ids) == len(set(ids)), "ids of SVG pictures on one page are unique"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_croissant_validator_finds_no_issue_and_reads_the_records(root: Path) -> None:
-    import mlcroissant
-
-    dataset = mlcroissant.Dataset(jsonld=str(root / croissant.NAME))
-    assert not dataset.metadata.issues.errors
-    # The day of publication is for the person who publishes; it would make two equal datasets differ.
-    assert all("datePublished" in warning for warning in dataset.metadata.issues.warnings)
-    records = list(dataset.records("sequences"))
-    assert [record["sequences/content_hash"].decode() for record in records] == [
-        row["content_hash"] for row in index.read_index(root).to_pylist()
-    ]
 
 
 @pytest.mark.slow
@@ -91,14 +68,12 @@ def test_a_picture_shows_flow_and_load_where_they_are(root: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_preview_draws_scenarios_and_prints_their_cost(tmp_path: Path) -> None:
+def test_preview_draws_scenarios_and_prints_their_disk(tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.png"
     small = ["render.size=[80, 64]", "sequences=40", "frames=6", "render.spp=4", "anatomy.vertices=900"]
     done = run(app, "preview", "tiny", *small, "-n", 3, "-o", sheet, "--json")
     found = json.loads(done.stdout)
     assert cv2.imread(str(sheet)).shape == (128, 160, 3)  # three tiles in a square of four
-    assert found["render_cpu_s"] > 0.1
-    assert found["cpu_s"] == pytest.approx(sum(found["stages_cpu_s"].values()))
     assert found["disk_bytes"] > 40 * 6 * 80 * 64 * 3 / 2
 
 
