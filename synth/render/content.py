@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from synth.arrays import Floats
+from synth.arrays import Floats, Indices
 from synth.geometry.triangles import Shape
 from synth.render.materials import Body, Lamp
 
@@ -22,6 +22,10 @@ class Instruments(Protocol):
     @property
     def tint(self) -> Floats:
         """(V, 3) diffuse reflectance at vertices."""
+
+    @property
+    def owner(self) -> Indices:
+        """(F,) number of the instrument that each face belongs to, from 0 on."""
 
     def pose(self, tips: Floats, shafts: Floats) -> Shape:
         """The mesh in its place; only its vertices depend on it."""

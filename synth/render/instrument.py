@@ -47,6 +47,11 @@ class SteelInstruments:
     def tint(self) -> Floats:
         return reflection.tint(self.coat)
 
+    @property
+    def owner(self) -> Indices:
+        sizes = [sum(len(part.profile) for part in one) for one in self.parts]
+        return np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)[self.faces[:, 0]]
+
     def pose(self, tips: Floats, shafts: Floats) -> Shape:
         """The mesh with its tips (2n, 3) mm, two per instrument, else UserError; a single-tipped one is in
         their middle."""

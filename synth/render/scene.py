@@ -21,6 +21,7 @@ from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.content import SceneContent
 from synth.render.materials import Body, Metal, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
+from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
 from synth.system.jit import vectorised
 
@@ -69,10 +70,16 @@ class RenderedFrame:
     """(H, W, 3) camera axes, this frame's pixels; 0 where there is nothing."""
     blur: Map | None = None
     """(H, W) px: radius of the circle of confusion, this frame's pixels."""
+    shadow: Map | None = None
+    """(H, W) share of the lamps' direct light that instruments take, this frame's pixels."""
+    instrument: Array | None = None
+    """(H, W) uint8, this frame's pixels: 1 + number of the instrument; 0 for none."""
     rgb_right: Pixels | None = None
     flow_right: Map | None = None
     visible_right: Mask | None = None
     depth_right: Map | None = None
+    shadow_right: Map | None = None
+    instrument_right: Array | None = None
     motion: Map | None = None
     """(H, W, 3) mm from the rest frame to this one, camera axes, at rest pixels; with a right camera."""
     tool_right: Mask | None = None
@@ -152,11 +159,13 @@ class Renderer:
             extra["normals"] = truth.normal_map(camera, own.hits, shapes)
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, own.depth)
+        extra |= self._shading(own.hits, shapes, "")
         if self._right_rest is not None:
             other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
             picture = self.develop(others[0], seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
+            extra |= self._shading(other.hits, shapes, "_right")
         return RenderedFrame(
             rgb=self.develop(radiance, seed),
             radiance=radiance,
@@ -208,6 +217,19 @@ class Renderer:
         """The instruments."""
         instruments = self.content.instruments
         return _NOTHING if instruments is None else instruments.pose(state.tips, state.shafts)
+
+    def _shading(self, hits: truth.Hits, shapes: Sequence[Shape], camera: str) -> dict[str, Array]:
+        """Optional fields of instruments and shadows at a camera's hits of shapes, instruments last."""
+        found: dict[str, Array] = {}
+        if (name := f"shadow{camera}") in self._extra:
+            found[name] = shadow_map(hits, shapes, self.content.lamps, self.camera.size)
+        if (name := f"instrument{camera}") in self._extra:
+            instruments, size = self.content.instruments, self.camera.size[::-1]
+            owner = np.zeros(0, int) if instruments is None else instruments.owner
+            first = sum(len(shape.faces) for shape in shapes[:-1])
+            number = np.concatenate([np.zeros(first, np.uint8), (owner + 1).astype(np.uint8), [np.uint8(0)]])
+            found[name] = number[hits.face].reshape(size)  # the last one is that of no hit, face -1
+        return found
 
     def _film(self, state: SceneState) -> Floats | None:
         instruments = self.content.instruments

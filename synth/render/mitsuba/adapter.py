@@ -90,9 +90,6 @@ class Stage:
         scene |= {name: _mesh(mi, name, body) for name, body in bodies.items()}
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
-        # Irradiance of all lamps at their targets, in green.
-        distances = [((lamp.position - lamp.target) ** 2).sum() for lamp in lamps]
-        self._power = sum(float(one.intensity[1] / d) for one, d in zip(lamps, distances, strict=True))
         self._scene = mi.load_dict(scene)
         self._parameters = mi.traverse(self._scene)
 
@@ -116,7 +113,7 @@ class Stage:
         lens = self._lens
         if self._layered:
             light = trace(self._scene, lens.sensor, self._size, "metal", lens.spp, seed)
-            radiance = soften(light, self._power, lens.spp)
+            radiance = soften(light, lens.spp)
         else:
             import mitsuba as mi
 

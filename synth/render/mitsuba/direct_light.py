@@ -28,6 +28,8 @@ class Light(NamedTuple):
     cover: Map  # (H, W) share of the paths that end on such steel
     blocked: Map  # (3, H, W) radiance that shadows take from the other paths
     shade: Map  # (H, W) irradiance that shadows take from them
+    arrive: Map  # (H, W) their irradiance without shadows, of the lamps that they sampled
+    radius: Map  # (H, W) px: cover times the radius of the circle of confusion
 
 
 def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, seed: int) -> Light:
@@ -45,7 +47,7 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
     shift = dr.opaque(mi.UInt32, int(np.ceil(np.log2(spp))))
     found = [mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == steel]
     number = dr.opaque(mi.UInt32, int(np.array(dr.reinterpret_array(mi.UInt32, found[0]))[0]) if found else 0)
-    sums = [dr.zeros(mi.Float, width * height) for _ in range(11)]
+    sums = [dr.zeros(mi.Float, width * height) for _ in range(13)]
     for before in range(0, spp, _AT_ONCE):
         count = min(spp - before, _AT_ONCE)
         first, paths = (dr.opaque(mi.UInt32, whole) for whole in (before, count))
@@ -66,12 +68,12 @@ def trace(scene: Any, lens: Any, size: tuple[int, int], steel: str, spp: int, se
         blur = lens.v["fx"] * lens.v["aperture"] * (dr.rcp(depth) - dr.rcp(lens.v["focus"]))
         near = hit & (blur > _BLURRED_PX) & (dr.reinterpret_array(mi.UInt32, si.shape) == number)
         parts = [(hit, (*radiance,)), (near, (*radiance, mi.Float(1)))]
-        parts.append((shadow & ~near, (*scattered, weight.y)))
+        parts += [(shadow & ~near, (*scattered, weight.y)), (hit & ~near, (weight.y,)), (near, (blur,))]
         for total, (where, value) in zip(sums, [(w, v) for w, vs in parts for v in vs], strict=True):
             dr.scatter_add(total, value, pixel, where)
         dr.eval(sums)
     means = np.stack([np.array(total) for total in sums]).reshape(-1, height, width) * np.float32(1 / spp)
-    return Light(means[:3], means[3:6], means[6], means[7:10], means[10])
+    return Light(means[:3], means[3:6], means[6], means[7:10], *means[10:])
 
 
 def _pair(index: Any, seeds: list[Any]) -> Any:

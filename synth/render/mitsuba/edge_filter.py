@@ -1,9 +1,9 @@
 """Denoising of soft edges: defocused objects and shadows are averaged along their own edges.
 
-A few paths per pixel locate a soft edge only roughly, but along it little changes. So the share of paths that
-it covers is averaged along the edge, while the background behind it stays unfiltered. K. Vaidyanathan et al.,
-"Layered light field reconstruction for defocus blur", 2015; E. Heitz et al., "Combining analytic direct
-illumination and stochastic shadows", 2018.
+A few paths per pixel locate a soft edge only roughly, but along it little changes, and nothing within a small
+part of the circle of confusion. So what covers a pixel is averaged over these, while the background behind it
+stays unfiltered. K. Vaidyanathan et al., "Layered light field reconstruction for defocus blur", 2015;
+E. Heitz et al., "Combining analytic direct illumination and stochastic shadows", 2018.
 """
 
 from __future__ import annotations
@@ -15,112 +15,132 @@ from synth.arrays import Map
 from synth.render.mitsuba.direct_light import Light
 from synth.system.jit import vectorised
 
-_REACH = 4  # px along an edge
+_REACH, _STEPS = 4, 4  # px along an edge at least, and steps to either side
+_ALONG, _ACROSS = 0.5, 0.2  # added reach, and standard deviation of an average, in radii of confusion
+_SOFT_PX = 4.0  # radius of confusion whose edges are averaged as far as a shadow's
+_MOST = 4  # times that light is corrected by the lamps that were sampled
 _ENOUGH = 16  # paths per pixel from which on nothing is filtered
 _SIGMA_PX = 1.5  # of the smoothing before and after slopes are taken
 _FLAT = np.float32(1e-4)  # squared slope per pixel below which there is no edge
+_LEAST = np.float32(1e-6)
 
 
-def soften(light: Light, power: float, spp: int) -> Map:
-    """Radiance (H, W, 3) of `direct_light.trace` with its soft edges denoised.
-
-    `power`: irradiance of all lamps, in green; `spp`: paths per pixel.
-    """
+def soften(light: Light, spp: int) -> Map:
+    """Radiance (H, W, 3) of `direct_light.trace` of `spp` paths per pixel with its soft edges denoised."""
     if spp >= _ENOUGH:
         return np.ascontiguousarray(light.radiance.transpose(1, 2, 0))
-    behind = light.radiance - light.near
-    share = light.shade * np.float32(1 / power)
-    if share.any():
-        _shade(behind, behind + light.blocked, share, light.cover, _along(share))
-    picture = np.ascontiguousarray((light.near + behind).transpose(1, 2, 0))
-    if light.cover.any():
-        # Highlights on an object run along its edge as well.
-        _cover(picture, light.near, behind, light.cover, _along(light.cover + light.near[1]))
+    every = light.near, light.radiance - light.near, light.blocked
+    near, behind, blocked = (cv2.merge([*part]) for part in every)
+    cover, arrive, bare = light.cover, light.arrive, 1 - light.cover
+    around = cv2.GaussianBlur(arrive, (0, 0), _SIGMA_PX)
+    if cover.any():
+        # Paths that an object leaves of a pixel's need not sample all lamps equally.
+        some = (cover > 0) & (arrive > 0)
+        usual = around / np.maximum(cv2.GaussianBlur(bare, (0, 0), _SIGMA_PX), _LEAST)
+        even = np.minimum(usual * bare / np.where(some, arrive, 1), _MOST)
+        even = np.where(some, even, np.float32(1))[..., None]
+        behind, blocked = behind * even, blocked * even
+    if light.shade.any():
+        # Of the light past defocused objects, whose edges are none of a shadow's.
+        part = cv2.GaussianBlur(light.shade, (0, 0), _SIGMA_PX) / np.maximum(around, _LEAST * around.max())
+        clear = behind + blocked
+        bright = clear[..., 1] + _LEAST
+        planes = cv2.merge([arrive, light.shade, arrive**2 / bright])
+        total, shade, dull = cv2.split(_averaged(planes, _along(part, np.full_like(part, _SOFT_PX))))
+        # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
+        most = np.minimum(4 * total * arrive / np.maximum(dull * bright, _LEAST), 1)
+        gain = most * (light.shade / np.maximum(arrive, _LEAST) - shade / np.maximum(total, _LEAST))
+        behind = np.maximum(behind + gain[..., None] * clear, 0)
+    picture = np.ascontiguousarray(near + behind)
+    if cover.any():
+        reach = int((light.radius / np.maximum(cover, _LEAST)).max()) + _REACH
+        share = cv2.blur(cover, (2 * reach + 1,) * 2)
+        x, y, wide, high = cv2.boundingRect((share > _LEAST).astype(np.uint8))
+        at = np.s_[y : y + high, x : x + wide]
+        radius = cv2.blur(light.radius, (2 * reach + 1,) * 2)[at] / np.maximum(share[at], _LEAST)
+        picture[at] = _covered(near[at], behind[at], cover[at], radius)
     return picture
 
 
-def _along(share: Map) -> Map:
-    """Vectors (2, H, W) px along the edges of a share (H, W), of the length to average over; 0 elsewhere.
+def _covered(near: Map, behind: Map, cover: Map, radius: Map) -> Map:
+    """Picture (H, W, 3) of defocused objects' light and share over the light `behind`."""
+    planes = _smooth(np.dstack([near, behind, cover]), radius)
+    # Highlights on an object run along its edge as well.
+    planes = _averaged(planes, _along(planes[..., 6] + planes[..., 1], radius))
+    gap = 1 - planes[..., 6:]
+    back = behind + np.float32(0.05) * planes[..., 3:6]
+    back /= (1 - cover)[..., None] + np.float32(0.05) * gap + _LEAST
+    return np.where(gap < 1, planes[..., :3] + gap * back, behind)
+
+
+def _smooth(planes: Map, radius: Map) -> Map:
+    """Planes (H, W, C) averaged over a part of a radius (H, W) px, mixed from a few double box filters."""
+    sizes = [1, 3, 7, 15, 31, 63]
+    variances = [(size**2 - 1) / 6 for size in sizes]
+    level = np.interp((_ACROSS * radius) ** 2, variances, range(len(sizes))).astype(np.float32)
+    found = np.zeros_like(planes)
+    for k in range(int(np.ceil(level.max())) + 1):
+        size = sizes[k], sizes[k]
+        _mix(found, planes if k == 0 else cv2.blur(cv2.blur(planes, size), size), level, k)
+    return found
+
+
+@vectorised
+def _mix(found: Map, planes: Map, level: Map, k: int) -> None:
+    for y in range(level.shape[0]):
+        for x in range(level.shape[1]):
+            weight = 1 - abs(level[y, x] - k)
+            if weight > 0:
+                for c in range(planes.shape[2]):
+                    found[y, x, c] += np.float32(weight) * planes[y, x, c]
+
+
+def _along(share: Map, radius: Map) -> Map:
+    """Vectors (2, H, W) px along the edges of a smooth share (H, W), of the length to average over; 0
+    elsewhere. `radius`: (H, W) px of the circle of confusion.
 
     By the structure tensor, which is largest across an edge. They are short where edges meet.
     """
-    smooth = cv2.GaussianBlur(share, (0, 0), _SIGMA_PX)
-    x, y = cv2.Sobel(smooth, -1, 1, 0, scale=0.125), cv2.Sobel(smooth, -1, 0, 1, scale=0.125)
+    x, y = cv2.Sobel(share, -1, 1, 0, scale=0.125), cv2.Sobel(share, -1, 0, 1, scale=0.125)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _SIGMA_PX) for product in (x * x, x * y, y * y))
     along = np.zeros((2, *share.shape), np.float32)
-    _point(xx, xy, yy, along)
+    _point(xx, xy, yy, radius, along)
     return along
 
 
 @vectorised
-def _point(xx: Map, xy: Map, yy: Map, along: Map) -> None:
+def _point(xx: Map, xy: Map, yy: Map, radius: Map, along: Map) -> None:
     height, width = xx.shape
     for y in range(height):
         for x in range(width):
             whole = xx[y, x] + yy[y, x]
-            if whole > _FLAT:
+            if whole > _FLAT / (1 + radius[y, x]) ** 2:
                 apart = np.sqrt((xx[y, x] - yy[y, x]) ** 2 + 4 * xy[y, x] ** 2)
                 turn = 0.5 * np.arctan2(2 * xy[y, x], xx[y, x] - yy[y, x])
                 # The average ends at the picture's border.
-                reach = min(_REACH, x, y, width - 1 - x, height - 1 - y) * apart / whole
+                most = _REACH + _ALONG * radius[y, x]
+                reach = min(most, x, y, width - 1 - x, height - 1 - y) * apart / whole
                 along[0, y, x], along[1, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
 
 
 @vectorised
-def _shade(behind: Map, clear: Map, share: Map, cover: Map, along: Map) -> None:
-    """Shades the light `behind` (3, H, W) by shadows whose share (H, W) is averaged along their edges."""
-    height, width = share.shape
-    for y in range(height):
-        for x in range(width):
-            if (along[0, y, x] == 0 and along[1, y, x] == 0) or cover[y, x] == 1:
-                continue
-            total, blocked, dull = np.float32(1e-9), np.float32(0), np.float32(0)
-            for step in range(-_REACH, _REACH + 1):
-                u = min(max(x + along[0, y, x] * step / _REACH, 0), width - 1.001)
-                v = min(max(y + along[1, y, x] * step / _REACH, 0), height - 1.001)
-                left, top = int(u), int(v)
-                for j in range(2):
-                    for i in range(2):
-                        weight = (1 - abs(u - left - i)) * (1 - abs(v - top - j)) * (_REACH + 1 - abs(step))
-                        bare = weight * (1 - cover[top + j, left + i])
-                        total += bare
-                        blocked += weight * share[top + j, left + i]
-                        dull += bare * bare / (weight * clear[1, top + j, left + i] + np.float32(1e-6))
-            # A highlight is due to one lamp, and its noise differs: only the light around it is corrected.
-            bare = max(1 - cover[y, x], np.float32(1e-6))
-            most = 4 * total * bare / (dull * (clear[1, y, x] + np.float32(1e-6)))
-            gain = (share[y, x] / bare - blocked / total) * min(most, 1)
-            for k in range(3):
-                behind[k, y, x] = max(behind[k, y, x] + gain * clear[k, y, x], 0)
-
-
-@vectorised
-def _cover(picture: Map, near: Map, behind: Map, cover: Map, along: Map) -> None:
-    """Composes a picture of defocused objects, averaged along their edges, over the light behind."""
-    height, width = cover.shape
-    found = np.zeros(8, np.float32)
+def _averaged(planes: Map, along: Map) -> Map:
+    """Planes (H, W, C) averaged over vectors (2, H, W) px and their opposites."""
+    height, width, count = planes.shape
+    found, total = planes.copy(), np.zeros(count, np.float32)
     for y in range(height):
         for x in range(width):
             if along[0, y, x] == 0 and along[1, y, x] == 0:
                 continue
-            found[:] = 0
-            for step in range(-_REACH, _REACH + 1):
-                u = min(max(x + along[0, y, x] * step / _REACH, 0), width - 1.001)
-                v = min(max(y + along[1, y, x] * step / _REACH, 0), height - 1.001)
+            total[:] = 0
+            for step in range(-_STEPS, _STEPS + 1):
+                u = min(max(x + along[0, y, x] * step / _STEPS, 0), width - 1.001)
+                v = min(max(y + along[1, y, x] * step / _STEPS, 0), height - 1.001)
                 left, top = int(u), int(v)
                 for j in range(2):
                     for i in range(2):
-                        weight = (1 - abs(u - left - i)) * (1 - abs(v - top - j)) * (_REACH + 1 - abs(step))
-                        found[0] += weight
-                        found[1] += weight * cover[top + j, left + i]
-                        for k in range(3):
-                            found[2 + k] += weight * near[k, top + j, left + i]
-                            found[5 + k] += weight * behind[k, top + j, left + i]
-            open_here = 1 - cover[y, x]
-            open_around = 1 - found[1] / found[0]
-            if open_around < np.float32(1e-3):  # no edge, but a highlight on an object that covers everything
-                continue
-            for k in range(3):
-                back = behind[k, y, x] + np.float32(0.05) * found[5 + k] / found[0]
-                back /= open_here + np.float32(0.05) * open_around + np.float32(1e-6)
-                picture[y, x, k] = found[2 + k] / found[0] + open_around * back
+                        weight = (1 - abs(u - left - i)) * (1 - abs(v - top - j)) * (_STEPS + 1 - abs(step))
+                        for k in range(count):
+                            total[k] += np.float32(weight) * planes[top + j, left + i, k]
+            found[y, x] = total / np.float32((_STEPS + 1) ** 2)
+    return found

@@ -50,10 +50,11 @@ def test_noise_along_a_soft_edge_falls_and_what_lies_behind_keeps_its_pixels() -
         exact, cover = soft_edge(64, rng)
         radiance = np.stack([0.1 * cover + ground * (1 - cover)] * 3).astype(np.float32)
         near = np.stack([0.1 * cover] * 3).astype(np.float32)
-        light = Light(radiance, near, cover.astype(np.float32), np.zeros_like(radiance), none)
+        share = cover.astype(np.float32)
+        light = Light(radiance, near, share, np.zeros_like(radiance), none, 1 - share, 3 * share)
         truth = 0.1 * exact + ground * (1 - exact)
         before.append(radiance[0] - truth)
-        after.append(soften(light, 1.0, 4)[..., 0] - truth)
+        after.append(soften(light, 4)[..., 0] - truth)
     check_denoised(exact, before, after)
     clear = np.roll(exact, (-4, -4), (0, 1))[8:-8, 8:-8] == 0  # four pixels and more from the edge
     assert np.abs(after)[:, 8:-8, 8:-8][:, clear].max() < 1e-5
@@ -65,7 +66,34 @@ def test_noise_along_a_soft_shadow_falls() -> None:
     for _ in range(8):
         exact, shade = soft_edge(64, rng)
         blocked = np.stack([0.6 * shade] * 3).astype(np.float32)
-        light = Light(0.6 - blocked, 0 * blocked, none, blocked, 2 * shade.astype(np.float32))
+        clear = none + np.float32(2)
+        light = Light(0.6 - blocked, 0 * blocked, none, blocked, 2 * shade.astype(np.float32), clear, none)
         before.append(light.radiance[0] - 0.6 * (1 - exact))
-        after.append(soften(light, 2.0, 4)[..., 0] - 0.6 * (1 - exact))
+        after.append(soften(light, 4)[..., 0] - 0.6 * (1 - exact))
     check_denoised(exact, before, after)
+
+
+def test_noise_falls_where_a_wide_rim_crosses_a_shadow() -> None:
+    """Under two unequal lamps, each sampled by half of a pixel's paths; not below what texture adds."""
+    rng, before, after = np.random.default_rng(5), [], []
+    y, x = np.mgrid[:96, :96]
+    part = np.clip((0.9 * x + 0.44 * y - 64) / 12, -1, 1)  # of the radius of confusion
+    exact = 0.5 + (part * np.sqrt(1 - part**2) + np.arcsin(part)) / np.pi
+    dark = np.clip((0.7 * x + 0.7 * y - 67) / 6 + 0.5, 0, 1)
+    ground = np.where(x % 6 < 3, 0.8, 0.3)
+    lamp = np.array([0.4, 0.4, 1.6, 1.6])[:, None, None]  # irradiance, of each path
+    for _ in range(8):
+        near, shaded = rng.random((2, 4, 96, 96)) < np.stack([exact, dark])[:, None]
+        cover, arrive, shade = (part.mean(axis=0) for part in (near, ~near * lamp, (~near & shaded) * lamp))
+        parts = [0.1 * cover + ground * (arrive - shade), 0.1 * cover], [ground * shade]
+        (radiance, object_), (blocked,) = ([np.stack([one] * 3) for one in group] for group in parts)
+        every = radiance, object_, cover, blocked, shade, arrive, 12 * cover
+        light = Light(*(one.astype(np.float32) for one in every))
+        before.append(light.radiance[0])
+        after.append(soften(light, 4)[..., 0])
+    band = np.zeros(exact.shape, bool)
+    band[8:-8, 8:-8] = ((exact > 0.03) & (exact < 0.97))[8:-8, 8:-8]
+    truth = 0.1 * exact + ground * (1 - exact) * (1 - dark)
+    for where in (band & (dark > 0.05) & (dark < 0.95), band & (dark < 0.05), band & (dark > 0.95)):
+        assert np.std(after, axis=0)[where].mean() < 0.3 * np.std(before, axis=0)[where].mean()
+        assert abs((np.mean(after, axis=0) - truth)[where].mean()) < 0.01

@@ -1,0 +1,158 @@
+"""Shadows of instruments: the share of the lamps' direct light that they take from each pixel's point.
+
+Rays come from points spread evenly over each lamp's window (H. Vogel, "A better way to construct the
+sunflower head", 1979) and are intersected in double precision (T. Moeller, B. Trumbore, "Fast, minimum
+storage ray/triangle intersection", 1997).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from synth.arrays import Array, Floats, Indices, Map
+from synth.geometry.triangles import Shape, joined, normals
+from synth.render.materials import Lamp
+from synth.render.truth import Hits, Size, blend
+from synth.system.jit import compiled
+
+_RAYS = 32  # per lamp
+_GOLDEN = np.pi * (3 - np.sqrt(5))
+_HIDDEN_MM = 1e-3  # a surface that is nearer to the lamp than a point by more than this shades it
+_NEAR_MM = 1.0  # from a lamp's plane: triangles that are nearer, or behind it, are left out
+
+
+def window(lamp: Lamp, rays: int = _RAYS) -> tuple[Floats, Floats]:
+    """Points (rays, 2) mm spread evenly over a lamp's window, and the lamp's axes as rows (3, 3), z towards
+    its target."""
+    z = (lamp.target - lamp.position) / np.linalg.norm(lamp.target - lamp.position)
+    x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+    x /= np.linalg.norm(x)
+    k = np.arange(rays)
+    away, turn = lamp.radius * np.sqrt((k + 0.5) / rays), k * _GOLDEN
+    return np.stack([away * np.cos(turn), away * np.sin(turn)], 1), np.stack([x, np.cross(z, x), z])
+
+
+def shadow_map(hits: Hits, shapes: Sequence[Shape], lamps: Sequence[Lamp], size: Size) -> Map:
+    """Share (H, W), 0 to 1, of the lamps' direct light that instruments take from the points at hits.
+
+    It is a share of the light that arrives without them: in the rim's shadow, of the rest. 0 on instruments,
+    where nothing is hit, and where no light arrives.
+
+    `hits`: of the pixels of a picture of a size (width, height), on the joined shapes, instruments last.
+    """
+    scene, bent = joined(*shapes), np.concatenate([normals(shape) for shape in shapes])
+    around, tool = np.split(scene.faces, [len(scene.faces) - len(shapes[-1].faces)])
+    at = np.flatnonzero((hits.face >= 0) & (hits.face < len(around)))
+    points = blend(scene.faces, hits.face[at], hits.bary[at], scene.vertices)
+    views = []  # of each lamp: points on its window, points and vertices in its axes, instruments' shadows
+    for lamp in lamps:
+        start, axes = window(lamp)
+        local = (points - lamp.position) @ axes.T, (scene.vertices - lamp.position) @ axes.T
+        views.append((start, axes, *local, _blocked(start, *local, tool)))
+    shaded = np.flatnonzero(np.any([view[-1] for view in views], axis=0))
+    at = at[shaded]
+    normal = blend(scene.faces, hits.face[at], hits.bary[at], bent)
+    light = np.zeros((len(at), 2))  # that arrives without the instruments, and what they take of it
+    for lamp, (start, axes, seen, vertices, taken) in zip(lamps, views, strict=True):
+        seen = np.ascontiguousarray(seen[shaded])
+        others = _blocked(start, seen, vertices, around)
+        power = float(lamp.intensity.sum())
+        _add_light(start, seen, normal @ axes.T, power, others, taken[shaded], light)
+    found = np.zeros(size[0] * size[1], np.float32)
+    found[at] = light[:, 1] / np.maximum(light[:, 0], 1e-300)
+    return found.reshape(size[::-1])
+
+
+@compiled
+def _add_light(
+    start: Floats, points: Floats, normal: Floats, power: float, others: Array, taken: Array, light: Floats
+) -> None:
+    """Adds to `light` (N, 2) that of a lamp at points (N, 3), lamp axes, by the rays that are not blocked."""
+    for i in range(len(points)):
+        for s in range(len(start)):
+            x, y, z = points[i, 0] - start[s, 0], points[i, 1] - start[s, 1], points[i, 2]
+            facing = -(normal[i, 0] * x + normal[i, 1] * y + normal[i, 2] * z)
+            if z <= 0.0 or facing <= 0.0 or (others[i] >> np.uint64(s)) & np.uint64(1):
+                continue
+            square = x * x + y * y + z * z
+            share = power * facing * z / (square * square)  # cosines at both ends, over the distance's square
+            light[i, 0] += share
+            if (taken[i] >> np.uint64(s)) & np.uint64(1):
+                light[i, 1] += share
+
+
+@compiled
+def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) -> Array:
+    """Bits (N,) of the rays from points on a window (S, 2) to points (N, 3) that faces stop, lamp axes.
+
+    Points are sorted into cells of a plane across the lamp's axis, onto which each window's point projects.
+    """
+    count, rays = len(points), len(start)
+    start_x, start_y = start[:, 0].copy(), start[:, 1].copy()
+    every = (np.uint64(1) << np.uint64(rays)) - np.uint64(1)
+    bits = np.zeros(count, np.uint64)
+    ahead = points[:, 2] > _NEAR_MM
+    if not ahead.any():
+        return bits
+    plane = points[ahead, 2].mean()
+    radius = np.sqrt((start * start).sum(axis=1).max())
+    x, y = points[:, 0] * plane / points[:, 2], points[:, 1] * plane / points[:, 2]
+    pad = radius * np.abs(1 - plane / points[ahead, 2]).max() * 1.0001 + 1e-9
+    left, top = x[ahead].min(), y[ahead].min()
+    wide, high = x[ahead].max() - left, y[ahead].max() - top
+    cell = max(np.sqrt(wide * high / count), max(wide, high) / 2000, 1e-9)
+    columns, rows = int(wide / cell) + 1, int(high / cell) + 1
+    number = np.full(count, -1)
+    first = np.zeros(columns * rows + 1, np.int64)
+    for i in range(count):
+        if ahead[i]:
+            number[i] = int((y[i] - top) / cell) * columns + int((x[i] - left) / cell)
+            first[number[i] + 1] += 1
+    first = np.cumsum(first)
+    order, filled = np.empty(first[-1], np.int64), first[:-1].copy()
+    for i in range(count):
+        if ahead[i]:
+            order[filled[number[i]]] = i
+            filled[number[i]] += 1
+    for f in range(len(faces)):
+        a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
+        if not min(a[2], b[2], c[2]) > _NEAR_MM:
+            continue
+        sa, sb, sc = plane / a[2], plane / b[2], plane / c[2]
+        wider = pad + radius * max(abs(1 - sa), abs(1 - sb), abs(1 - sc))
+        x0, x1 = min(a[0] * sa, b[0] * sb, c[0] * sc) - wider, max(a[0] * sa, b[0] * sb, c[0] * sc) + wider
+        y0, y1 = min(a[1] * sa, b[1] * sb, c[1] * sc) - wider, max(a[1] * sa, b[1] * sb, c[1] * sc) + wider
+        if x1 < left or y1 < top or x0 > left + wide or y0 > top + high:
+            continue
+        u0, u1 = int(max(x0 - left, 0) / cell), int(min(x1 - left, wide) / cell)
+        e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+        n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+        off = n0 * a[0] + n1 * a[1] + n2 * a[2]
+        for v in range(int(max(y0 - top, 0) / cell), int(min(y1 - top, high) / cell) + 1):
+            for k in range(first[v * columns + u0], first[v * columns + u1 + 1]):
+                i = order[k]
+                if bits[i] == every:
+                    continue
+                # Moeller and Trumbore's triple products are linear in the ray's start.
+                p0, p1, p2 = points[i, 0] - a[0], points[i, 1] - a[1], points[i, 2] - a[2]
+                behind = n0 * p0 + n1 * p1 + n2 * p2
+                q0, q1, q2 = p1 * g2 - p2 * g1, p2 * g0 - p0 * g2, p0 * g1 - p1 * g0
+                r0, r1, r2 = e1 * p2 - e2 * p1, e2 * p0 - e0 * p2, e0 * p1 - e1 * p0
+                q, r = q0 * a[0] + q1 * a[1] + q2 * a[2], r0 * a[0] + r1 * a[1] + r2 * a[2]
+                near = _HIDDEN_MM / np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2)
+                sign = 1.0 if behind >= 0.0 else -1.0  # that of a plane between lamp and point
+                found = np.uint64(0)
+                for s in range(rays):
+                    along = sign * (off - n0 * start_x[s] - n1 * start_y[s])
+                    whole = along + sign * behind
+                    across = sign * (q - q0 * start_x[s] - q1 * start_y[s])
+                    down = sign * (r - r0 * start_x[s] - r1 * start_y[s])
+                    hair = 1e-10 * whole  # rays must not slip between faces that share an edge
+                    inside = (across >= -hair) & (down >= -hair) & (across + down <= whole + hair)
+                    hit = inside & (along > 0.0) & (sign * behind > near * whole)
+                    found |= np.uint64(hit) << np.uint64(s)
+                bits[i] |= found
+    return bits
