@@ -43,7 +43,7 @@ def of_photograph(photo: Path, outline: str, width_mm: float, step: int = 56) ->
     found = corners(outlined(outline, image.shape[:2]), SIDE_PX, step)
     if not found:
         raise UserError(f"{photo}: no crop of {SIDE_PX} px fits inside the outline")
-    return _cut(taken(image, 0), found), np.array(found, float)
+    return crops(taken(image, 0), found), np.array(found, float)
 
 
 def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
@@ -57,7 +57,7 @@ def of_job(job: Job, step: int = 64) -> tuple[Pixels, Ints]:
     for index in range(job.sequences):
         rgb, inside, _ = bare_picture(bare, index)
         found = corners(inside, SIDE_PX, step)
-        pictures.append(_cut(taken(rgb, index + 1), found))
+        pictures.append(crops(taken(rgb, index + 1), found))
         of += [index] * len(found)
     return np.concatenate(pictures), np.array(of)
 
@@ -90,9 +90,10 @@ def taken(rgb: Pixels, seed: int) -> Pixels:
     return jpeg(np.clip(rgb + noise, 0, 255).astype(np.uint8), _QUALITY)
 
 
-def _cut(rgb: Pixels, found: list[tuple[int, int]]) -> Pixels:
-    crops = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
-    return np.asarray(crops, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
+def crops(rgb: Pixels, found: list[tuple[int, int]]) -> Pixels:
+    """Square crops (N, 128, 128, 3) of a picture at some upper left corners (x, y)."""
+    cut = [rgb[y : y + SIDE_PX, x : x + SIDE_PX] for x, y in found]
+    return np.asarray(cut, np.uint8).reshape(-1, SIDE_PX, SIDE_PX, 3)
 
 
 def measure(
@@ -126,7 +127,8 @@ def measure(
         return np.concatenate([theirs, ours]), label, fold, both
 
     pictures, label, fold, both = against(read_job({}, frames, seed, width_mm))
-    add("default job", pictures, label, fold, both)
+    for name, of in ablated(pictures).items():
+        add(f"default job{name}", of, label, fold, both)
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
@@ -135,10 +137,7 @@ def measure(
         usable = without(read_photograph(photo, width_mm, None), places[np.isin(region, pair)])
         fitted.append(fit_camera(usable))
         pictures, label, fold, both = against(read_job(fitted[-1], frames, seed, width_mm))
-        grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
-        blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
-        shown = {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
-        for name, of in shown.items():
+        for name, of in ablated(pictures).items():
             scores = held_out(of, label, fold, both, epochs, seed, pair)
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
@@ -159,6 +158,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(
         "Rendered crops against a photograph's", found, [chart], [report.Section("", table)], words
     )
+
+
+def ablated(pictures: Pixels) -> dict[str, Pixels]:
+    """Crops (N, n, n, 3) as they are, without colour, and without fine structure, by name."""
+    grey = np.stack([cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in pictures])
+    blurred = np.stack([cv2.GaussianBlur(one, (0, 0), _BLURRED_PX) for one in pictures])
+    return {"": pictures, ", grey levels": np.repeat(grey[..., None], 3, axis=3), ", blurred": blurred}
 
 
 def shuffled(label: Ints, fold: Ints, rng: np.random.Generator) -> Ints:

@@ -10,11 +10,13 @@ import numpy as np
 from evidence import report
 from evidence.study import Study
 from synth.arrays import Pixels
+from synth.job.reader import load_job
 from synth.job.schema import Family, Job
 from synth.publish.contact_sheet import poised
+from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence import scenario
-from synth.sequence.scene import at_rest
+from synth.sequence.scene import RestScene, at_rest
 from synth.tune.search import changed
 
 Settings = dict[str, Any]  # values of a job's dotted keys
@@ -36,14 +38,14 @@ _LIGHTS: dict[str, Settings] = {
 _CAMERAS: dict[str, Settings] = {
     "default": {},
     "noisy": {"sensor.full_well": 900.0, "sensor.read_noise": 25.0, "sensor.sharpening": 1.2},
-    "soft": {"sensor.blur_px": 1.2},
+    "soft": {"sensor.blur_px": 5.0},
     "wide": {"render.field_mm": 46.0, "render.tilt_deg": 28.0, "render.distortion": (-0.25, 0, 0, 0, 0)},
 }
 _SCENERY: dict[str, str] = {
     "bone": "forceps",
     "drape": "dissector",
-    "cottonoid": "suction",
     "retractor": "bayonet",
+    "bone, drape": "suction",
 }
 _CAPTION_PX = 15
 
@@ -64,12 +66,15 @@ def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 14
         for lit, lamp in _LIGHTS.items()
     ]
     around = [
-        _tile({"render.scenery": (part,)}, kind, size, seed + 3, part) for part, kind in _SCENERY.items()
+        _tile({"render.scenery": tuple(parts.split(", "))}, kind, size, seed + 3, parts)
+        for parts, kind in _SCENERY.items()
     ]
     out.mkdir(parents=True, exist_ok=True)
     for name, rows in (("gallery-appearances", families), ("gallery-views", [*views, around])):
-        picture = np.vstack([np.hstack(row) for row in rows])
-        cv2.imwrite(str(out / f"{name}.webp"), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
+        _save(out / f"{name}.webp", rows, quality)
+    job = changed(load_job("randomized"), {"render.stereo_mm": 0, "store.without": (), "sequences": 48})
+    tiles = [_ready(at_rest(job, index)) for index in range(48)]
+    _save(out / "gallery-randomized.webp", [tiles[k : k + 8] for k in range(0, 48, 8)], quality)
 
 
 def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
@@ -81,12 +86,24 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
     rest = at_rest(job)
     case = rest.scenario
     appearance = replace(case.appearance, scenery=job.render.scenery)
-    scene = replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1]))
-    state = SceneState(rest.surface.vertices, *poised(case.gestures[0], rest.surface))
-    shot = scene.renderer.render(state, scenario.frame_seeds(job, 0)[0])
+    shot = _ready(replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1])))
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
     cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)
-    return np.vstack([band, shot.rgb])
+    return np.vstack([band, shot])
+
+
+def _ready(scene: RestScene) -> Pixels:
+    """The picture of a scene whose instruments touch the tissue."""
+    case, surface = scene.scenario, scene.surface
+    ends, shafts = zip(*(poised(gesture, surface) for gesture in case.gestures), strict=True)
+    poses = with_idle(case.idle, 0.0, np.concatenate(ends), np.concatenate(shafts))
+    seed = scenario.frame_seeds(scene.job, scene.index)[0]
+    return scene.renderer.render(SceneState(surface.vertices, *poses), seed).rgb
+
+
+def _save(file: Path, rows: list[list[Pixels]], quality: int) -> None:
+    picture = np.vstack([np.hstack(row) for row in rows])
+    cv2.imwrite(str(file), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
 STUDY = Study(measure)

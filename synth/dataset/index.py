@@ -74,6 +74,8 @@ COLUMNS = (
     IndexColumn("poisson", _REAL, "Poisson's ratio"),
     IndexColumn("load", _REAL, "peak load F/(E a^2) of the first instrument", title="Load F/(E a²)",
                 source=lambda one: next(iter(gestures_of(one.attrs)), {}).get("load")),
+    IndexColumn("attempt", _INT, "earlier draws of its gestures, whose loads the mesh did not bear",
+                source="scenario.attempt"),
     IndexColumn("peak_force_mn", _REAL, "largest force", "mN", "summary.peak_force_mn", "Peak force"),
     IndexColumn("peak_flow_px", _REAL, "largest true motion", "px", "summary.peak_flow_px"),
     IndexColumn("peak_motion_mm", _REAL, "largest true motion, at the scale of the craniotomy", "mm",

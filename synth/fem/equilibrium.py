@@ -23,11 +23,15 @@ _Step = tuple[Floats, Floats, float, Floats]
 """Step s (N, 3) mm, the gradient's change y (N, 3) mN over it, s'y, and the inverse rest stiffness on y."""
 
 
-class NoEquilibrium(UserError):
+class ExcessiveLoad(UserError):
+    """A load that the mesh does not bear."""
+
+
+class NoEquilibrium(ExcessiveLoad):
     """The iteration found no balance of forces."""
 
 
-class InvertedElement(UserError):
+class InvertedElement(ExcessiveLoad):
     """The load is too large for the mesh: an element is flat or inside out."""
 
 

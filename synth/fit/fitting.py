@@ -20,12 +20,12 @@ from synth.render.camera.colour_processing import PLAIN, ColourProcessing
 from synth.render.scene import SceneState
 from synth.sequence.scene import at_rest
 
-_LARGEST_MM, _SMALLEST_PX, _LARGEST_PX = 60.0, 160, 720
+_LARGEST_MM, _LARGEST_PX, _CHOOSING_PX = 60.0, 720, 320  # of frames; and of those that choose the family
 _PIXELS, _DIRECTIONS, _QUANTILES = 6000, 48, 100
-_OFF_DIAGONAL = -0.6, 0.2  # range in published cameras
+_LOW, _HIGH = 0.4, 1.2  # 1 plus the off-diagonal elements of published cameras' matrices
+_CURVE = 0.3  # largest change of a level of a tone curve
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
-_INSET_PX, _CHOOSING_PX = 9, 320  # from the opening's edge; width of frames by which the family is chosen
-_ANATOMIES = 2
+_INSET_PX, _ANATOMIES = 9, 2
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
@@ -55,8 +55,8 @@ class TissueFrame(NamedTuple):
 
     def light(self, keys: dict[str, Any]) -> Map:
         """The sensor's signal (N, 3) on tissue, white-balanced, 1 at full scale."""
-        rng = np.random.default_rng(0)
-        return balanced_light(self.radiance, replace(self.sensor, **keys), rng)[self.usable]
+        sensor = replace(self.sensor, **keys)
+        return balanced_light(self.radiance, sensor, np.random.default_rng(0))[self.usable]
 
 
 def fit_camera(given: Photograph) -> dict[str, Any]:
@@ -66,36 +66,29 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     reproduce the photograph's statistics. Colours are fitted to the signal of that camera.
     """
     theirs, video = measure(given.rgb, given.usable), given.rgb[given.usable] / 255
-    small = min(_CHOOSING_PX, given.rgb.shape[1] // 4 * 4)
-    tissue = {name: render(name, small, given.mm_per_px, 0).light({}) for name in FAMILIES}
-    family = min(FAMILIES, key=lambda name: fit_colours(tissue[name], video)[1])  # the closest
-    widest = min(given.rgb.shape[1], _LARGEST_MM / given.mm_per_px)
-    width = int(np.clip(widest, _SMALLEST_PX, _LARGEST_PX)) // 4 * 4
-    frames = [render(family, width, given.mm_per_px, index) for index in range(_ANATOMIES)]
-    reach = width / given.rgb.shape[1]
-    keys: dict[str, Any] = {"vignette": _USUAL.vignette}
+    widest = int(min(given.rgb.shape[1], _LARGEST_PX, _LARGEST_MM / given.mm_per_px)) // 4 * 4
+    small = {name: render(name, min(_CHOOSING_PX, widest), given.mm_per_px, 0) for name in FAMILIES}
+    family = min(FAMILIES, key=lambda name: fit_colours(small[name].light({}), video)[1])  # the closest
+    frames = [render(family, widest, given.mm_per_px, index) for index in range(_ANATOMIES)]
+    reach = widest / given.rgb.shape[1]
 
-    def figure(name: str, tried: dict[str, float]) -> float:
-        now = keys | tried
-        now["vignette"] *= reach**2
-        taken = ((given.compression.apply(one.record(now)), one.usable) for one in frames)
+    def here(keys: dict[str, Any]) -> dict[str, Any]:
+        return keys | {"vignette": keys["vignette"] * reach**2}  # frames show the photograph's middle
+
+    def figure(name: str, keys: dict[str, Any]) -> float:
+        taken = ((given.compression.apply(one.record(here(keys))), one.usable) for one in frames)
         return float(np.mean([measure(*one, reach)[name] for one in taken]))
 
+    keys: dict[str, Any] = {"vignette": _USUAL.vignette}
     for name, (tried, as_keys) in _TRIED.items():
-        measured = np.maximum.accumulate([figure(name, as_keys(value)) for value in tried])
+        measured = np.maximum.accumulate([figure(name, keys | as_keys(value)) for value in tried])
         keys |= as_keys(float(np.interp(theirs[name], measured, tried)))
-    here = keys | {"vignette": keys["vignette"] * reach**2}
-    light = np.concatenate([one.light(here) for one in frames])
+    light = np.concatenate([one.light(here(keys)) for one in frames])
     keys |= fit_colours(light, video)[0]._asdict()
-    rate = given.compression.bitrate_mbps(frames[0].record(keys))
     sensor = {name: np.round(value, 4).tolist() for name, value in keys.items()}
-    sensor["blur_px"] = sensor.pop("blur")
-    for name in ("full_well", "read_noise", "sharpening"):
-        sensor[name] = [sensor[name]] * 2
-    sensor |= {"chroma": given.compression.chroma, "bitrate_mbps": rate and round(rate, 2)}
-    sections = {"appearance": {"families": [family]}, "sensor": sensor}
-    Job.model_validate(sections)
-    return sections
+    rate = given.compression.bitrate_mbps(frames[0].record(keys))
+    sensor |= {"blur_px": sensor.pop("blur"), "chroma": given.compression.chroma, "bitrate_mbps": rate}
+    return {"appearance": {"families": [family]}, "sensor": sensor}
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
@@ -104,8 +97,7 @@ def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFr
     anatomy = {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8]}
     drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}}
-    job = Job.model_validate({"anatomy": anatomy, "render": view, **drawn})
-    scene = at_rest(job, index)
+    scene = at_rest(Job.model_validate({"anatomy": anatomy, "render": view, **drawn}), index)
     nowhere = np.zeros((2, 3))
     radiance = scene.renderer.render(SceneState(scene.surface.vertices, nowhere, nowhere), index).radiance
     usable = cv2.erode(scene.tissue.astype(np.uint8), np.ones((_INSET_PX, _INSET_PX), np.uint8)) > 0
@@ -120,7 +112,7 @@ def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     which the photograph varies little have more weight, as lightness would dominate hue. `light`: (N, 3) as
     of `TissueFrame.light`; `video`: (M, 3) levels of the photograph's tissue, 0 to 1.
     """
-    rng, plain = np.random.default_rng(0), np.array(PLAIN.curves)
+    rng, plain = np.random.default_rng(0), np.array(PLAIN.curves)[:, :4].ravel()
     ours, theirs = rng.choice(light, _PIXELS)[None], rng.choice(video, _PIXELS)
     variances, axes = np.linalg.eigh(np.cov(theirs.T))
     directions = rng.standard_normal((3, _DIRECTIONS))
@@ -135,23 +127,19 @@ def fit_colours(light: Map, video: Floats) -> tuple[ColourProcessing, float]:
     def residuals(free: Floats) -> Floats:
         colours = _colours(free)
         left = (quantiles(np.clip(processed(ours, *colours), 0, 1)[0]) - wanted) / np.sqrt(wanted.size)
-        curves = np.array(colours.curves)
-        unlike, odd = curves - curves.mean(axis=0), np.append(curves - plain, free[:6] - 1)
-        return np.concatenate([left.ravel(), _NEUTRAL * unlike.ravel(), _KNOWN * odd])
+        unlike = np.array(colours.curves) - np.mean(colours.curves, axis=0)
+        return np.concatenate([left.ravel(), _NEUTRAL * unlike.ravel(), _KNOWN * (free - start)])
 
-    steps = np.log(np.diff(plain, axis=1, prepend=0))
-    start = np.append(np.ones(6), steps[:, :4] - steps[:, 4:])
-    ends = [np.repeat([1 + end, 8 * np.sign(end)], (6, 12)) for end in _OFF_DIAGONAL]
-    found = least_squares(residuals, start, bounds=ends, max_nfev=40, diff_step=3e-3)
+    start = np.append(np.ones(6), plain)
+    low, high = np.append([_LOW] * 6, plain - _CURVE), np.append([_HIGH] * 6, plain + _CURVE)
+    found = least_squares(residuals, start, bounds=(low, high), max_nfev=40, diff_step=3e-3)
     return _colours(found.x), float(found.cost)
 
 
 def _colours(free: Floats) -> ColourProcessing:
-    """Colours from 6 off-diagonal elements plus 1, and 12 log steps of curves relative to the last."""
-    matrix, off = np.eye(3), ~np.eye(3, dtype=bool)
-    matrix[off] = free[:6] - 1
-    matrix[~off] = 2 - matrix.sum(axis=1)
-    steps = np.exp(np.pad(free[6:].reshape(3, 4), ((0, 0), (0, 1))))
-    curves = np.cumsum(steps / steps.sum(axis=1, keepdims=True), axis=1)
-    rows: list[Any] = [tuple(map(tuple, table.tolist())) for table in (matrix, curves)]
+    """Colours from 6 off-diagonal elements plus 1, and the first 4 levels of 3 curves, made to rise to 1."""
+    a, b, c, d, e, f = free[:6] - 1
+    matrix = np.array([[1 - a - b, a, b], [c, 1 - c - d, d], [e, f, 1 - e - f]])
+    levels = np.pad(np.clip(free[6:].reshape(3, 4), 0, 1), ((0, 0), (0, 1)), constant_values=1)
+    rows: list[Any] = [tuple(map(tuple, one.tolist())) for one in (matrix, np.maximum.accumulate(levels, 1))]
     return ColourProcessing(*rows)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from PIL import Image, JpegImagePlugin
 
-from synth.arrays import Map, Mask, Pixels
+from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow import mask_detection
 from synth.job.schema import RenderSection, SensorSection
@@ -19,8 +19,7 @@ from synth.system import checked_file
 
 _SMALLEST_PX, _LEAST_MM2 = 160, 60.0  # of a picture's sides, and of cortex
 _INVISIBLE_DB = 46.0  # PSNR above which a loss is smaller than rounding a noisy picture to 8 bits
-_BITRATES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # Mbit/s of a video of so many pixels
-_VIDEO_PX = 640 * 480
+_BITRATES = (0.25, 0.5, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)  # Mbit/s at 640 x 480
 _SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 _BANDS_PX = ((0.7, 1.4), (2.8, 5.6))
 _BLOCK, _SMOOTHEST = 16, 0.2  # px; noise is measured where such blocks are smoothest
@@ -38,35 +37,34 @@ class Compression(NamedTuple):
     def of_file(cls, data: bytes, finer: float) -> Compression:
         """The compression stated in the header of a file."""
         with Image.open(io.BytesIO(data)) as image:
-            if not isinstance(image, JpegImagePlugin.JpegImageFile):
-                return cls([], "4:4:4", finer)
-            tables = [list(table) for table in image.quantization.values()]
+            tables = [list(table) for table in getattr(image, "quantization", {}).values()]
             return cls(tables[:2], _SAMPLING[max(0, JpegImagePlugin.get_sampling(image))], finer)
 
     def apply(self, rgb: Pixels) -> Pixels:
         """A picture (H, W, 3) compressed alike at the file's resolution, and resampled back."""
         if not self.tables:
             return rgb
-        height, width = rgb.shape[:2]
-        size, packed = (round(width * self.finer), round(height * self.finer)), io.BytesIO()
-        large = Image.fromarray(cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC))
-        large.save(packed, "JPEG", qtables=self.tables, subsampling=_SAMPLING.index(self.chroma))
+        packed = io.BytesIO()
+        size = [round(side * self.finer) for side in rgb.shape[1::-1]]
+        large = cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
+        sampling = _SAMPLING.index(self.chroma)
+        Image.fromarray(large).save(packed, "JPEG", qtables=self.tables, subsampling=sampling)
         back = np.asarray(Image.open(packed).convert("RGB"))
-        return np.asarray(cv2.resize(back, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        return np.asarray(cv2.resize(back, rgb.shape[1::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def bitrate_mbps(self, rgb: Pixels) -> float | None:
-        """The bitrate, for 640 x 480, at which H.264 has the same loss on a frame; None: it is invisible."""
+        """The least bitrate tried, for 640 x 480, at which H.264 loses no more; None: invisible loss."""
         lost = cv2.PSNR(rgb, self.apply(rgb))
         if lost > _INVISIBLE_DB:
             return None
         noise = np.random.default_rng(0).normal(0, 2, (5, *rgb.shape))
         video = np.clip(rgb + noise, 0, 255).astype(np.uint8)
-        left = []
-        for rate in np.array(_BITRATES) * (rgb[..., 0].size / _VIDEO_PX):
-            sensor = SensorSection.model_validate({"bitrate_mbps": rate, "chroma": self.chroma})
-            back = video_link.recorded(video, sensor, 25.0)
-            left.append(np.mean([cv2.PSNR(*pair) for pair in zip(video, back, strict=True)]))
-        return float(np.exp(np.interp(lost, np.maximum.accumulate(left), np.log(_BITRATES))))
+        for rate in _BITRATES:
+            scaled = {"bitrate_mbps": rate * rgb[..., 0].size / (640 * 480), "chroma": self.chroma}
+            back = video_link.recorded(video, SensorSection.model_validate(scaled), 25.0)
+            if cv2.PSNR(video, back) >= lost:
+                break
+        return rate
 
 
 class Photograph(NamedTuple):
@@ -96,11 +94,10 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
     usable = mask_detection.cortex(rgb, own) if painted is None else painted
     if usable.shape != rgb.shape[:2]:
         raise UserError(f"{mask}: has another size than the photograph")
-    small = {"dsize": None, "fx": 1 / finer, "fy": 1 / finer, "interpolation": cv2.INTER_AREA}
-    rgb = np.asarray(cv2.resize(rgb, **small), np.uint8)
-    usable = np.asarray(cv2.resize(usable.astype(np.float32), **small) > 0.99)
-    data = checked_file.read_bytes(path, checked_file.LARGEST_PICTURE)
-    found = Photograph(rgb, usable, own * finer, Compression.of_file(data, finer))
+    both = np.dstack([rgb, 255 * usable.astype(np.uint8)])
+    small = cv2.resize(both, None, fx=1 / finer, fy=1 / finer, interpolation=cv2.INTER_AREA)
+    packed = Compression.of_file(checked_file.read_bytes(path, checked_file.LARGEST_PICTURE), finer)
+    found = Photograph(np.ascontiguousarray(small[..., :3]), small[..., 3] > 252, own * finer, packed)
     if found.cortex_mm2 < _LEAST_MM2:
         raise UserError(
             f"{path}: {found.cortex_mm2:.0f} mm2 of cortex in a width of {width_mm:g} mm, {_LEAST_MM2:g} are "
@@ -112,14 +109,12 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
 def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     """Statistics by which a photograph can be compared with a rendered frame of another cortex.
 
-    `vignette`: logarithmic loss of light in the corners. `noise`: standard deviation in grey levels where
-    tissue is smoothest (J. Immerkaer, 1996). `sharpness`: contrast of the finest octave relative to two
-    octaves coarser, without noise. `rgb`: (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to
-    the photograph's.
+    `vignette`: logarithmic loss of red light, which blood hardly absorbs, in the corners, less a slope due to
+    lamps at one side. `noise`: standard deviation in grey levels where tissue is smoothest (J. Immerkaer,
+    1996). `sharpness`: contrast of the finest octave relative to two octaves coarser, without noise. `rgb`:
+    (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the photograph's.
     """
     tissue, clear = (usable & ~mask_detection.glare(rgb, grown) for grown in (2, 4))
-    levels = np.arange(256, dtype=np.float32) / 255
-    decoded = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     block = cv2.blur(np.abs(cv2.filter2D(grey, -1, _LAPLACIAN)), (_BLOCK, _BLOCK))
     full = cv2.erode(tissue.astype(np.uint8), np.ones((_BLOCK, _BLOCK))) > 0
@@ -130,18 +125,10 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
         # White noise of unit variance leaves this much in a difference of Gaussians.
         left = (1 / fine**2 + 1 / coarse**2 - 4 / (fine**2 + coarse**2)) / (4 * np.pi)
         energy.append(max(float(band[clear].var()) - left * noise**2, 0.01))
-    red = decoded[rgb[..., 0]] / np.median(decoded[rgb[tissue, 0]])
-    sharpness = np.sqrt(energy[0] / energy[1])
-    return {"noise": float(noise), "sharpness": float(sharpness), "vignette": _vignette(red, tissue, reach)}
-
-
-def _vignette(red: Map, tissue: Mask, reach: float) -> float:
-    """Loss of red light, which blood hardly absorbs, in the corners, on a log scale.
-
-    A linear slope over the picture, from lamps at one side, is not part of the vignette.
-    """
     at, middle = np.argwhere(tissue), (np.array(tissue.shape) - 1) / 2
     away = reach**2 * ((at - middle) ** 2).sum(axis=1) / (middle**2).sum()
-    light = np.log(np.maximum(red[tissue], 0.5))
+    red = rgb[tissue, 0] / np.median(rgb[tissue, 0])
+    light = np.log(np.maximum(red**2.2, 0.5))
     slopes, *_ = np.linalg.lstsq(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
-    return -float(slopes[0])
+    sharpness = float(np.sqrt(energy[0] / energy[1]))
+    return {"noise": float(noise), "sharpness": sharpness, "vignette": -float(slopes[0])}

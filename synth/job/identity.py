@@ -20,6 +20,7 @@ FILES: dict[tuple[str, str], int] = {
 """Keys of a job that are files, as (section, key), and the largest size of such a file in bytes."""
 LARGEST_STATE, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file of a series, of a collection of them
 COLLECTIONS = (".pvd", ".series")  # suffixes of files that name those of a series
+_PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 _OF_SERIES = (*COLLECTIONS, ".vtu", ".vtk", ".vtp", ".npz", ".obj")
 
 
@@ -91,6 +92,14 @@ def read_collection(source: Path) -> list[tuple[Path, float]]:
         return [(source.parent / name, time) for name, time in found]
 
 
+def list_pictures(folder: Path) -> list[Path]:
+    """Pictures in a folder of `appearance.photo`. UserError: there are none."""
+    found = sorted(one for one in folder.iterdir() if one.suffix.lower() in _PICTURES and one.is_file())
+    if not found:
+        raise UserError(f"appearance.photo: {folder} holds no picture ({' '.join(_PICTURES)})")
+    return found
+
+
 def identify_anatomy(job: Job, seed: int, at_rest: bytes | None = None) -> str:
     """Name of a sequence's geometry, equal in all datasets: a user's brain, or the seed of a procedural one.
 
@@ -112,5 +121,7 @@ def identify_opening(job: Job, index: int, anatomy: str) -> str:
 def _digest_file(path: Path | None, largest: int) -> str | None:
     if path is None:
         return None
+    if path.is_dir():
+        return digest([_digest_file(one, largest) for one in list_pictures(path)])
     with checked_file.open_file(path, largest) as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()

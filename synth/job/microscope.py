@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, ValidationInfo, model_validator
 
-from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Section, Share, Weights
+from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Scenery, Section, Share, Weights
 from synth.plugins import STORED
 from synth.system import camera_file
 
@@ -38,8 +38,10 @@ class SensorSection(Section):
     """Noise of the readout, standard deviation [electrons]."""
     vignette: Share = 0.15
     """Share of light lost in the picture's corners."""
-    blur_px: Annotated[FiniteFloat, Field(ge=0, le=8)] = 0.0
-    """Blur of the optics in addition to the aperture's: standard deviation of a Gaussian [px]."""
+    blur_px: Range[Annotated[FiniteFloat, Field(ge=0, le=8)]] = (0.4, 1.2)
+    """Blur of lens, colour filter and recorder in addition to the aperture's: standard deviation of a
+    Gaussian in a picture 640 wide [px], in proportion to the width of others (0.4 times in one of 256).
+    Default: from a full HD camera, scaled down, to one of 640 x 480 with a recorder of 320 lines."""
     matrix: tuple[Weights, Weights, Weights] | None = None
     """Colour matrix from sensor to picture, in linear light: rows for red, green, blue, each summing to 1 to
     keep white. Empty: that of a camera drawn from a few."""
@@ -84,9 +86,9 @@ class RenderSection(Section):
     stereo_mm: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Baseline to a right camera [mm], for a stereo dataset: its pictures, and motion in three dimensions,
     true and recovered; 0: monocular."""
-    scenery: tuple[Literal["retractor", "cottonoid", "bone", "drape"], ...] = ()
-    """Objects around the opening, each in three of four sequences: a retractor's blade and cotton patties
-    over its edge, the bone's cut edge, drapes in the corners. They hide tissue and don't count as tissue."""
+    scenery: tuple[Scenery, ...] = ()
+    """Objects around the opening, each in three of four sequences: a retractor's blade over its edge, the
+    bone's cut edge, drapes in the corners. They hide tissue and don't count as tissue."""
 
     @model_validator(mode="after")
     def _calibration_replaces_keys(self, info: ValidationInfo) -> RenderSection:

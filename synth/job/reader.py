@@ -72,7 +72,9 @@ def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
             continue
         try:
             path = ((Path.cwd() if at in config.changes else folder) / Path(name).expanduser()).resolve()
-            if largest is not None:  # else a pattern, or a folder
+            if at == ("appearance", "photo") and path.is_dir():
+                identity.list_pictures(path)
+            elif largest is not None:  # else a pattern, or a folder
                 checked_file.check_file(path, largest)
             config.values[at[0]][at[1]] = str(path)
         except UserError as error:

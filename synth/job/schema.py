@@ -17,7 +17,7 @@ from synth.job.mechanics import PulseSection as PulseSection
 from synth.job.microscope import LightSection as LightSection
 from synth.job.microscope import RenderSection as RenderSection
 from synth.job.microscope import SensorSection as SensorSection
-from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
+from synth.job.types import Direction, Group, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
 from synth.plugins import ESTIMATORS, STORED
 
 
@@ -134,7 +134,8 @@ class AppearanceSection(Section):
     families: tuple[Family, ...] = ("healthy",)
     """Appearance families that sequences are drawn from, in equal shares."""
     photo: Path | None = None
-    """A photograph used as albedo, relative to the job file. Empty: procedural vessels and parenchyma."""
+    """A photograph used as albedo, or a folder of which each sequence draws one, relative to the job file.
+    Empty: procedural vessels and parenchyma."""
     blood: Range[Share] | None = None
     """Blood on the rim, from none (0) to soaked (1). Empty: that of the family."""
 
@@ -212,6 +213,10 @@ class Job(Section):
     fem: FemSection = FemSection()
     render: RenderSection = RenderSection()
     flow: FlowSection = FlowSection()
+    randomize: dict[Group, Share] = Field(default_factory=dict)
+    """Domain randomisation, wider than reality: groups, each with its strength from 0 (off) to 1, such as
+    {texture: 1, light: 0.5}. A group draws its keys anew for every sequence and replaces the job's values of
+    them. Needs a procedural block for `field`."""
     store: StoreSection = StoreSection()
     labels: Literal["published", "none"] = "none"
     """Noise on the field `intensity`: that of the published method's first stage, or none, as in its
@@ -227,6 +232,9 @@ class Job(Section):
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
+        given = self.anatomy.mesh or self.mechanics.source or self.render.calibration
+        if self.randomize.get("field") and given is not None:
+            raise ValueError("randomize.field: needs a procedural block and a camera without calibration")
         right = [name for name in self.store.extra if name.endswith("_right")]
         if right and self.render.stereo_mm == 0:
             raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")

@@ -52,4 +52,7 @@ Curve = Annotated[
 Direction = Annotated[Vector, AfterValidator(_long)]
 MembraneState = Literal["stripped", "unknown", "intact"]
 """Knowledge of the tissue's membrane (pia): removed, unknown, or present."""
+Scenery = Literal["retractor", "bone", "drape"]
+Group = Literal["instruments", "texture", "surroundings", "light", "camera", "field"]
+"""What domain randomisation draws at random."""
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

@@ -72,6 +72,7 @@ def limits(model: type[BaseModel], key: str) -> str:
     signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
     if "anyOf" in described:  # an optional key: only its choices are listed
         described, signs = described["anyOf"][0], {}
+    described = described.get("propertyNames", described)
     described = (described.get("prefixItems") or [described.get("items", described)])[0]
     if "enum" in described:
         return f"({' | '.join(map(str, described['enum']))})"
@@ -89,6 +90,8 @@ def scalar(value: Any) -> str:
     if isinstance(value, BaseModel):
         given = {name: getattr(value, name) for name in type(value).model_fields}
         return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in given.items() if one is not None)}}}"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name}: {scalar(one)}' for name, one in value.items())}}}"
     if isinstance(value, tuple):
         return f"[{', '.join(scalar(item) for item in value)}]"
     return "" if value is None else str(value)

@@ -63,6 +63,7 @@ def facts(folder: Folder, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "job": job,
         "card": job.card,
         "done": done,
+        "redrawn": sum(bool(row.get("attempt")) for row in done),
         "failed": [(count, reason, first[reason]) for reason, count in reasons.most_common(50)],
         "frames": sum(row["frames"] for row in done),
         "anatomies": len({row["anatomy"] for row in done}),

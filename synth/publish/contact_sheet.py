@@ -14,6 +14,7 @@ from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.camera.camera import resized
+from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence import scenario
 from synth.sequence.scene import RestScene, at_rest
@@ -52,12 +53,13 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     else:
         scene = at_rest(job, index)
         ready = [poised(gesture, scene.surface) for gesture in scene.scenario.gestures]
-        tips, shafts = (np.concatenate(part) for part in zip(*ready, strict=True))
+        touching = (np.concatenate(part) for part in zip(*ready, strict=True))
+        tips, shafts = with_idle(scene.scenario.idle, 0.0, *touching)
         state = SceneState(scene.surface.vertices, tips, shafts)
     scene = replace(scene, view=resized(scene.view, size))
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
-    acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments)
+    acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")
     return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
 
 

@@ -14,7 +14,7 @@ from synth.render.materials import Body, Lamp
 
 
 class Instruments(Protocol):
-    """Instruments as one mesh of polished metal that follows tips and shafts.
+    """Instruments as one mesh that follows tips and shafts.
 
     `tips` (2n, 3) mm and `shafts` (2n, 3), unit vectors from tip to hand: two of each for every instrument.
     """

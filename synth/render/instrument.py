@@ -1,4 +1,4 @@
-"""Instruments as meshes that follow tips and shafts: two forceps, dissector, suction, spatula, probe.
+"""Instruments as meshes that follow tips and shafts: forceps, dissector, suction, rods, fingers, cloth.
 
 Sizes in mm are those of common neurosurgical instruments, chosen by eye, not from drawings.
 """
@@ -10,19 +10,23 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Indices, Map
+from synth.arrays import Floats, Indices
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces, joined, lengths
+from synth.render import finish
 from synth.render.appearance import reflection
-from synth.render.appearance.reflection import Theatre
+from synth.render.appearance.reflection import Reflectance, Theatre
+from synth.render.idle import CLOTH, IdleInstrument
 
-_AROUND = 40
-RING = _AROUND + 1  # vertices of each of a part's rings
+RING = 32  # vertices of each of a part's rings
+_RINGS = 64
 _LENGTH_MM = 110.0
-_COAT_MM = 11.0  # from the tip
 _CLIMB_MM, _REACH_MM = 0.30, 0.40  # height to which fluid climbs at a tip, and distance of its fall-off
-_COATED = 0.4  # share of instruments whose end is coated black, against sticking and glare
+_OTHER_SIZES = 0.6, 1.6  # of an acting instrument's tip, at strength 1
+_SHEET_MM, _LAID_MM = 0.4, 0.45  # spacing of a cloth's vertices, its height over what is below
 
 
 @dataclass(frozen=True)
@@ -31,21 +35,28 @@ class Part:
 
     profile: Floats  # (V, 3) mm
     side: int  # tip of the instrument that it follows: 1, -1; 0: their middle
+    rows: int = 0  # of a sheet of cloth; 0: closed rings
+
+    @property
+    def shape(self) -> Shape:
+        rows = self.rows or len(self.profile) // RING
+        faces = grid_faces(rows, len(self.profile) // rows, "" if self.rows else "columns")
+        return Shape(self.profile, faces.reshape(-1, 3))
 
 
 @dataclass(frozen=True)
-class SteelInstruments:
+class InstrumentMesh:
     """All instruments of a scene as one mesh; see `content.Instruments`."""
 
     halves: tuple[float, ...]  # half the width of each one's contact with tissue, mm
     parts: tuple[tuple[Part, ...], ...]  # the parts of each, none where it is not drawn
     faces: Indices  # (F, 3) over all parts
-    coat: Map  # (V,) 0 bare steel to 1 under a black coating
+    surface: Reflectance  # at all vertices
     theatre: Theatre  # that they mirror
 
     @property
     def tint(self) -> Floats:
-        return reflection.tint(self.coat)
+        return self.surface.diffuse
 
     @property
     def owner(self) -> Indices:
@@ -61,7 +72,7 @@ class SteelInstruments:
         return Shape(np.concatenate([bar for one in each for bar in place(*one)]), self.faces)
 
     def glow(self, posed: Shape) -> Floats:
-        return reflection.glow(posed, self.coat, self.theatre)
+        return reflection.glow(posed, self.surface, self.theatre)
 
     def film(self, tips: Floats, surface: Floats) -> Floats:
         height = np.zeros(len(surface))
@@ -86,34 +97,65 @@ def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
     return placed
 
 
-def shape_of(kind: str, footprint_mm: float) -> tuple[tuple[Part, ...], float]:
-    """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip."""
+def shape_of(kind: str, footprint_mm: float, size: float = 1.0) -> tuple[tuple[Part, ...], float]:
+    """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip; both times
+    `size`."""
     if kind == "none":
         return (), 0.0
     make, share, least, most = SHAPES[kind]
-    half = float(np.clip(share * footprint_mm, least, most))
+    half = size * float(np.clip(share * footprint_mm, least, most))
     return make(half), half
 
 
 def build(
-    drawn: Sequence[tuple[str, float]], theatre: Theatre, rng: np.random.Generator
-) -> SteelInstruments | None:
-    """Instruments in a theatre, some of them with ends coated black; None if there is none.
+    drawn: Sequence[tuple[str, float]],
+    theatre: Theatre,
+    rng: np.random.Generator,
+    strength: float = 0.0,
+    idle: Sequence[IdleInstrument] = (),
+    ground: Floats = np.zeros((1, 3)),
+) -> InstrumentMesh | None:
+    """Instruments in a theatre, with finishes drawn for each; None if there is none.
 
-    `drawn`: kind of each and the radius a of its contacts, mm.
+    `drawn`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
+    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on.
     """
-    coated = rng.random(len(drawn)) < _COATED
-    parts, halves = zip(*(shape_of(*one) for one in drawn), strict=True) if drawn else ((), ())
+    sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
+    made = [shape_of(kind, a, size) for (kind, a), size in zip(drawn, sizes, strict=True)]
+    made += [
+        ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
+        for one in idle
+    ]
+    parts, halves = zip(*made, strict=True) if made else ((), ())
     if not any(parts):
         return None
-    bars, coat = [], []
-    for own, ends in zip(parts, coated, strict=True):
-        for part in own:
-            bars.append(Shape(part.profile, grid_faces(len(part.profile) // RING, RING).reshape(-1, 3)))
-            # The coating ends in a sharp ring.
-            coat.append(ends / (1 + np.exp(np.clip((part.profile[:, 2] - _COAT_MM) / 0.12, -40, 40))))
-    whole = np.concatenate(coat).astype(np.float32)
-    return SteelInstruments(halves, parts, joined(*bars).faces, whole, theatre)
+    surfaces = list[Reflectance]()
+    for own, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
+        skin = finish.draw_finish(strength, rng, kind)
+        surfaces += [finish.reflectance(skin, part.profile, 0 if part.rows else RING, rng) for part in own]
+    whole = Reflectance(*(np.concatenate(part) for part in zip(*surfaces, strict=True)))
+    faces = joined(*(part.shape for own in parts for part in own)).faces
+    return InstrumentMesh(halves, parts, faces, whole, theatre)
+
+
+def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
+    """A cloth that lies on points (N, 3) mm, gauze in folds."""
+    half = one.radius_mm, one.radius_mm * (0.46 if one.kind == "patty" else 0.8)
+    rows, columns = (int(2 * side / _SHEET_MM) for side in half)
+    sides = (
+        np.linspace(-half[0], half[0], rows),
+        np.linspace(half[1], -half[1], columns),
+    )
+    u, v = (axis.ravel() for axis in np.meshgrid(*sides, indexing="ij"))  # faces turn upwards
+    (tip, _), (shaft, _) = one.at(0.0)
+    at = np.column_stack([u, v, np.zeros(len(u))])
+    _, near = cKDTree(ground[:, :2]).query((tip + at @ _axes(shaft, np.asarray(one.aside)))[:, :2], k=6)
+    below = ground[near % len(ground), 2].max(axis=1).reshape(rows, columns)
+    z = np.maximum(gaussian_filter(below, 1.5, mode="nearest"), below) + _LAID_MM
+    z[1:-1, 1:-1] += 0.3  # its border is lower
+    if one.kind == "gauze":
+        z += 0.5 * np.maximum(finish.noise(at, 9.0, rng), 0).reshape(z.shape)
+    return Part(np.column_stack([u, v, z.ravel() - tip[2]]), 1, rows)
 
 
 def _axes(shaft: Floats, across: Floats) -> Floats:
@@ -130,7 +172,7 @@ def _axes(shaft: Floats, across: Floats) -> Floats:
 
 def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
     """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
-    angle = np.linspace(0, 2 * np.pi, _AROUND + 1)
+    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
     c, w = np.cos(angle), np.sin(angle)
     x = np.sign(c) * np.abs(c) ** power
     y = np.sign(w) * np.abs(w) ** power
@@ -138,9 +180,10 @@ def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) ->
     return np.stack(columns, -1).reshape(-1, 3)
 
 
-def _along(rings: int) -> Floats:
-    """Positions (rings,) mm of rings along an instrument, closer together at its tip."""
-    return np.asarray((np.linspace(0, 1, rings) ** 1.6) * _LENGTH_MM)
+def _along() -> Floats:
+    """Positions (R,) mm of rings along an instrument, closer at its tip, two where a coat may begin."""
+    coats = np.add.outer(finish.COATS_MM, [-0.02, 0.02]).ravel()
+    return np.sort(np.concatenate([np.linspace(0, 1, _RINGS) ** 1.9 * _LENGTH_MM, coats]))
 
 
 def _round_off(s: Floats, over: float) -> Floats:
@@ -151,19 +194,19 @@ def _round_off(s: Floats, over: float) -> Floats:
 def _forceps(half: float, aside_mm: float = 0.0) -> tuple[Part, ...]:
     """Two tines: a blunt tip that widens into a flat blade, bowed outwards (to -x for side 1), and the handle
     shifted by `aside_mm`, out of view."""
-    s = _along(96)
+    s = _along()
     close = _round_off(s, 0.45)
     wide = (half - 0.03 + 0.9 * (1 - np.exp(-s / 9.0)) + 1.3 * (1 - np.exp(-s / 45.0))) * close
     thick = (0.34 + 0.42 * (1 - np.exp(-s / 8.0)) + 0.3 * (1 - np.exp(-s / 40.0))) * close
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
     bend = np.clip((s - 24.0) / 14.0, 0, 1)
-    shift = np.repeat(aside_mm * bend**2 * (3 - 2 * bend), _AROUND + 1)[:, None] * [0.0, 1.0, 0.0]
+    shift = np.repeat(aside_mm * bend**2 * (3 - 2 * bend), RING)[:, None] * [0.0, 1.0, 0.0]
     return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
 
 
 def _dissector(half: float) -> tuple[Part, ...]:
     """A small rounded blade on a thin round shaft, slightly bent, that ends in a thicker handle."""
-    s = _along(96)
+    s = _along()
     close = _round_off(s, 1.4)
     neck = np.exp(-((s / 5.0) ** 2))
     handle = 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
@@ -173,20 +216,21 @@ def _dissector(half: float) -> tuple[Part, ...]:
     return (Part(_sweep(s, thick, wide, bow, 0.9), 0),)
 
 
-def _suction(half: float) -> tuple[Part, ...]:
+def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[Part, ...]:
     """A tube, open at its end, bent and wider towards the hand."""
-    outside = 0.12 + _along(84)
+    outside = 0.12 + _along()
     inside = np.array([8.0, 3.0, 1.0, 0.3, 0.05])
     s = np.concatenate([inside, outside])
-    radius = half + np.concatenate([np.full(5, -0.15), 0.05 + 0.9 / (1 + np.exp(-(outside - 55.0) / 4.0))])
+    grown = 0.05 + wider_mm / (1 + np.exp(-(outside - 55.0) / 4.0))
+    radius = half + np.concatenate([np.full(5, -0.3 * min(half, 0.5)), grown])
     radius[5] = half - 0.05  # a blunted edge
-    bow = 2.5 * (1 - np.exp(-((s / 45.0) ** 2)))
+    bow = bend_mm * (1 - np.exp(-((s / 45.0) ** 2)))
     return (Part(_sweep(s, radius, radius, bow, 1.0), 0),)
 
 
 def _spatula(half: float) -> tuple[Part, ...]:
     """A flat ribbon with a round end, bent where it leaves the wound."""
-    s = _along(96)
+    s = _along()
     wide = (half + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, half)
     thick = np.full_like(s, 0.32) * _round_off(s, 0.3)
     bow = 4.0 * (1 - np.exp(-((s / 30.0) ** 2)))
@@ -195,11 +239,18 @@ def _spatula(half: float) -> tuple[Part, ...]:
 
 def _probe(half: float) -> tuple[Part, ...]:
     """A ball on a thin shaft; at 50 degrees its lowest point is the tip."""
-    s = _along(96)
+    s = _along()
     radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), np.where(s > half, 0.45 * half, 0))
     radius += 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
     low, up = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
     return (Part(_sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)
+
+
+def _rod(half: float, bend: float = 0.0) -> tuple[Part, ...]:
+    """A round rod or finger with a round end, straight or bent upwards."""
+    s = _along()
+    radius = half * _round_off(s, half)
+    return (Part(_sweep(s, radius, radius, bend * s**2, 1.0), 0),)
 
 
 SHAPES: dict[str, tuple[Callable[[float], tuple[Part, ...]], float, float, float]] = {
@@ -209,5 +260,9 @@ SHAPES: dict[str, tuple[Callable[[float], tuple[Part, ...]], float, float, float
     "suction": (_suction, 0.48, 1.0, 2.0),
     "spatula": (_spatula, 0.8, 1.5, 4.5),
     "probe": (_probe, 0.5, 0.6, 3.0),
+    "rod": (_rod, 1.0, 0.25, 4.0),
+    "bent": (partial(_rod, bend=6e-3), 1.0, 0.25, 4.0),
+    "tube": (partial(_suction, bend_mm=0.0, wider_mm=0.0), 1.0, 0.5, 4.0),
+    "finger": (partial(_rod, bend=4e-3), 1.0, 6.5, 8.5),
 }
 """Parts of each drawn kind by half the width of its tip: a share of the contact's radius, from and to mm."""

@@ -45,7 +45,7 @@ class Wet:
 
 @dataclass(frozen=True)
 class Metal:
-    """A polished body, whose reflections are given rather than rendered."""
+    """A body whose reflections are given rather than rendered."""
 
     tint: Floats
     """(V, 3) diffuse reflectance at vertices."""

@@ -47,4 +47,6 @@ def build_volume(rest: RestScene) -> Tets:
     if rest.brain is not None:
         return tetrahedra.from_brain(rest.brain, anatomy, *mesh, slips=slips)
     height = HeightMap(surface.pia, surface.extent_mm)
-    return tetrahedra.block(anatomy, *mesh, height, slips=slips)
+    how = rest.scenario.randomized
+    width, length, depth = (side * (1.0 if how is None else how.scale) for side in tetrahedra.BLOCK_MM)
+    return tetrahedra.block(anatomy, *mesh, height, slips=slips, size_mm=(width, length, depth))

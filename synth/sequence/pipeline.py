@@ -74,7 +74,7 @@ def write_scene(
         renderer = scene.renderer
     _refuse_unseen(scene)
     width, height = job.render.size
-    writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=job)
+    writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=scene.dataset)
     writer.put("time", scene.time)
     writer.put("force", scene.force)  # labels are in camera axes
     if writer.wants("force_of"):
@@ -251,7 +251,7 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
                 "tip_mm": motion.tip[:, 2 * k : 2 * k + 2].tolist(),
                 "shaft": motion.shaft[:, 2 * k].tolist(),
             }
-            for k, (kind, instrument, _) in enumerate(scene.instruments)
+            for k, (kind, instrument, _) in enumerate(scene.instruments[: motion.tip.shape[1] // 2])
         ],
     }
 

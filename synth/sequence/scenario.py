@@ -27,8 +27,11 @@ from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.camera.camera import CameraView, place, visible_radius
 from synth.render.camera.camera_motion import CameraMotion
-from synth.render.camera.camera_sensor import CameraSensor
+from synth.render.camera.camera_sensor import BLUR_WIDTH_PX, CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
+from synth.render.idle import IdleInstrument, draw_idle
+from synth.render.randomized.randomization import Randomization
+from synth.sequence.randomization import draw_randomization, randomized, vary_appearance, vary_view
 
 Random = np.random.Generator
 Range = tuple[float, float]
@@ -36,11 +39,14 @@ Range = tuple[float, float]
 # First element of the spawn key.
 _ANATOMY, _SEQUENCE = 0, 1
 _TISSUE, _GESTURE, _APPEARANCE, _VIEW, _NOISE, _FURTHER, _LABELS, _CAMERA_MOTION, _PULSE = range(9)
+_IDLE = 16
 
 _STRETCH = 1.01, 1.03
 """Pre-stretch of a membrane. Not measured: its tension then balances a pressure of 3-350 Pa (at most 2.6
 mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
+ATTEMPTS = 4  # draws of a sequence's gestures, each where the mesh did not bear those before
+_REDRAW = 32  # third element of the spawn key of further attempts
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
@@ -70,29 +76,45 @@ class Scenario:
     camera_motion: CameraMotion
     pulse: Pulse | None
     """Pulse of heart and breath; None where only instruments move the tissue."""
+    idle: tuple[IdleInstrument, ...] = ()
+    """Instruments that touch nothing."""
+    randomized: Randomization | None = None
+    """What `Job.randomize` draws beyond the job's own keys; None without it."""
+    attempt: int = 0
+    """Number of earlier draws of its gestures, whose loads the mesh did not bear."""
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 @checked
-def draw_scenario(job: Job | str | Path, index: int) -> Scenario:
-    """Draws sequence `index` of `job`, independently of the others' number and order."""
+def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenario:
+    """Draws sequence `index` of `job`, independently of the others' number and order.
+
+    `attempt`: number of earlier draws of its gestures; all else is the same in every attempt.
+    """
     job = as_job(job)
     if index < 0:
         raise UserError(f"index {index}: sequences are numbered from 0")
+    job, how = randomized(job, index), draw_randomization(job, index)
     family = job.appearance.families[index % len(job.appearance.families)]
     generator = partial(_generator, job, _SEQUENCE, index)
     relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
     tissue = draw_tissue(job.fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
-    view = draw_view(job.render, generator(_VIEW))
+    view = vary_view(draw_view(job.render, generator(_VIEW)), job, index)
     motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
     lens, opening_mm = place(view, job.render), job.anatomy.craniotomy.radius_mm
-    rngs, shown = (generator(_GESTURE), generator(_FURTHER)), (visible_radius(lens), lens.centre)
+    again, shown = (_REDRAW, attempt) if attempt else (), (visible_radius(lens), lens.centre)
+    rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
     gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
-    appearance = draw_appearance(job, family, generator(_APPEARANCE))
-    return Scenario(index, family, relief, tissue, gestures, appearance, view, motion, pulse)
+    appearance = vary_appearance(draw_appearance(job, family, generator(_APPEARANCE)), job, index)
+    acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
+    strength = job.randomize.get("instruments", 0.0)
+    idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_radius(lens), acting)
+    return Scenario(
+        index, family, relief, tissue, gestures, appearance, view, motion, pulse, idle, how, attempt
+    )
 
 
 def frame_seeds(job: Job, index: int) -> list[int]:
@@ -342,10 +364,13 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
         light=lighting,
         sensor=draw_sensor(job.sensor, balance(lighting.kelvin + rng.uniform(-250, 350)), rng),
     )
-    # By a seed of its own, so that no other number depends on it.
+    # By seeds of their own, so that no other number depends on them.
+    blur = _uniform(np.random.default_rng([appearance.rim_seed, 5]), job.sensor.blur_px)
+    sensor = replace(appearance.sensor, blur=blur * job.render.size[0] / BLUR_WIDTH_PX)
     parts = job.render.scenery
     shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
-    return replace(appearance, scenery=tuple(part for part, one in zip(parts, shown, strict=True) if one))
+    scenery = tuple(part for part, one in zip(parts, shown, strict=True) if one)
+    return replace(appearance, sensor=sensor, scenery=scenery)
 
 
 def draw_light(light: LightSection, rng: Random) -> Lighting:
@@ -373,7 +398,6 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
         full_well=_uniform(rng, section.full_well),
         read_noise=_uniform(rng, section.read_noise),
         vignette=section.vignette,
-        blur=section.blur_px,
         sharpening=_uniform(rng, section.sharpening),
         chroma=section.chroma,
         coded=section.bitrate_mbps is not None,

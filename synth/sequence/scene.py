@@ -32,6 +32,7 @@ from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
 from synth.render.scene import RenderedFrame, Renderer, SceneState
 from synth.sequence import scenario
+from synth.sequence.randomization import randomized
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
 from synth.system import camera_file
@@ -61,6 +62,7 @@ class RestScene:
     """One sequence of a job, drawn and built, before any motion; made by `at_rest`."""
 
     job: Job
+    """The job, with keys that it randomises as drawn for this sequence."""
     index: int
     """Number of the sequence in the job."""
     scenario: Scenario
@@ -75,6 +77,8 @@ class RestScene:
     """What is drawn of it: `draw_craniotomy`, or content of your own around the same surface."""
     series: MeshSeries | None
     """Motion and load by another program, of `mechanics.source`."""
+    dataset: Job
+    """The job of all sequences, as given."""
 
     @property
     def shape(self) -> Shape:
@@ -88,11 +92,12 @@ class RestScene:
 
     @property
     def instruments(self) -> list[tuple[str, str, float]]:
-        """Gesture, kind and radius of the contact in mm of each instrument."""
+        """Gesture, kind and radius of the contact in mm of each acting instrument, then of idle ones."""
+        idle = [("idle", one.kind, one.radius_mm) for one in self.scenario.idle]
         if self.series is None:
-            return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures]
+            return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures] + idle
         kinds, radius = self.job.fem.instrument or ("probe",), self.job.fem.footprint_mm[0]
-        return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])]
+        return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])] + idle
 
     @property
     def time(self) -> Floats:
@@ -138,7 +143,8 @@ class Scene(RestScene):
     @cached_property
     def _timeline(self) -> Timeline:
         case, rest = self.scenario, self.surface.vertices
-        return Timeline(rest, self.motion, self.view, case.camera_motion, case.appearance.light, self.job.fps)
+        moving = case.camera_motion, case.appearance.light, self.job.fps
+        return Timeline(rest, self.motion, self.view, *moving, case.idle)
 
     @cached_property
     def _seeds(self) -> list[int]:
@@ -220,8 +226,10 @@ class Scene(RestScene):
 
 def draw_craniotomy(rest: RestScene) -> SceneContent:
     """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
-    drawn = [one[1:] for one in rest.instruments]
-    return craniotomy(rest.surface, rest.scenario.appearance, rest.view, rest.job, drawn)
+    case = rest.scenario
+    drawn = [one[1:] for one in rest.instruments if one[0] != "idle"]
+    given = rest.surface, case.appearance, rest.view, rest.job, drawn
+    return craniotomy(*given, case.idle, case.randomized)
 
 
 def at_rest(
@@ -238,6 +246,7 @@ def at_rest(
     `draw_craniotomy` if None. UserError: the job's surface or calibration cannot be used.
     """
     case = case or scenario.draw_scenario(job, index)
+    dataset, job = job, randomized(job, index)
     view = camera.place(case.view, job.render)
     if job.render.calibration is not None:
         case = replace(case, view=camera.calibrated(case.view, view))
@@ -249,8 +258,11 @@ def at_rest(
     about = mesh.stat() if mesh and mesh.is_file() else None
     written = about and (about.st_mtime_ns, about.st_size)
     bare = content is not None  # whoever draws another organ has no veins on it
-    surface, brain = _cortex(job.anatomy.opened(case.index), case.relief, written, series, bare)
-    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy, series)
+    scale = case.randomized.scale if case.randomized is not None else 1.0
+    section, relief = anatomy.shrunk(job.anatomy.opened(case.index), case.relief, scale)
+    surface, brain = _cortex(section, relief, written, series, bare)
+    surface = anatomy.resized(surface, scale)
+    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy, series, dataset)
 
 
 def refuse_unfit(render: RenderSection) -> None:

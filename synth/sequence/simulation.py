@@ -9,13 +9,14 @@ from pathlib import Path
 from synth.arguments import checked
 from synth.errors import UserError
 from synth.fem.deformation import check_deformation
+from synth.fem.equilibrium import ExcessiveLoad
 from synth.fem.tool_gesture import ToolMotion, trajectory
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
-from synth.sequence.scenario import Scenario, draw_scenario
+from synth.sequence.scenario import ATTEMPTS, Scenario, draw_scenario
 from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.sequence.series_mechanics import SeriesMechanics
 from synth.system.stopwatch import StageCallback, Stopwatch
@@ -36,7 +37,8 @@ def simulate(
     """Builds sequence `index` of a job and simulates its gestures; nothing is rendered or written yet.
 
     Without `case`, `motions`, `mechanics` and `content` the scene is the one that `synth render` computes for
-    that job and index.
+    that job and index. Gestures whose loads the mesh does not bear are then drawn anew, up to three times,
+    unless the job states the load of an instrument.
 
     Args:
         job: the job, or its file or name as for `load_job`; its `sequences` only limits `index`.
@@ -58,16 +60,27 @@ def simulate(
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
+    ours = mechanics is None and not len(motions)
+    stated = any(one.load or one.force_mn for one in job.fem.instrument_list)
+    left = 0 if case or stated or not ours else ATTEMPTS - 1
     case = case or draw_scenario(job, index)
-    if mechanics is None and not len(motions):
-        refuse_untouched(job, case)
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
-    with watch.stage("mesh"):
-        rest = at_rest(job, index, case=case, content=content)
-    ours = FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics()
-    motion = (mechanics or ours).deform(rest, report, watch)
-    check_deformation(motion, rest.shape, job.frames, len(rest.instruments), "force" in job.stored_fields)
+    mechanics = mechanics or (FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics())
+    while True:
+        if ours:
+            refuse_untouched(job, case)
+        with watch.stage("mesh"):
+            rest = at_rest(job, index, case=case, content=content)
+        try:
+            motion = mechanics.deform(rest, report, watch)
+            break
+        except ExcessiveLoad:
+            if case.attempt >= left:
+                raise
+            case = draw_scenario(job, index, case.attempt + 1)
+    acting = len(rest.instruments) - len(case.idle)
+    check_deformation(motion, rest.shape, job.frames, acting, "force" in job.stored_fields)
     return Scene(**{one.name: getattr(rest, one.name) for one in fields(rest)}, motion=motion)
 
 

@@ -11,6 +11,7 @@ from synth.fem.deformation import Deformation
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera import Camera
 from synth.render.camera.camera_motion import CameraMotion
+from synth.render.idle import IdleInstrument, with_idle
 from synth.render.scene import SceneState
 
 _SUBFRAMES = 4  # pictures averaged over an open shutter
@@ -26,6 +27,7 @@ class Timeline:
     camera_motion: CameraMotion
     light: Lighting
     fps: float
+    idle: tuple[IdleInstrument, ...] = ()
 
     def at(self, frame: float) -> SceneState:
         """The state at a frame, or linearly interpolated between two."""
@@ -39,10 +41,12 @@ class Timeline:
             mixed = values[before] if part == 0 else (1 - part) * values[before] + part * values[after]
             return np.asarray(mixed)
 
+        acting = between(self.motion.tip), between(self.motion.shaft)
+        tips, shafts = with_idle(self.idle, frame / self.fps, *acting)
         return SceneState(
             vertices=self.rest + between(self.motion.displacement),
-            tips=between(self.motion.tip),
-            shafts=between(self.motion.shaft),
+            tips=tips,
+            shafts=shafts,
             camera=self.camera_motion.at(self.camera, frame / self.fps),
             power=self.light.gain(frame / max(last, 1)),
         )

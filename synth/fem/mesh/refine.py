@@ -65,26 +65,21 @@ def bisect(points: Floats, cells: Ints, chosen: Ints) -> tuple[Floats, Ints]:
         marked = closed
 
     split = np.flatnonzero(marked)
-    middle = {(int(a), int(b)): len(points) + i for i, (a, b) in enumerate(pairs[split])}
-    weight = {(int(a), int(b)): int(rank[e]) for e, (a, b) in zip(split, pairs[split], strict=True)}
-    touched = marked[of].any(axis=1)
-    done: list[tuple[int, ...]] = []
-    waiting = [tuple(int(v) for v in cell) for cell in cells[touched]]
-    while waiting:
-        cell = waiting.pop()
-        best, at = -1, (0, 0)
-        for i, j in EDGES:
-            a, b = cell[i], cell[j]
-            order = weight.get((a, b) if a < b else (b, a), -1)
-            if order > best:
-                best, at = order, (int(i), int(j))
-        if best < 0:
-            done.append(cell)
-            continue
-        a, b = cell[at[0]], cell[at[1]]
-        new = middle[(a, b) if a < b else (b, a)]
+    stride = len(points) + len(split)
+    key, touched = pairs[split] @ [stride, 1], marked[of].any(axis=1)
+    done, waiting = [cells[~touched]], cells[touched]
+    while len(waiting):
+        wanted = np.sort(waiting[:, EDGES], axis=2) @ [stride, 1]
+        at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+        order = np.where(key[at] == wanted, rank[split[at]], -1)
+        best, row = order.argmax(axis=1), np.arange(len(waiting))
+        cut = order[row, best] >= 0
+        done.append(waiting[~cut])
+        best, row = best[cut], row[: cut.sum()]
+        new = len(points) + at[cut, best]
         # Putting the midpoint in the place of one end keeps the orientation.
-        waiting.append(tuple(new if v == a else v for v in cell))
-        waiting.append(tuple(new if v == b else v for v in cell))
+        one, other = waiting[cut], waiting[cut]
+        one[row, EDGES[best, 0]] = other[row, EDGES[best, 1]] = new
+        waiting = np.concatenate([one, other])
     halves = 0.5 * (points[pairs[split, 0]] + points[pairs[split, 1]])
-    return np.vstack([points, halves]), np.vstack([cells[~touched], np.array(done, np.int64)])
+    return np.vstack([points, halves]), np.concatenate(done)

@@ -11,54 +11,78 @@ from functools import partial
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Map
-from synth.geometry.triangles import Shape, grid_faces, joined
-from synth.render.anatomy import noise, scenery, tube
+from synth.geometry.triangles import Shape, grid_faces
+from synth.render.anatomy import noise, suture
 from synth.render.anatomy.chart import places
 from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, through
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.anatomy.texture import normals, thickness
+from synth.render.anatomy.texture import normals
 from synth.render.appearance.family import Appearance
 from synth.render.materials import Coat
 
-_AROUND, _OUT = 320, 42  # at most: points around the opening, rings outwards
+_AROUND, _OUT = 240, 24  # at most: points around the opening, rings outwards
 _SEGMENT_PX = 4.0  # least distance of points around in the picture: the mesh is built anew every frame
+_FINE = 8192  # angles at which outlines are read
 _WIDTH_MM = 26.0  # of the rim; the picture ends before
 
 
-class CutEdge:
-    """Cross-section of the dura's cut edge [mm]: rings from its underside over its lip to the fold."""
+class Opening:
+    """The outline: dura pulled tight between stitches; pairs are ranges."""
 
-    lip: float = 0.5  # overhang over the brain
-    inside: tuple[float, ...] = (1.0, 0.96, 0.72, 0.44, 0.2, 0.04)  # its rings, as shares of the lip
-    height: tuple[float, ...] = (-1.8, -0.12, 0.10, 0.26, 0.38, 0.46)  # of its rings over the brain
-    painted: tuple[float, ...] = (-3.0, -1.5, -1.2, -0.95, -0.7, -0.3)  # radii of its rings in the texture
-    fold: tuple[float, float] = 0.12, 0.5  # start of the folded dura: outwards, over the brain
+    stitches: tuple[int, int] = (6, 10)
+    jitter: float = 0.3  # of a stitch along the edge, as a share of the distance to the next
+    pull: tuple[float, float] = 0.97, 1.05  # relative radius at a stitch
+    sag: tuple[float, float] = 0.0, 0.03  # of the edge between two stitches, into the opening
+    corner: float = 0.07  # rad, standard deviation of the corners' rounding
+
+
+class CutEdge:
+    """Cross-section of the dura's thin cut edge [mm]: rings from its underside over its lip to its top."""
+
+    lip: float = 0.35  # overhang over the brain
+    inside: tuple[float, ...] = (1.0, 0.95, 0.65, 0.3, 0.05)  # its rings, as shares of the lip
+    height: tuple[float, ...] = (-1.7, -0.1, 0.08, 0.2, 0.27)  # of its rings over the brain
+    painted: tuple[float, ...] = (-2.6, -1.1, -0.8, -0.5, -0.2)  # radii of its rings in the texture
+    top: tuple[float, float] = 0.12, 0.3  # start of the dura's outer face: outwards, over the brain
+    albedo: Rgb = (0.88, 0.68, 0.62)  # of its section
+    width: float = 0.3
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
 
 
-class FoldedDura:
-    """The dura folded back over the rim [mm]; `width`: mean and spread around the opening, see `_uneven`."""
+class Dura:
+    """The dura around the opening, pulled up at stitches, folded between them [mm]."""
 
-    width: tuple[float, float] = 3.1, 0.7
-    pleats: tuple[float, float] = 3.0, 1.2  # factor of the fold's height, phase of the pleats; no lengths
-    pulled: tuple[float, float] = 1.3, 1.6  # added width at a stitch, and over what distance aside
-    vessel: Rgb = (0.35, 1.0, 0.95)  # absorption of its vessels
+    width: tuple[float, float] = 1.5, 0.9  # mean and spread around the opening, see `_uneven`
+    pulled: tuple[float, float] = 2.6, 2.2  # added width at a stitch, and over what distance aside
+    slope: float = 0.25  # rise outwards
+    tent: tuple[float, float] = 0.7, 1.3  # height at a stitch, and over what distance
+    folds: tuple[float, float, float] = (
+        0.16,
+        2.1,
+        2.8,
+    )  # height, waves per mm aside, reach of those at a stitch
+    soaked: tuple[float, float] = 1.6, 1.1  # its blood by the level, and by chance from place to place
 
 
 class Wound:
-    """Gutter behind the dura, and the wall beyond that rises in two steps [mm]."""
+    """Gutter behind the dura, and the wall of galea and muscle beyond it [mm]."""
 
-    gutter: tuple[float, float] = 1.7, 0.6  # width: mean and spread
-    floor: float = 1.3  # height over the brain
-    rise: tuple[float, float] = 1.5, 0.8  # height of the first and second step
-    first: float = 0.4  # from the wall's foot to the first step
-    second: tuple[float, float] = 2.4, 0.7  # to the second step: mean and spread
-    shadow: Rgb = (0.8, 1.1, 1.1)  # absorption that darkens the gutter
-    fat: Rgb = (0.72, 0.46, 0.22)  # albedo
-    blood: Rgb = (0.26, 2.4, 2.8)  # absorption
+    gutter: tuple[float, float] = 1.2, 0.7  # width: mean and spread
+    floor: float = 0.9  # height over the brain
+    rise: float = 2.0  # of the wall
+    shadow: Rgb = (0.6, 0.9, 0.9)  # absorption that darkens the gutter
+    blood: Rgb = (0.3, 1.7, 2.1)  # absorption
+
+
+class Skin:
+    """Skin behind the wound's wall, stained with blood towards it."""
+
+    away: tuple[float, float] = 4.5, 2.0  # behind the wall's foot: mean and spread
+    albedo: Rgb = (0.68, 0.44, 0.31)
 
 
 class Bone:
@@ -86,11 +110,12 @@ class Rim:
     uv: Map  # (V, 2)
     extent_mm: float  # side of the square that uv spans
     edge: Floats  # (A,) mm: radius of the opening's edge at even angles
-    cotton: bool  # whether the texture's unused middle has the felt of patties over the edge
-    stitches: Floats  # (n,) rad: angles of threads that hold the dura
-    dura: Floats  # (A,) mm beyond the edge: end of the folded dura, start of the gutter
+    stitches: Floats  # (n,) rad: angles of the outline's corners
+    threads: bool  # whether threads hold them
+    dura: Floats  # (A,) mm beyond the edge: end of the dura, start of the gutter
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
     bone: bool  # whether the wall is of bone, else of muscle
+    skin: Floats  # (A,) mm beyond the edge: start of the skin
     cloth: Floats  # (A,) mm beyond the edge: start of the drapes; empty without drapes
 
 
@@ -98,76 +123,58 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` resolve."""
     rng = np.random.default_rng([appearance.rim_seed, 0])
     around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
-    part = np.linspace(0, 1, round(_OUT * around / _AROUND))
+    part = np.linspace(0, 1, round(_OUT * (around / _AROUND) ** 0.5))
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
-    edge = radius_mm * _outline(rng, angle)
+    stitches, relative = _outline(rng, angle)
+    edge = radius_mm * relative
     out = _WIDTH_MM * (0.4 * part + 0.6 * part**3)
-    away = np.concatenate([-CutEdge.lip * np.array(CutEdge.inside), out + CutEdge.fold[0]])
-    up = np.concatenate([CutEdge.height, CutEdge.fold[1] + 0.05 * out])
+    away = np.concatenate([-CutEdge.lip * np.array(CutEdge.inside), out + CutEdge.top[0]])
+    up = np.concatenate([CutEdge.height, CutEdge.top[1] + 0 * out])
     away = np.broadcast_to(away, (around, len(away)))
     xy = _places(angle, edge[:, None] + away)
     flat = xy.reshape(-1, 2)
     extent = 2 * (radius_mm * 1.25 + _WIDTH_MM)
-
-    def sampled(image: Map) -> Map:
-        return noise.sample(image, flat, extent).reshape(away.shape)
-
-    folds = 0.2 * noise.band(rng, 256, extent, 6.5, 0.5) + 0.05 * noise.band(rng, 256, extent, 1.8, 0.5)
-    z = _under(surface, flat).reshape(away.shape) + up
-    z += np.clip(away - 0.1, 0, 3.0) / 3.0 * sampled(folds)
-    stitches = scenery.stitches(edge, rng)
-    if appearance.family == "calf":  # the dura of a specimen is not sewn back
-        stitches = stitches[:0]
-    asides = [scenery.aside(angle, stitch)[:, None] * float(edge.mean()) for stitch in stitches]
-    wider, within = FoldedDura.pulled
-    dura = _uneven(rng, angle, *FoldedDura.width)
-    dura = dura + sum(wider * ridge(aside[:, 0], within) for aside in asides)
+    lumps = noise.sample(noise.band(rng, 256, extent, 3.5, 0.6), flat, extent).reshape(away.shape)
+    asides = np.stack([suture.aside(angle, stitch) for stitch in stitches]) * float(edge.mean())
+    dura = _uneven(rng, angle, *Dura.width) + Dura.pulled[0] * ridge(asides, Dura.pulled[1]).max(axis=0)
     wall = dura + _uneven(rng, angle, *Wound.gutter)
+    skin = wall + _uneven(rng, angle, *Skin.away)
     cloth = wall + _uneven(rng, angle, *Drape.away) if "drape" in appearance.scenery else np.zeros(0)
-    beyond = step((away - dura[:, None]) / 0.35 - 0.4)
-    z += _folded(away, dura[:, None], _uneven(rng, angle, *FoldedDura.pleats)[:, None], asides) * (1 - beyond)
     bone = "bone" in appearance.scenery
-    steps = wall + Wound.first, wall + _uneven(rng, angle, *Wound.second)
-    risen = sum(high * step((away - at[:, None]) / 0.7) for at, high in zip(steps, Wound.rise, strict=True))
-    lumps = sampled(noise.band(rng, 256, extent, 2.6, 0.6))
-    lumpy = (0.12 if bone else 0.4) * np.minimum(risen, 1) * lumps
-    z += beyond * (Wound.floor - CutEdge.fold[1] + risen + lumpy)
+    high, reach = Dura.tent
+    tents = high * ridge(asides[..., None], reach).max(axis=0) * ridge(away, at=0.8, width=reach)
+    outer = np.clip(away, 0, None)
+    raised = np.where(away > 0, tents + Dura.slope * outer + 0.15 * np.minimum(outer, 1) * lumps, 0)
+    beyond = step((away - dura[:, None]) / 0.5 - 0.4)
+    wound = Wound.floor - CutEdge.top[1] + Wound.rise * step((away - wall[:, None]) / 2.5 - 0.3)
+    wound = wound + (0.1 if bone else 0.25) * lumps
     if len(cloth):
-        z += step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
+        wound = wound + step((away - cloth[:, None]) / 1.2 - 0.5) * (1.0 + 0.7 * lumps)
+    z = _under(surface, flat).reshape(away.shape) + up + over(raised, wound, beyond)
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     painted = edge[:, None] + np.concatenate([CutEdge.painted, away[0, len(CutEdge.painted) :]])[None]
     faces = grid_faces(around, away.shape[1], "rows").reshape(-1, 3)
-    parts = [(vertices, faces, _places(angle, painted).reshape(-1, 2))]
-    cotton = "cottonoid" in appearance.scenery
-    if cotton:
-        # Their felt is painted in the middle of the maps, which the opening leaves free.
-        parts += scenery.patties(edge, np.concatenate([surface.vertices, vertices]), rng)
-    uv = (np.concatenate([place for *_, place in parts]) / extent + 0.5).astype(np.float32)
-    mesh = joined(*(Shape(vertices, faces) for vertices, faces, _ in parts))
-    return Rim(mesh, uv, extent, edge, cotton, stitches, dura, wall, bone, cloth)
+    uv = (_places(angle, painted).reshape(-1, 2) / extent + 0.5).astype(np.float32)
+    threads = appearance.family != "calf"  # the dura of a specimen is not sewn back
+    return Rim(Shape(vertices, faces), uv, extent, edge, stitches, threads, dura, wall, bone, skin, cloth)
 
 
 def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
     """Maps of the rim, `pixels` on a side."""
     rng = np.random.default_rng([appearance.rim_seed, 1])
     extent = rim.extent_mm
-    wide = noise.fractal(rng, pixels, extent, 8.0, 2.6)
-    mottle = noise.fractal(rng, pixels, extent, 2.2, 2.3)
-    grain = noise.fractal(rng, pixels, extent, 0.6, 1.6)
-    streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
-    swell = noise.band(rng, pixels, extent, 1.4, 0.5)
+
+    def drawn(longest_mm: float, slope: float, extent_mm: float = extent) -> Map:
+        coarse = noise.fractal(rng, min(512, pixels), extent_mm, longest_mm, slope)
+        return np.asarray(cv2.resize(coarse, (pixels, pixels)), np.float32)
+
     axis = noise.centres(pixels, extent)
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
-    vessels = tube.raster(scenery.dural_vessels(rim.edge, rng), pixels, extent)
-    maps = [x, y, wide, mottle, grain, swell, *vessels]
-    if rim.cotton:
-        ragged = noise.fractal(rng, pixels, 60.0, 1.5, 1.5)
-        weave = noise.band(rng, pixels, 60.0, 0.5, 0.5)
-        maps += [ragged, weave, noise.fractal(rng, pixels, 60.0, 4.0, 2.0)]
+    maps = [x, y, drawn(9.0, 2.4), drawn(2.5, 2.2), drawn(0.6, 1.4)]
+    streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
     colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, streaks), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
-    bent = normals(noise.blur(bumps.astype(np.float32), 0.2, extent), extent)
-    return Coat(colour, bent, dry.astype(np.float32))
+    return Coat(colour, normals(noise.blur(bumps, 0.15, extent), extent), dry)
 
 
 def shade(rim: Rim, surface: CortexSurface) -> Map:
@@ -185,8 +192,9 @@ def inside(rim: Rim, x: Map, y: Map) -> Map:
 def _round(values: Floats, angle: Map) -> Map:
     """Values (A,) at even angles, interpolated at angles (...) rad."""
     closed = np.append(values, values[0])
-    even = np.linspace(0, 2 * np.pi, len(closed))
-    return np.asarray(np.interp(angle % (2 * np.pi), even, closed), np.float32)
+    table = np.interp(np.arange(_FINE) * (len(values) / _FINE), np.arange(len(closed)), closed)
+    at = np.asarray(angle * (_FINE / (2 * np.pi)), np.int32) % _FINE
+    return np.asarray(table.astype(np.float32)[at])
 
 
 def _places(angle: Floats, radius: Floats) -> Floats:
@@ -194,17 +202,25 @@ def _places(angle: Floats, radius: Floats) -> Floats:
     return np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None]], axis=-1)
 
 
-def _outline(rng: np.random.Generator, angle: Floats) -> Floats:
-    """Relative radius of an opening cut by hand: between a circle and a rounded polygon, ragged."""
-    corners = int(rng.integers(5, 8))
-    part = 2 * np.pi / corners
-    phase = (angle + rng.uniform(0, part)) % part - part / 2
-    polygon = np.cos(part / 2) / np.cos(phase)
-    shape = 0.65 + 0.35 * polygon / polygon.mean()
-    # Spread of each wave's amplitude, as a share of the radius: slow deviations, then a ragged cut.
-    for order, spread in [(n, 0.045 / n) for n in range(2, 9)] + [(n, 0.0010) for n in range(12, 40)]:
-        shape += rng.normal(0, spread) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
-    return np.asarray(shape)
+def _outline(rng: np.random.Generator, angle: Floats) -> tuple[Floats, Floats]:
+    """Angles (n,) rad of stitches, and the relative radius (A,) of an opening of mean 1 pulled tight between
+    them: a polygon whose sides sag inwards."""
+    count = int(rng.integers(*Opening.stitches))
+    at = np.arange(count) + rng.uniform(-Opening.jitter, Opening.jitter, count)
+    at = rng.uniform(0, 2 * np.pi) + at * 2 * np.pi / count
+    pull, sag = rng.uniform(*Opening.pull, count), rng.uniform(*Opening.sag, count)
+    ahead = (angle - at[0]) % (2 * np.pi)
+    side = np.searchsorted(at - at[0], ahead, side="right") - 1
+    after = (side + 1) % count
+    whole, past = (at[after] - at[side]) % (2 * np.pi), ahead - (at - at[0])[side]
+    line = pull[side] * pull[after] * np.sin(whole)
+    line /= pull[side] * np.sin(past) + pull[after] * np.sin(whole - past)
+    line *= 1 - 4 * sag[side] * (past / whole) * (1 - past / whole)
+    round_mm = Opening.corner * len(angle) / (2 * np.pi)
+    line = gaussian_filter1d(line, round_mm, mode="wrap")
+    for order in range(9, 40):  # cut by hand
+        line += rng.normal(0, 0.0012) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
+    return np.sort(at % (2 * np.pi)), line / line.mean()
 
 
 def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float) -> Floats:
@@ -215,46 +231,42 @@ def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
     return np.maximum(wave, 0.35 * mean)
 
 
-def _folded(away: Floats, dura: Floats, pleats: Floats, asides: list[Floats]) -> Floats:
-    """Height (A, R) mm of the folded dura: its fold, pleats, free end, and rays and tents at stitches; all in
-    mm: `away` from the edge, `dura` its end, `asides` from each stitch."""
-    raised = 0.11 * pleats * ridge(away, at=0.8, width=0.5)
-    raised += 0.2 * np.sin(3.2 * away + 2 * pleats) * np.clip(away - 0.8, 0, 1)
-    # It leans against the wall: its free end is the highest, and curls.
-    raised += 0.36 * np.clip(away, 0, None) + 0.35 * ridge(away - dura, at=-0.3, width=0.28)
-    for aside in asides:
-        raised += 0.2 * np.cos(aside * 3.6) * ridge(aside, width=2.4) * np.clip(away / 1.5, 0, 1)
-        raised += 0.55 * np.exp(-((aside / 1.2) ** 2) - ((away - 1.0) / 1.3) ** 2)
-    return np.asarray(np.where(away > 0, raised, 0.0))
-
-
 def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Albedo (r, n, 3), bumps mm and dry share (r, n) of some rows of the maps; see `paint` for `maps`."""
-    x, y, wide, mottle, grain, swell, distance, radius, *cotton = maps
-    angle = np.arctan2(y, x)
+    x, y, wide, mottle, grain = maps
+    angle, mean = np.arctan2(y, x), float(rim.edge.mean())
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     reach, past = _round(rim.dura, angle), away - _round(rim.wall, angle)
-    fibres = _fibres(streaks, angle, away, float(rim.edge.mean()))
-    outer = step((away - reach) / 0.3 + 0.2 * mottle)
-    gutter = outer * (1 - step(past / 0.9 + 0.25 * mottle))
-    bumps = 0.035 * mottle + 0.006 * swell
-    beyond = _muscle(appearance, past, mottle, grain)
+    fibres = _fibres(streaks, angle, away, mean)
+    outer = step((away - reach) / 0.3 + 0.25 * mottle)
+    gutter = outer * (1 - step(past / 1.5 + 0.3 * mottle))
+    stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
+    aside = suture.aside(angle, rim.stitches.astype(np.float32)[stitch])
+    folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
+    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer)
+    dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain)
+    section = np.clip(0.6 + 0.3 * wide + 0.2 * mottle, 0, 0.85) * ridge(away, width=CutEdge.width)
+    dura = through(dura, soaked * (1 - 0.7 * section), Wound.blood)
+    colour = over(dura, np.asarray(CutEdge.albedo, np.float32), section[..., None])
+    beyond = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.08 * fibres)
     if rim.bone:
         beyond = _bone(beyond, past, mottle, grain)
-        bumps *= np.where(past > 0.6, 0.4, 1.0).astype(np.float32)
-    colour = over(_dura(appearance, fibres, mottle, grain, distance, radius), beyond, outer[..., None])
-    if not rim.bone:
-        fat = 0.7 * step(wide * 1.5 - 1.4 + 0.4 * mottle) * step(past)
-        colour = over(colour, speckled(Wound.fat, 0.10 * grain), fat[..., None])
-    blood = _blood(appearance.blood, 0.8 * wide + 0.25 * mottle + 0.3 * fibres, gutter)
-    colour = _shadowed(through(colour, blood, Wound.blood), away, reach, past, gutter)
-    dry = np.clip(0.55 + 0.3 * wide - 0.8 * blood - 0.5 * gutter, 0.02, 1)
+    skin = step((away - _round(rim.skin, angle)) / 1.5 + 0.25 * mottle) * (not rim.bone)
+    stained = np.clip(appearance.blood * (1.3 - 0.25 * past) + 0.2 * mottle + 0.4 * wide, 0, 1.5)
+    pale = through(speckled(Skin.albedo, 0.04 * mottle, 0.03 * grain), stained, Wound.blood)
+    beyond = over(through(beyond, 0.25 * soaked, Wound.blood), pale, skin[..., None])
+    colour = over(colour, beyond, outer[..., None])
+    colour = through(colour, np.clip(-away - 1.2, 0, 1), CutEdge.shadow)
+    colour = through(
+        colour, gutter + 0.5 * ridge(away - reach, width=0.4) - 1.5 * np.minimum(folds, 0), Wound.shadow
+    )
+    bumps = folds + 0.025 * mottle + 0.006 * grain
+    dry = np.clip(0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin, 0.05, 1)
     if len(rim.cloth):
         cloth = away - _round(rim.cloth, angle)
         colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
-    colour, bumps = scenery.threaded(rim.stitches, angle, away, float(rim.edge.mean()), colour, bumps)
-    if rim.cotton:
-        colour, bumps = scenery.with_felt(x, y, cotton, appearance.blood, colour, bumps)
+    if rim.threads:
+        colour, bumps = suture.threaded(aside * (mean + away), away, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 
@@ -266,19 +278,19 @@ def _fibres(streaks: Map, angle: Map, away: Map, radius: float) -> Map:
     return np.asarray(cv2.remap(streaks, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.float32)
 
 
-def _dura(appearance: Appearance, fibres: Map, mottle: Map, grain: Map, distance: Map, radius: Map) -> Map:
-    """Albedo of the folded dura, with its vessels and the redder margin along them."""
-    margin = 0.35 * np.exp(-np.maximum(distance - radius, 0) / 0.25) * np.clip(radius / 0.2, 0, 1)
-    blood = 4.5 * thickness((distance, radius)) + margin
-    pale = speckled(appearance.dura_albedo, 0.05 * fibres, 0.05 * mottle, 0.02 * grain)
-    return through(pale, blood, FoldedDura.vessel)
+def _folds(aside: Map, away: Map, mottle: Map) -> Map:
+    """Height (r, n) mm of the dura's folds, which run outwards, by the distance `aside` mm from a stitch."""
+    high, waves, reach = Dura.folds
+    wave = np.cos(2 * np.pi / waves * aside + 0.8 * mottle)
+    return np.asarray(high * wave * ridge(aside, reach) * np.clip(away / 0.8, 0, 1), np.float32)
 
 
-def _muscle(appearance: Appearance, past: Map, mottle: Map, grain: Map) -> Map:
-    """Albedo of cut muscle with its strands, and of pale fascia at the wall's edge."""
-    strands = speckled(appearance.surroundings_albedo, 0.18 * mottle, 0.04 * grain)
-    fascia = 0.45 * ridge(past - 1.0 - 0.3 * mottle, width=0.3)[..., None]
-    return np.asarray(over(strands, np.asarray(appearance.dura_albedo), fascia), np.float32)
+def _soaked(level: float, uneven: Map) -> Map:
+    """Optical depth (r, n) of blood at a level from 0 (none) to 1 (soaked), by `uneven` noise."""
+    by_level, by_chance = Dura.soaked
+    return np.asarray(
+        np.log1p(np.exp(2.5 * (by_level * level - 1.0 + by_chance * uneven))) * min(0.4, 4 * level)
+    )
 
 
 def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
@@ -288,20 +300,6 @@ def _bone(beyond: Map, past: Map, mottle: Map, grain: Map) -> Map:
     cut = 0.6 * ridge(past, at=0.35, width=0.25)[..., None]
     bone = over(compact, speckled(Bone.spongy, 0.25 * grain), cut)
     return np.asarray(over(beyond, bone, step((3.9 + 0.5 * mottle - past) / 0.6)[..., None]), np.float32)
-
-
-def _blood(level: float, uneven: Map, gutter: Map) -> Map:
-    """Optical depth (r, n) of blood at a level from 0 (none) to 1 (soaked): uneven, most in the gutter."""
-    gathered = 2.4 * level - 1.9 + uneven + (0.3 + 2.6 * level) * gutter
-    return np.asarray((0.02 + 0.4 * np.log1p(np.exp(2.0 * gathered))) * min(1.0, 8 * level))
-
-
-def _shadowed(colour: Map, away: Map, reach: Map, past: Map, gutter: Map) -> Map:
-    """Albedo with a pale thin lip, darkened under the lip, in the gutter, and most at its two borders."""
-    pale = colour * (1 + 0.12 * ridge(away, at=-0.1, width=0.35)[..., None])
-    crevice = np.minimum(np.abs(away - reach - 0.25), np.abs(past) + 0.1)
-    lost = 0.7 * gutter + 0.8 * ridge(crevice, width=0.3)
-    return through(through(pale, np.clip(-away - 1.5, 0, 1), CutEdge.shadow), lost, Wound.shadow)
 
 
 def _draped(

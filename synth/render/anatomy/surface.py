@@ -26,8 +26,8 @@ MARGIN_MM = 5.0
 LEAST_FILLED = 0.65
 """Least share of the patch that a user's brain has to fill."""
 _RELIEF_PX = 512
-_BULGE_PX = 1024
 _BED = 0.5  # depth of the groove under a vein of 0.8 mm radius, as a share of a sulcus's
+_DIP = 0.5  # share of a vein's height that an artery of 0.25 mm radius takes where it crosses
 _ROUND = 1.2  # 1: gyri are half waves; more: narrower clefts between flatter crowns
 
 
@@ -87,7 +87,7 @@ def grow(
     chart = unroll(height, extent, anatomy.craniotomy.radius_mm + MARGIN_MM / 2)
     tree = vessels.Vessels(*(replace(one, nodes=chart.at(one.nodes)) for one in vars(tree).values()))
     laid = chart.at(xy)
-    z = pia + veined * noise.sample(bulge(tree.veins, chart.extent_mm), laid, chart.extent_mm)
+    z = pia + veined * noise.sample(bulge(tree, chart.extent_mm), laid, chart.extent_mm)
     return CortexSurface(
         vertices=np.concatenate([xy, z[:, None]], axis=1),
         faces=grid_faces(side, side).reshape(-1, 3),
@@ -101,11 +101,14 @@ def grow(
     )
 
 
-def bulge(tree: Tree, extent_mm: float) -> Map:
-    """Height of vessels above the pia, (n, n) mm: half sunk round tubes with soft shoulders."""
-    distance, radius = tube.raster(tree, _BULGE_PX, extent_mm)
+def bulge(grown: Vessels, extent_mm: float) -> Map:
+    """Height of veins above the pia, (n, n) mm: half sunk round tubes with soft shoulders, pressed in where
+    arteries cross them."""
+    distance, radius = tube.raster(grown.veins, _RELIEF_PX, extent_mm, 0.1)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    return noise.blur(inside.astype(np.float32), 0.2, extent_mm)
+    distance, radius = tube.raster(grown.arteries, _RELIEF_PX, extent_mm, 0.1)
+    pressed = _DIP * np.clip(radius / 0.25, 0, 1) * (distance < radius + 0.1)
+    return noise.blur((inside * (1 - pressed)).astype(np.float32), 0.2, extent_mm)
 
 
 def _folds(relief: Relief, extent_mm: float) -> Map:
@@ -125,9 +128,10 @@ def _folds(relief: Relief, extent_mm: float) -> Map:
 
 def _beds(veins: Tree, extent_mm: float) -> Map:
     """Grooves of wide veins where they cross a gyrus, (n, n) from 0 to 1 as the sulci."""
-    distance, radius = tube.raster(veins, _RELIEF_PX, extent_mm)
+    distance, radius = tube.raster(veins, _RELIEF_PX // 4, extent_mm, 3.6)
     bed = _BED * np.clip(radius / 0.8, 0, 1) * np.exp(-((distance / 1.8) ** 2))
-    return noise.blur(bed.astype(np.float32), 0.3, extent_mm)
+    bed = noise.blur(bed.astype(np.float32), 0.3, extent_mm)
+    return np.asarray(cv2.resize(bed, (_RELIEF_PX, _RELIEF_PX)), np.float32)
 
 
 def _under_opening(brain: Shape, relief: Relief, extent: float) -> tuple[Map, Map]:
@@ -177,3 +181,21 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
         window = height[y0 : y1 + 1, x0 : x1 + 1]
         height[y0 : y1 + 1, x0 : x1 + 1] = np.fmax(window, z)
     return height
+
+
+def shrunk(
+    section: schema.AnatomySection, relief: Relief, scale: float
+) -> tuple[schema.AnatomySection, Relief]:
+    """Section and relief of a procedural surface that `resized` by a scale takes to the wanted one."""
+    opening = {"radius_mm": section.craniotomy.radius_mm / scale}
+    small = {"craniotomy": section.craniotomy.model_copy(update=opening), "dome_mm": section.dome_mm / scale}
+    lower = replace(relief, gyrus_mm=relief.gyrus_mm / scale, sulcus_mm=relief.sulcus_mm / scale)
+    return section.model_copy(update=small), lower
+
+
+def resized(surface: CortexSurface, factor: float) -> CortexSurface:
+    """A surface of another size; chart and vessels, which it is painted by, stay as they were grown."""
+    if factor == 1:
+        return surface
+    vertices, pia = factor * surface.vertices, factor * surface.pia
+    return replace(surface, vertices=vertices, pia=pia, extent_mm=factor * surface.extent_mm)

@@ -52,18 +52,18 @@ class Sulcus:
 class Bleeding:
     """Blood under the arachnoid, ragged and thin at its edges; pairs are ranges."""
 
-    count: float = 3.5  # mean on a patch whose rim is soaked with blood
-    radius: tuple[float, float] = 0.4, 1.6
-    depth: tuple[float, float] = 0.3, 0.9  # optical
-    blood: Rgb = (0.12, 1.5, 2.3)  # absorption
+    count: float = 1.2  # mean on a patch whose rim is soaked with blood
+    radius: tuple[float, float] = 0.3, 1.2
+    depth: tuple[float, float] = 0.5, 1.3  # optical
+    blood: Rgb = (0.2, 1.9, 2.5)  # absorption
 
 
 class Artery:
     """Blood that absorbs most green light even in the finest arteries, and an opaque wall of wide ones."""
 
     absorption_per_mm: Rgb = (0.4, 5.6, 7.6)
-    opaque: tuple[float, float] = 0.30, 0.16  # depth that even fine ones reach, and the chord for 63% of it
-    wall: Rgb = (0.7, 0.13, 0.075)  # albedo
+    opaque: tuple[float, float] = 0.26, 0.11  # depth that even fine ones reach, and the chord for 63% of it
+    wall: Rgb = (0.7, 0.17, 0.1)  # albedo
     wide: tuple[float, float] = 0.16, 0.24  # radius of the first opaque walls, and span to fully opaque ones
 
 
@@ -142,7 +142,8 @@ def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, exte
     mottle = noise.fractal(rng, 256, extent, 3.0, 1.3)
     pale = np.clip(0.62 + 0.42 * wide + 0.04 * mottle, 0, 1)
     pale = cv2.resize(pale, (pixels, pixels), interpolation=cv2.INTER_CUBIC)[..., None]
-    grain = noise.fractal(rng, pixels, extent, 0.35, 1.2)
+    grain = noise.fractal(rng, min(pixels, 640), extent, 0.35, 1.2)
+    grain = cv2.resize(grain, (pixels, pixels))
     chords = {name: thickness(drawn) for name, drawn in tubes.items()}
     around = noise.blur(chords["arteries"], Parenchyma.perivascular[0], extent)
     around = around + noise.blur(chords["veins"], Parenchyma.perivascular[1], extent)
@@ -160,10 +161,10 @@ def _painted(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, exte
 
 
 def _paint_rows(appearance: Appearance, *maps: Map) -> tuple[Map]:
-    """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 7 of veins, 3 of arteries."""
+    """Albedo (r, n, 3) of some rows of maps: 6 of tissue, strands, bleedings, 5 of veins, 3 of arteries."""
     tissue = _with_clefts(appearance, _parenchyma(appearance, *maps[:6]), sulci=maps[2], strands=maps[6])
-    veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:15])
-    return (_with_arteries(appearance, veined, *maps[15:]),)
+    veined = _veined(appearance, through(tissue, maps[7], Bleeding.blood), *maps[8:13])
+    return (_with_arteries(appearance, veined, *maps[13:]),)
 
 
 def _parenchyma(
@@ -194,7 +195,7 @@ def _with_clefts(appearance: Appearance, albedo: Map, sulci: Map, strands: Map) 
 
 def _strands(rng: Random, sulci: Map, extent: float) -> Map:
     """Share (n, n) covered by the arachnoid's fibres over clefts: thin lines."""
-    small = 512
+    small = 384
     wave = noise.band(rng, small, extent, 1.6, 0.4)
     slope = np.hypot(*np.gradient(wave, extent / small)).astype(np.float32)
     line = ridge(wave / np.maximum(slope, 0.5), width=0.07)
@@ -204,7 +205,7 @@ def _strands(rng: Random, sulci: Map, extent: float) -> Map:
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
     """Optical depth (n, n) of a few small bleedings."""
-    small = 512
+    small = 256
     axis = noise.centres(small, extent)
     ragged = noise.fractal(rng, small, extent, 2.5, 1.7)
     total = np.zeros((small, small), np.float32)
@@ -212,7 +213,7 @@ def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
         x, y = rng.uniform(-0.4, 0.4, 2) * extent
         radius, depth = rng.uniform(*Bleeding.radius), rng.uniform(*Bleeding.depth)
         away = np.hypot(axis[None] - x, axis[:, None] - y) / radius
-        total += depth * np.clip(1.25 - away + 0.3 * ragged, 0, 1).astype(np.float32)
+        total += depth * np.clip(2.5 * (1 - away + 0.35 * ragged), 0, 1).astype(np.float32)
     return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
@@ -223,24 +224,21 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     across = np.asarray(np.clip(distance / np.maximum(radius, 1e-3), 0, 1), np.float32)
     start, span = Vein.wide
     thick = np.clip((radius - start) / span, 0, 1)
-    along = cv2.resize(noise.band(rng, 256, extent, 9.0, 0.6), size)
-    streak = cv2.resize(noise.fractal(rng, 1024, extent, 1.5, 1.0), size)
+    along = cv2.resize(noise.band(rng, 96, extent, 9.0, 0.6), size)
     cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.05, extent)
     margin = noise.blur(((across < 1) * thick).astype(np.float32), Vein.margin, extent)
-    # Some stretches lie deeper, under the arachnoid.
-    depth = cv2.resize(noise.band(rng, 256, extent, 7.0, 0.6), size)
-    return [across, thick, along, streak, cover, margin, depth]
+    return [across, thick, along, cover, margin]
 
 
 def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their veins, by the maps of `_vein_maps`."""
-    across, thick, along, streak, cover, margin, depth = maps
-    crest = np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.55)
-    crest = np.clip(crest * (1 + 0.12 * streak), 0, 1)[..., None]
+    across, thick, along, cover, margin = maps
+    crest = (np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.7))[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
-    cover = cover[..., None] * np.clip(0.9 + 0.15 * depth, 0.5, 0.97)[..., None]
+    # Some stretches lie deeper, under the arachnoid.
+    cover = (cover * np.clip(0.9 + 0.15 * along, 0.5, 0.97))[..., None]
     return np.asarray(over(through(albedo, 1.7 * margin, Vein.margin_dark), wall, cover), np.float32)
 
 
@@ -261,7 +259,7 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
 
 def _film(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent: float) -> tuple[Map, Map]:
     """Height of the wet surface above the mesh [mm], and the share of it under too thin a film, 0 to 1."""
-    coarse = 512
+    coarse = 256
     relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
     relief = noise.blur(relief, appearance.fluid_smoothing_mm, extent)
     pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)

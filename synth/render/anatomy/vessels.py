@@ -1,46 +1,58 @@
-"""Vessels of the pia: veins and arteries from trunks along the sulci down to the finest arterioles.
+"""Vessels of the pia: veins along the sulci, arteries from trunks that cross the patch down to arterioles.
 
-All numbers were chosen by eye on an intra-operative photograph.
+Densities and calibres were compared with an intra-operative photograph (`evidence.render.vessels`); the other
+numbers were chosen by eye on it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Map
+from synth.arrays import Floats, Ints, Map
 from synth.render.anatomy import noise, tube
-from synth.render.anatomy.tree import Tree, grow, murray, pruned, relaxed, scattered, taper
+from synth.render.anatomy.tree import Lattice, Tree, halved, joined, lattice, least_cost, relaxed, remaining
 
-_STIFF_MM = 0.15  # radius of a vessel that winds half as far as the finest
-_PATCH_MM = 34.0  # side of the patch that `Kind.trunks` are counted on
-_GRID = 72  # side of the grid on which trunks are routed
-_SHORTEST = 8  # steps of a trunk: a shorter one joins another vessel at once and is dropped
+_PATCH_MM = 34.0  # side of the patch that numbers of trunks are counted on
+_FINEST_MM = 0.2  # spacing of the points that vessels pass
+_MOST = 160  # of them along a side
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Growth of one kind of vessel; lengths in mm."""
+    """One kind of vessel; lengths in mm, pairs are ranges."""
 
-    trunks: tuple[int, int]  # least number, and one more than the largest
-    radius: tuple[float, float]  # of a trunk
-    smooth: int  # rounds of smoothing over a trunk: thick vessels bend in wider curves
-    wiggle: float  # share of a trunk's short bends
-    spacings: tuple[float, ...]  # of the branches of each round
-    leaf: float  # radius of the finest: Murray's law gives the others'
-    wander: float  # random part of a step's direction
-    settle: float = 0.0  # shift of a trunk into its cleft, per round of smoothing
-    winding: float = 0.0  # amplitude of bends
+    roots: tuple[int, int]  # trunks that enter at the patch's border
+    through: tuple[int, int]  # trunks that leave it on the other side
+    inside: tuple[int, int]  # trunks that come up from a sulcus inside
+    trunk: tuple[float, float]  # radius of those where they leave
+    coarse: float  # spacing of points, as a multiple of the finest's
+    spacing: float  # of ends
+    end: tuple[float, float]  # radius of the finest
+    crown: float  # cost of a way over a gyrus, as a multiple of one along a sulcus
+    chance: float  # spread of the logarithm of ways' costs: more winds more
+    sharing: float  # see `least_cost`
+    stiff: float  # radius of vessels that are smoothed fully
+    taper: float  # length over which ends thin to nothing
+    bends: tuple[float, float]  # shift of a fine vessel over 2 mm, of every vessel over 9 mm
+    loops: float = 0.0  # share of ends that join another vessel
 
 
-VEINS = Kind((1, 4), (0.55, 1.2), 60, 0.0, (9.0, 5.5), 0.1, 0.3, settle=0.1)
-ARTERIES = Kind((4, 7), (0.2, 0.4), 40, 0.12, (5.2, 2.6, 1.3, 0.7, 0.46), 0.042, 0.25, winding=0.1)
-DEEP = Kind((3, 4), (0.1, 0.2), 18, 0.2, (3.6, 1.9), 0.05, 0.35)  # coarser than the finest of the pia
+VEINS = Kind(
+    roots=(1, 3), through=(2, 4), inside=(0, 1), trunk=(0.45, 0.95), coarse=2.5, spacing=5.0,
+    end=(0.06, 0.11), crown=3.0, chance=0.9, sharing=0.4, stiff=0.25, taper=3.0, bends=(0.25, 0.5),
+)  # fmt: skip
+ARTERIES = Kind(
+    roots=(2, 5), through=(2, 4), inside=(2, 5), trunk=(0.2, 0.38), coarse=1.0, spacing=0.62,
+    end=(0.024, 0.045), crown=0.7, chance=1.0, sharing=0.2, stiff=0.3, taper=2.4, bends=(0.14, 0.35),
+    loops=0.05,
+)  # fmt: skip
+DEEP = Kind(
+    roots=(2, 4), through=(2, 3), inside=(0, 1), trunk=(0.08, 0.15), coarse=2.0, spacing=2.4,
+    end=(0.05, 0.08), crown=1.0, chance=0.8, sharing=0.3, stiff=0.3, taper=3.0, bends=(0.2, 0.5),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -54,145 +66,77 @@ class Vessels:
 
 def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     """Vessels of a square patch, along its sulci (n, n): 0 on a crown to 1 in a sulcus."""
-    veins = _branched(VEINS, _trunks(VEINS, sulci, extent_mm, rng), extent_mm, rng)
-    trunks = _trunks(ARTERIES, sulci, extent_mm, rng)
+    everywhere = np.ones((8, 8), np.float32)
+    veins = _grown(VEINS, sulci, everywhere, extent_mm, rng)
     # The density of arteries varies between gyri, and is 0 on a wide vein.
-    rich = 0.9 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5)
+    rich = np.clip(0.8 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5), 0.15, 1.0)
     distance, width = tube.raster(veins, 128, extent_mm)
-    rich = np.clip(rich, 0.3, 1.0) * ((distance > width + 0.3) | (width < 0.3))
-    arteries = _branched(ARTERIES, trunks, extent_mm, rng, np.asarray(rich, np.float32))
-    deep = _branched(DEEP, _trunks(DEEP, sulci, extent_mm, rng), extent_mm, rng)
-    return Vessels(veins, arteries, deep)
+    rich *= (distance > width + 0.3) | (width < 0.3)
+    arteries = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
+    return Vessels(veins, arteries, _grown(DEEP, sulci, everywhere, extent_mm, rng))
 
 
-def _trunks(kind: Kind, sulci: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
-    """Paths across the square along the sulci.
-
-    A path that meets an earlier one ends there and springs from it: vessels join, they don't cross.
-    """
-    count = round(extent_mm / _PATCH_MM * rng.integers(*kind.trunks))
-    depth = cv2.resize(sulci, (_GRID, _GRID), interpolation=cv2.INTER_AREA)
-    across, along = np.gradient(noise.blur(depth, 0.5, extent_mm), extent_mm / _GRID)
-    downhill = np.dstack([along, across]).astype(np.float32)
-    nodes, parents, radii = np.zeros((0, 2)), np.zeros(0, np.int64), np.zeros(0)
-    taken = np.zeros((_GRID, _GRID), np.float32)
-    for trunk in range(max(1, count)):
-        # A pixel of a cleft costs 0.12, of a crown 1 more, by chance up to 0.35, and 2.5 where a vessel runs.
-        cost = 0.12 + (1 - np.clip(depth, 0, 1)) ** 2 + 0.35 * rng.random((_GRID, _GRID)) + 2.5 * taken
-        angle = rng.uniform(0, 2 * np.pi) + trunk * 2 * np.pi / count
-        turn = rng.uniform(0.6, 1.0) * np.pi
-        path = _cheapest(cost, _border(angle), _border(angle + turn))
-        line = ((path + 0.5) / _GRID - 0.5) * extent_mm
-        line, root = _joined(line, nodes, 0.04 * extent_mm)
-        if len(line) < _SHORTEST:
-            continue
-        pixel = np.rint((line / extent_mm + 0.5) * _GRID - 0.5).astype(int)
-        taken[pixel[:, 1], pixel[:, 0]] = 1.0
-        taken = np.maximum(taken, cv2.GaussianBlur(taken, (0, 0), 1.5))
-        for _ in range(kind.smooth):
-            line = line + kind.settle * noise.sample(downhill, line, extent_mm)
-            line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]
-        length = _lengths(line)
-        at = np.linspace(0, length[-1], max(2, int(length[-1] / 0.18)))
-        line = np.stack([np.interp(at, length, line[:, axis]) for axis in (0, 1)], axis=1)
-        line = line + _meander(rng, line, extent_mm, 0.55, kind.wiggle)
-        own = rng.uniform(*kind.radius)
-        if root >= 0:
-            line = line + np.exp(-_lengths(line) / (0.1 * extent_mm))[:, None] * (nodes[root] - line[0])
-            own = min(own, rng.uniform(0.6, 0.85) * radii[root])
-        thinner = np.linspace(1.0, rng.uniform(0.55, 0.85), len(line))
-        # A vessel's width varies along it.
-        swell = 1 + 0.1 * noise.sample(noise.band(rng, 128, extent_mm, 6.0, 0.5), line, extent_mm)
-        parents = np.concatenate([parents, [root], np.arange(len(line) - 1) + len(nodes)])
-        nodes = np.concatenate([nodes, line])
-        radii = np.concatenate([radii, own * thinner * np.clip(swell, 0.75, 1.3)])
-    return Tree(nodes, parents.astype(np.int64), radii)
+def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
+    """One kind of vessel; `density` (m, m): share of its ends that stay."""
+    way = lattice(extent_mm, kind.coarse * max(_FINEST_MM, extent_mm / _MOST), rng)
+    depth = noise.sample(sulci, way.points, extent_mm)
+    clouds = noise.sample(noise.band(rng, 128, extent_mm, 2.0, 0.7), way.points, extent_mm)
+    chance = np.exp(0.7 * kind.chance * (clouds + rng.standard_normal(len(depth))))
+    cost = np.asarray((1 + kind.crown * (1 - np.clip(depth, 0, 1)) ** 2) * chance, np.float64)
+    many = extent_mm / _PATCH_MM
+    roots, deep, out = _trunks(kind, cost, way, many, rng)
+    ends = _ends(kind, way, density, extent_mm, rng)
+    ends = ends[~np.isin(ends, np.concatenate([roots, deep, out]))]
+    starts = np.concatenate([roots, deep])
+    radius = np.concatenate([rng.uniform(*kind.trunk, len(out)), rng.uniform(*kind.end, len(ends))])
+    made = used = least_cost(way, cost, starts, np.concatenate([out, ends]), radius, kind.sharing)
+    nodes, parent, own = made.nodes, made.parent, made.radius
+    between = float(np.median(way.lengths))
+    made = halved(joined(made, kind.loops, 3 * kind.spacing, between, rng))
+    nodes, parent, own = made.nodes, made.parent, made.radius
+    beyond = np.where(np.arange(len(nodes)) < 2 * len(used.nodes), 0.0, kind.taper)
+    nodes = relaxed(nodes, parent, own, kind.stiff, 100)
+    left = remaining(nodes, parent, beyond)
+    short, long = (
+        [noise.sample(noise.band(rng, 128, extent_mm, wave, 0.4), nodes, extent_mm) for _ in range(2)]
+        for wave in (1.7, 9.0)
+    )
+    supple = kind.bends[0] / (1 + (own / (0.4 * kind.stiff)) ** 2)
+    nodes = nodes + np.stack(short, 1) * supple[:, None] + kind.bends[1] * np.stack(long, 1)
+    own = own * np.where(own > kind.end[1], 1, np.clip(left / kind.taper, 0.05, 1) ** 0.5)
+    if len(deep):  # it comes into sight over a millimetre or two
+        own = own * np.clip(0.2 + cKDTree(way.points[deep]).query(nodes)[0] / 1.5, 0, 1)
+    swell = noise.sample(noise.band(rng, 128, extent_mm, 4.0, 0.5), nodes, extent_mm)
+    return Tree(nodes, parent, own * np.clip(1 + 0.1 * swell, 0.75, 1.3))
 
 
-def _branched(
-    kind: Kind, trunks: Tree, extent_mm: float, rng: np.random.Generator, density: Map | None = None
-) -> Tree:
-    """A tree from trunks: branches, then finer ones from those, a round per spacing."""
-    nodes, parent, own = trunks.nodes, trunks.parent, trunks.radius
-    fixed = len(nodes)
-    for spacing in kind.spacings:
-        step = 0.15 * min(spacing, 1.6)
-        grown = len(nodes)
-        between = float(np.linalg.norm(nodes[1] - nodes[0]))
-        attractors = scattered(extent_mm, spacing, rng, density)
-        buds = rng.random(grown) < between / (0.9 * spacing)
-        buds[grown // 2] |= not buds.any()
-        how = {"step": step, "kill": 0.5 * spacing, "wander": kind.wander}
-        nodes, parent = grow(nodes, parent, attractors, buds=buds, rng=rng, **how)
-        nodes, parent = pruned(nodes, parent, grown, shortest=int(0.55 * spacing / step))
-    nodes = relaxed(nodes, parent, fixed, rounds=12)
-    nodes = nodes + _meander(rng, nodes, extent_mm, 0.3, 0.22)
-    radius = murray(parent, kind.leaf) * taper(nodes, parent, 1.6)
-    radius[:fixed] = np.maximum(np.minimum(radius[:fixed], 1.3 * own), own)
-    swell = 1 + 0.15 * noise.sample(noise.band(rng, 256, extent_mm, 2.0, 0.5), nodes[fixed:], extent_mm)
-    radius[fixed:] = np.minimum(radius[fixed:] * np.clip(swell, 0.6, 1.4), 0.8 * own.max())
-    if kind.winding:  # bends of one or two millimetres, of wide vessels less
-        bends = [noise.sample(noise.band(rng, 256, extent_mm, 1.7, 0.35), nodes, extent_mm) for _ in range(2)]
-        stiff = 1 / (1 + (radius / _STIFF_MM) ** 2)
-        nodes = nodes + kind.winding * stiff[:, None] * np.stack(bends, axis=1)
-    return Tree(nodes, parent, radius)
+def _trunks(
+    kind: Kind, cost: Floats, way: Lattice, many: float, rng: np.random.Generator
+) -> tuple[Ints, Ints, Ints]:
+    """Points where trunks enter at the patch's border, come up in it, and leave it: where ways are cheap."""
+    half = np.abs(way.points).max()
+    out = np.abs(way.points).max(axis=1)
+    angle = np.arctan2(way.points[:, 1], way.points[:, 0])
+    border, inner = np.flatnonzero(out > 0.93 * half), np.flatnonzero(out < 0.7 * half)
+
+    def cheapest(towards: Floats) -> Ints:
+        apart = np.abs(np.angle(np.exp(1j * (angle[border] - towards[:, None]))))
+        return np.asarray(border[np.argmin(np.log(cost[border]) + 6 * apart, axis=1)])
+
+    count, leaving = (max(1, round(many * rng.integers(*of))) for of in (kind.roots, kind.through))
+    within = round(many * rng.integers(*kind.inside))
+    first = rng.uniform(0, 2 * np.pi) + (np.arange(count) + rng.uniform(-0.3, 0.3, count)) * 2 * np.pi / count
+    across = first[np.arange(leaving) % count] + rng.uniform(0.7, 1.3, leaving) * np.pi
+    chosen = rng.choice(inner, (within, 40))
+    deep = chosen[np.arange(within), np.argmin(cost[chosen], axis=1)]
+    roots, out = np.unique(cheapest(first)), np.unique(cheapest(across))
+    return roots, np.unique(deep), out[~np.isin(out, roots)]
 
 
-def _joined(line: Floats, nodes: Floats, near: float) -> tuple[Floats, int]:
-    """The part of a path from where it meets earlier nodes, and that node's index; else all of it and -1.
-
-    Of the path's two free ends the longer one remains.
-    """
-    if not len(nodes):
-        return line, -1
-    away, which = cKDTree(nodes).query(line)
-    met = np.flatnonzero(away < near)
-    if not len(met):
-        return line, -1
-    before, after = line[: met[0] + 1], line[met[-1] :]
-    if len(before) >= len(after):
-        return before[::-1], int(which[met[0]])
-    return after, int(which[met[-1]])
-
-
-def _meander(
-    rng: np.random.Generator, points: Floats, extent_mm: float, amplitude: float, wiggle: float
-) -> Floats:
-    """A smooth random shift (n, 2) mm of points (n, 2) mm; `wiggle` is the share of short bends."""
-    shifts = []
-    for _ in range(2):
-        long, short = (noise.band(rng, 128, extent_mm, wavelength, 0.3) for wavelength in (9.0, 3.0))
-        shift = amplitude * (0.6 * noise.sample(long, points, extent_mm))
-        shifts.append(shift + amplitude * wiggle * noise.sample(short, points, extent_mm))
-    return np.stack(shifts, axis=1).astype(np.float64)
-
-
-def _lengths(line: Floats) -> Floats:
-    """Length (L,) mm of a path (L, 2) mm up to each of its points."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-
-
-def _border(angle: float) -> tuple[int, int]:
-    """Pixel (x, y) on the grid's border in a direction from its centre."""
-    direction = np.array([np.cos(angle), np.sin(angle)])
-    point = direction / np.abs(direction).max() * (_GRID - 1) / 2 + (_GRID - 1) / 2
-    return round(float(point[0])), round(float(point[1]))
-
-
-def _cheapest(cost: Floats, start: tuple[int, int], end: tuple[int, int]) -> Floats:
-    """Cheapest path (L, 2) of pixels x, y over a square cost map, diagonals allowed."""
-    side = len(cost)
-    index = np.arange(side * side).reshape(side, side)
-    links = []
-    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        a = index[: side - dy, max(0, -dx) : side - max(0, dx)].ravel()
-        b = index[dy:, max(0, dx) : side + min(0, dx)].ravel()
-        links.append((a, b, 0.5 * (cost.ravel()[a] + cost.ravel()[b]) * np.hypot(dx, dy)))
-    rows, columns, weights = (np.concatenate(part) for part in zip(*links, strict=True))
-    graph = coo_array((weights, (rows, columns)), shape=(side**2, side**2)).tocsr()
-    source, goal = start[1] * side + start[0], end[1] * side + end[0]
-    before = dijkstra(graph, directed=False, indices=source, return_predecessors=True)[1]
-    path = [goal]
-    while path[-1] != source:
-        path.append(int(before[path[-1]]))
-    return np.array([(p % side, p // side) for p in reversed(path)], dtype=np.float64)
+def _ends(kind: Kind, way: Lattice, density: Map, extent_mm: float, rng: np.random.Generator) -> Ints:
+    """Points about `kind.spacing` apart: of a jittered grid, which neither clumps nor lines up, a share."""
+    side = max(1, int(extent_mm / kind.spacing))
+    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    points = ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
+    points = points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
+    return np.unique(cKDTree(way.points).query(points)[1])

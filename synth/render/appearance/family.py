@@ -48,10 +48,10 @@ class Ranges:
     `evidence.render.realism` compares colours with one.
     """
 
-    gyrus_albedo: Colour = (0.95, 0.79, 0.49)
+    gyrus_albedo: Colour = (0.95, 0.765, 0.49)
     perfused_albedo: Colour = (0.93, 0.57, 0.38)
-    vein_crest_albedo: Colour = (0.34, 0.24, 0.3)
-    vein_side_albedo: Colour = (0.2, 0.045, 0.045)
+    vein_crest_albedo: Colour = (0.27, 0.235, 0.3)
+    vein_side_albedo: Colour = (0.17, 0.045, 0.055)
     arterial_absorption: Ends = (1.1, 1.5)
     subpial_absorbance_per_mm: Ends = (1.4, 2.2)
     pial_absorbance: Ends = (0.3, 0.9)
@@ -63,7 +63,7 @@ class Ranges:
     dry_roughness: Ends = (0.22, 0.34)
     blood: Ends = (0.25, 0.75)
     dura_albedo: Colour = (0.86, 0.6, 0.5)
-    surroundings_albedo: Colour = (0.46, 0.07, 0.04)
+    surroundings_albedo: Colour = (0.40, 0.10, 0.065)
 
 
 FAMILIES: dict[Family, Ranges] = {
@@ -78,7 +78,7 @@ FAMILIES: dict[Family, Ranges] = {
         pial_absorbance=(1.2, 2.2),
         blood=(0.5, 0.95),
         dura_albedo=(0.82, 0.5, 0.42),
-        surroundings_albedo=(0.46, 0.06, 0.04),
+        surroundings_albedo=(0.42, 0.07, 0.045),
     ),
     "pale": Ranges(
         gyrus_albedo=(0.92, 0.84, 0.67),
@@ -108,7 +108,7 @@ FAMILIES: dict[Family, Ranges] = {
         bump=(0.4, 0.8),
         blood=(0.2, 0.6),
         dura_albedo=(0.87, 0.64, 0.55),
-        surroundings_albedo=(0.46, 0.08, 0.05),
+        surroundings_albedo=(0.42, 0.09, 0.06),
     ),
     "calf": Ranges(
         gyrus_albedo=(0.81, 0.64, 0.50),

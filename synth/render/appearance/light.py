@@ -18,7 +18,19 @@ _APART = 2.2  # between the lamps, round the optical axis [rad]
 _STEEPEST_DEG = 6.5
 _FADE = 0.6  # widths of the field over which the spot fades
 _RAYS = 65  # across a picture
+_LOWEST = 0.17  # height of any lamp over the opening's plane, as a share of its distance
 _WINDOW_DEG = 0.7  # angular radius of a lamp's window at the tissue
+
+
+@dataclass(frozen=True)
+class FreeLamp:
+    """A lamp anywhere, as drawn."""
+
+    tilt_deg: float  # from the optical axis
+    azimuth_deg: float  # about it, in the picture
+    share: float  # of the light
+    colour: tuple[float, float, float]  # linear RGB
+    window_deg: float  # its angular radius at the tissue
 
 
 @dataclass(frozen=True)
@@ -35,6 +47,8 @@ class Lighting:
     even: float  # radius of the even spot, in widths of the field
     drift: float  # largest change of power over the sequence
     phase: float  # of the drift's slow wave in the rest frame [rad]
+    ambient: float = 0.05  # share of the lamps' light that comes from all directions
+    lamps: tuple[FreeLamp, ...] = ()  # instead of the microscope's
 
     def gain(self, part: float) -> float:
         """Power at a part (0 to 1) of the sequence, relative to the rest frame."""
@@ -43,15 +57,19 @@ class Lighting:
 
 def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
     """The lamps, which together give a white surface in the opening a radiance of about 1."""
-    colour = blackbody(lighting.kelvin)
-    distance = float(np.linalg.norm(camera.centre))
+    # Wide windows are behind the lens, which they would hide.
+    distance = float(np.linalg.norm(camera.centre)) * (1.05 if lighting.lamps else 1.0)
     # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is at an angle to it.
     total = lighting.power * np.pi * distance**2
-    window = distance * float(np.tan(np.deg2rad(_WINDOW_DEG)))
+    own = _WINDOW_DEG, blackbody(lighting.kelvin)
+    drawn = [(lighting.main, *own, _towards(camera, lighting, 0))]
+    drawn += [(1 - lighting.main, *own, _towards(camera, lighting, 1))]
+    if lighting.lamps:
+        drawn = [(a.share, a.window_deg, np.array(a.colour), _free(camera, a)) for a in lighting.lamps]
     made = []
-    for side, share in ((0.0, lighting.main), (1.0, 1 - lighting.main)):
-        towards = _towards(camera, lighting, side)
+    for share, window_deg, colour, towards in drawn:
         intensity = share * total * colour / max(float(towards[2]), 0.3)
+        window = distance * float(np.tan(np.deg2rad(window_deg)))
         made.append(Lamp(distance * towards, np.zeros(3), window, intensity))
     return tuple(made)
 
@@ -73,14 +91,25 @@ def spot(camera: Camera, rest: Camera, even: float) -> Map:
     return np.asarray(np.clip((even + _FADE - away) / _FADE, 0, 1), np.float32)
 
 
+def _leaning(camera: Camera, lean: float, turn: float) -> Floats:
+    """Unit direction (3,) at an angle to the optical axis, and about it in the picture [rad]."""
+    axis, (right, down, _) = camera.centre / np.linalg.norm(camera.centre), camera.rotation
+    return np.asarray(np.cos(lean) * axis + np.sin(lean) * (np.cos(turn) * right + np.sin(turn) * down))
+
+
+def _free(camera: Camera, lamp: FreeLamp) -> Floats:
+    """Unit direction (3,) of a lamp, at least `_LOWEST` above the opening's plane."""
+    towards = _leaning(camera, *np.deg2rad([lamp.tilt_deg, lamp.azimuth_deg]))
+    flat = towards[:2] * min(1.0, np.sqrt(1 - _LOWEST**2) / max(np.linalg.norm(towards[:2]), 1e-9))
+    return np.append(flat, max(towards[2], _LOWEST))
+
+
 def _towards(camera: Camera, lighting: Lighting, side: float) -> Floats:
     """Unit direction (3,) from the craniotomy to the main lamp (side 0) or to the one across the lens (1)."""
     axis = camera.centre / np.linalg.norm(camera.centre)
     turn = np.deg2rad(lighting.azimuth_deg) + side * _APART
     if lighting.tilt_deg is not None:
-        lean = np.deg2rad(lighting.tilt_deg)
-        right, down, _ = camera.rotation
-        return np.asarray(np.cos(lean) * axis + np.sin(lean) * (np.cos(turn) * right + np.sin(turn) * down))
+        return _leaning(camera, np.deg2rad(lighting.tilt_deg), turn)
     turn = turn + np.arctan2(axis[1], axis[0])
     slope = np.deg2rad(lighting.mirror_deg)
     facing = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])

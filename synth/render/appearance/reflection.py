@@ -1,30 +1,36 @@
-"""Reflections in polished steel: of the wound, a dark theatre with its lamps, the microscope's windows.
+"""Reflections on instruments: of the wound, a dark theatre, the microscope's windows.
 
-They are evaluated at vertices, blurred by the finish: a path tracer's reflection of small bright lamps is
-noise at few paths a pixel, and the theatre lights nothing else. Reflectances and the theatre's radiances (1:
-white that fills the sensor) were chosen by eye; no instrument or theatre was measured.
+They are evaluated at vertices, from surroundings blurred by the roughness there: a path tracer's reflection
+of small bright lamps is noise at few paths a pixel, and the theatre lights nothing else. The theatre's
+radiances (1: white that fills the sensor) were chosen by eye; no theatre was measured.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
 from synth.render.materials import Lamp
 
-_STEEL, _BLACK = 0.58, 0.045
-"""Reflectance at right angles of machined steel and of the coating."""
-_SATIN = 0.10  # share of light that steel's finish scatters diffusely
-_TINT = np.array([1.0, 0.985, 0.96])
-_DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.16, 0.17, 0.18])
-_LAMPS = 7
-_FINISH = 0.30  # GGX alpha of machined steel
+_DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.78, 0.80, 0.82])
 _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
+_BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
+_SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
+_SHADED = 0.45  # share of the wound's radiance: an instrument mirrors tissue in its own shadow
+
+
+class Reflectance(NamedTuple):
+    """What a surface reflects, at its vertices."""
+
+    diffuse: Floats  # (V, 3) albedo
+    mirror: Floats  # (V, 3) reflectance at right angles
+    alpha: Floats  # (V,) GGX roughness
 
 
 @dataclass(frozen=True)
@@ -36,70 +42,68 @@ class Theatre:
     lamps: tuple[Lamp, ...]  # of the microscope
     light: Floats  # (3,) colour and power of the light on wound and theatre; 1 is white that fills the sensor
     lens: Floats  # (3,) mm, towards which steel mirrors them
-    seed: int  # of the theatre's lamps
+
+    @cached_property
+    def blurred(self) -> Floats:
+        """The wound (3, levels, n, n) blurred by `_BLURRED_MM`."""
+        per_mm = len(self.wound) / self.extent_mm
+        planes = np.moveaxis(self.wound.astype(np.float64), -1, 0)
+        spread = [
+            gaussian_filter(planes, (0, mm * per_mm, mm * per_mm), mode="nearest") for mm in _BLURRED_MM
+        ]
+        return np.stack(spread, axis=1)
 
 
-def tint(coat: npt.NDArray[np.floating]) -> Floats:
-    """Diffuse reflectance (V, 3) of steel under a black `coat` (V,) 0 to 1."""
-    bare, black = _SATIN * _STEEL * _TINT, np.full(3, 0.03)
-    return np.asarray(bare + coat[:, None] * (black - bare))
-
-
-def glow(steel: Shape, coat: npt.NDArray[np.floating], theatre: Theatre) -> Floats:
-    """Radiance (V, 3) that steel, `coat` (V,) 0 bare to 1 black, mirrors towards the theatre's lens."""
-    normal = normals(steel)
-    towards = theatre.lens - steel.vertices
+def glow(shape: Shape, surface: Reflectance, theatre: Theatre) -> Floats:
+    """Radiance (V, 3) that a shape mirrors towards the theatre's lens."""
+    normal = normals(shape)
+    towards = theatre.lens - shape.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
     mirrored = 2 * facing * normal - towards
-    straight = _STEEL * _TINT + coat[:, None] * (_BLACK - _STEEL * _TINT)
-    # Schlick, An inexpensive BRDF model for physically-based rendering, 1994.
-    share = straight + (1 - straight) * np.clip(1 - facing, 0, 1) ** 5
-    mirror = _surroundings(steel.vertices, mirrored, theatre) * theatre.light
+    # Schlick, 1994; at grazing angles roughness limits it (S. Lagarde, "Adopting a physically based shading
+    # model", 2011).
+    most = np.maximum(1 - surface.alpha[:, None], surface.mirror)
+    share = surface.mirror + (most - surface.mirror) * np.clip(1 - facing, 0, 1) ** 5
+    mirror = _surroundings(shape.vertices, mirrored, surface.alpha, theatre) * theatre.light
     for lamp in theatre.lamps:
-        mirror += _window(steel.vertices, normal, towards, lamp)
+        mirror += _window(shape.vertices, normal, towards, surface.alpha, lamp)
     return np.asarray(share * mirror)
 
 
-def _surroundings(place: Floats, direction: Floats, theatre: Theatre) -> Floats:
-    """Radiance (N, 3) that arrives at places (N, 3) mm from directions (N, 3)."""
-    up = direction[:, 2:]
-    below = 1 / (1 + np.exp((up + 0.05) / 0.09))
+def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
+    """Radiance (N, 3) that arrives at places (N, 3) mm from around directions (N, 3)."""
+    up, spread = direction[:, 2:], _SPREAD * alpha
+    below = 1 / (1 + np.exp(np.clip((up + 0.05) / np.hypot(0.09, alpha)[:, None], -40, 40)))
     # Intersection of the mirrored ray with the wound's plane; nearly level ones meet drapes.
-    steep = np.maximum(-direction[:, 2], 0.05)
-    far = np.maximum(place[:, 2], 0.0) / steep
-    met = place[:, :2] + far[:, None] * direction[:, :2]
-    pixel = ((met / theatre.extent_mm + 0.5) * len(theatre.wound) - 0.5).T[::-1]
-    planes = np.moveaxis(theatre.wound, -1, 0)
-    wound = np.stack([map_coordinates(one, pixel, order=1, mode="nearest") for one in planes], axis=-1)
-    lit = 1 / (1 + np.exp(np.clip((np.linalg.norm(met, axis=1) - _FADE_MM) / 3.0, -40, 40)))[:, None]
-    ground = lit * 0.8 * wound + (1 - lit) * _DRAPE
-    high = np.clip(up, 0, 1) ** 0.5
+    far = np.maximum(place[:, 2], 0.0) / np.maximum(-direction[:, 2], 0.05 + 0.5 * spread)
+    met, width = place[:, :2] + far[:, None] * direction[:, :2], far * spread
+    row, column = ((met / theatre.extent_mm + 0.5) * len(theatre.wound) - 0.5).T[::-1]
+    at = np.stack([np.interp(width, _BLURRED_MM, np.arange(len(_BLURRED_MM))), row, column])
+    wound = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in theatre.blurred], axis=-1)
+    edge = (np.linalg.norm(met, axis=1) - _FADE_MM) / (3.0 + 0.6 * width)
+    lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
+    ground = lit * _SHADED * wound + (1 - lit) * _DRAPE
+    high = np.clip(up, 0, 1)
     above = (1 - high) * _DRAPE + high * _CEILING
-    return np.asarray(below * ground + (1 - below) * (above + _ceiling_lamps(direction, theatre.seed)))
+    return np.asarray(below * ground + (1 - below) * above)
 
 
-def _ceiling_lamps(direction: Floats, seed: int) -> Floats:
-    """Radiance (N, 1) of the theatre's lamps."""
-    rng = np.random.default_rng([seed, 3])
-    total = np.zeros((len(direction), 1))
-    ranges = (0.0, 2 * np.pi), (0.05, 0.8), (0.10, 0.28), (0.6, 2.6)
-    drawn = [rng.uniform(*ends, _LAMPS) for ends in ranges]
-    for azimuth, height, size, power in zip(*drawn, strict=True):
-        flat = np.sqrt(1 - height**2)
-        middle = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), height])
-        total += power * np.exp(-np.maximum(1 - direction @ middle, 0) / (0.5 * size**2))[:, None]
-    return total
+def _window(place: Floats, normal: Floats, towards: Floats, alpha: Floats, lamp: Lamp) -> Floats:
+    """Reflection (N, 3) of a microscope's window, by a GGX lobe with Smith's correlated masking.
 
-
-def _window(place: Floats, normal: Floats, towards: Floats, lamp: Lamp) -> Floats:
-    """Reflection (N, 3) of a microscope's window in a machined finish, by a GGX lobe."""
+    E. Heitz, "Understanding the masking-shadowing function in microfacet-based BRDFs", 2014.
+    """
     way = lamp.position - place
     away2 = np.einsum("nc,nc->n", way, way)
     way /= np.sqrt(away2)[:, None]
     half = way + towards
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    in_line = np.clip(np.einsum("nc,nc->n", normal, half), 0, 1) ** 2
-    lobe = _FINISH**2 / (np.pi * (in_line * (_FINISH**2 - 1) + 1) ** 2)
+    level, facing = (np.clip(np.einsum("nc,nc->n", normal, one), 1e-3, 1) for one in (way, towards))
+    in_line, square = np.clip(np.einsum("nc,nc->n", normal, half), 0, 1) ** 2, alpha**2
+    lobe = square / (np.pi * (in_line * (square - 1) + 1) ** 2)
+    masked = 0.5 / sum(
+        a * np.sqrt(b**2 * (1 - square) + square) for a, b in ((level, facing), (facing, level))
+    )
     lit = np.einsum("nc,nc->n", normal, way) > 0
-    return np.asarray((lit * lobe / (4 * away2))[:, None] * lamp.intensity)
+    return np.asarray((lit * level * lobe * masked / away2)[:, None] * lamp.intensity)

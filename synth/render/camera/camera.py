@@ -80,7 +80,8 @@ def place(view: CameraView, render: RenderSection) -> Camera:
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ frame
     if render.calibration is None:
         focal = width * view.working_distance_mm / view.field_mm
-        K = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+        x, y = (width - 1) / 2 + width * view.off_centre[0], (height - 1) / 2 + width * view.off_centre[1]
+        K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
         distortion = np.asarray(render.distortion, np.float64)
     else:
         K, distortion = calibration.read(render.calibration, render.size)

@@ -14,6 +14,8 @@ from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, M
 from synth.system.jit import vectorised
 
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
+BLUR_WIDTH_PX = 640.0
+"""Width of the picture that the job's key `sensor.blur_px` refers to."""
 _STEPS = 4096  # of the tabulated tone curves per full scale
 
 MOST_BLANK = 0.95
@@ -42,13 +44,21 @@ class CameraSensor:
     curves: Curves = PLAIN.curves  # tone curves of red, green, blue: video levels at `KNOTS` of full scale
     sharpening: float = 0.3  # unsharp mask of the video processor, as a share of the detail
     chroma: str = "4:4:4"  # colour resolution of the video: 4:4:4, 4:2:2 or 4:2:0
+    native: float = 1.0  # its pixels across, as a share of the picture's, which is scaled up
+    halo_px: float = 1.0  # width of the unsharp mask: standard deviation [px of the sensor]
     coded: bool = False  # whether a codec follows, which subsamples colours itself
 
 
 def record(radiance: Map, sensor: CameraSensor, rng: np.random.Generator) -> Pixels:
     """The sRGB picture (H, W, 3) uint8 of linear radiance (H, W, 3) float32; `rng`: of the noise."""
+    size = radiance.shape[1::-1]
+    if sensor.native < 1:
+        fewer = [max(round(sensor.native * side), 8) for side in size]
+        radiance = cv2.resize(radiance, fewer, interpolation=cv2.INTER_AREA)
     video = processed(balanced_light(radiance, sensor, rng), sensor.matrix, sensor.curves)
-    video = _sharpen(video, sensor.sharpening)
+    video = _sharpen(video, sensor.sharpening, sensor.halo_px)
+    if sensor.native < 1:
+        video = cv2.resize(video, size, interpolation=cv2.INTER_CUBIC)
     np.clip(video, 0, 1, out=video)
     video = video if sensor.coded else _subsampled(video, sensor.chroma)
     return np.asarray(np.rint(np.clip(video, 0, 1) * np.float32(255)), np.uint8)
@@ -152,10 +162,10 @@ def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: M
                 video[y, x, k] = curve[low] + (at - np.float32(low)) * (curve[low + 1] - curve[low])
 
 
-def _sharpen(video: Map, amount: float) -> Map:
+def _sharpen(video: Map, amount: float, sigma: float) -> Map:
     if amount == 0:
         return video
-    sharp = cv2.GaussianBlur(video, (0, 0), 1.0)
+    sharp = cv2.GaussianBlur(video, (0, 0), sigma)
     np.subtract(video, sharp, out=sharp)
     sharp *= np.float32(amount)
     return np.asarray(np.add(video, sharp, out=sharp), np.float32)

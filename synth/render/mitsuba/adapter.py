@@ -29,6 +29,7 @@ from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
 
 _REGISTER = 64  # bytes of a vector register
+_LAMPS = 2, 6, 12  # numbers of lamps, each with a kernel of its own
 
 
 def pick(variant: str) -> str:
@@ -87,6 +88,9 @@ class Stage:
         else:
             scene["integrator"] = {"type": "path", "max_depth": int(integrator.removeprefix("path"))}
         scene |= {f"lamp{index}": _lamp(mi, lamp) for index, lamp in enumerate(lamps)}
+        # Lamps that are hardly ever sampled and emit nothing: their number is compiled into the kernel.
+        count = next((size for size in _LAMPS if size >= len(lamps)), len(lamps))
+        scene |= {f"lamp{index}": _lamp(mi, lamps[0], 1e-6) for index in range(len(lamps), count)}
         scene |= {name: _mesh(mi, name, body) for name, body in bodies.items()}
         self._lens = (Compiled if self._jit else Scalar)(camera, spp)
         self._layered, self._size = self._jit and integrator == "direct", camera.size
@@ -188,14 +192,18 @@ def _register_glow(variant: str) -> None:
     mi.register_emitter("sulcus_glow", Glow)
 
 
-def _lamp(mi: Any, lamp: Lamp) -> dict[str, Any]:
+def _lamp(mi: Any, lamp: Lamp, weight: float = 1.0) -> dict[str, Any]:
     towards = lamp.target - lamp.position
     up = [0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 * np.linalg.norm(towards) else [1.0, 0.0, 0.0]
     placed = mi.ScalarTransform4f().look_at(lamp.position.tolist(), lamp.target.tolist(), up)
     placed = placed @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
-    radiance = {"type": "rgb", "value": (lamp.intensity / (np.pi * lamp.radius**2)).tolist()}
+    radiance = lamp.intensity * (weight == 1) / (np.pi * lamp.radius**2)
     # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
-    light = {"type": "area", "radiance": radiance, "sampling_weight": 1.0}
+    light = {
+        "type": "area",
+        "radiance": {"type": "rgb", "value": radiance.tolist()},
+        "sampling_weight": weight,
+    }
     return {"type": "disk", "to_world": placed, "light": light}
 
 

@@ -135,6 +135,6 @@ def test_the_camera_of_a_photograph_of_another_brain_is_recovered() -> None:
     sensor = found["sensor"]
     assert sensor["vignette"] == pytest.approx(0.4, abs=0.15)
     assert sensor["blur_px"] == pytest.approx(1.0, abs=0.25)
-    assert sensor["full_well"][0] == pytest.approx(3000, rel=0.6)
+    assert sensor["full_well"] == pytest.approx(3000, rel=0.6)
     assert sensor["chroma"] == "4:2:0"
     assert sensor["bitrate_mbps"] > 1

