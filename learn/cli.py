@@ -57,7 +57,6 @@ def train_command(
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
     preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
-    devices: Annotated[int, Option(help="Number of GPUs; under torchrun of processes.")] = 1,
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
@@ -69,24 +68,22 @@ def train_command(
     from learn.inference.predict import load_model
     from learn.settings import preset as named
     from learn.split import divide
-    from learn.training.threads import make_fabric, set_threads
+    from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
     from synth.system.config_file import override
 
     set_threads(threads)
+    device = choose_device(accelerator)
     dataset, given = _split_arguments(str(dataset), changes or [])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
     with made_folder(out, disk_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
         clips = _read(datasets, settings.grid, sources(settings.input), cache)
         clips, split = divide(clips, datasets, settings.seed, _console.print)
-        fabric = make_fabric(accelerator=accelerator, devices=devices, precision=settings.precision)
-        log = _log if fabric.is_global_zero and not json else lambda numbers: None
+        log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
-            card = train(clips, split, settings, out, fabric=fabric, report=progress, log=log)
-    if not fabric.is_global_zero:
-        return
+            card = train(clips, split, settings, out, device=device, report=progress, log=log)
     if card.intervals is None and card.weights_hash:
         with counting("Fitting intervals") as progress:
             card = add_intervals(out, load_model(out), clips, split, report=progress)
@@ -163,7 +160,7 @@ def eval_command(
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
-    chosen = choose_unseen(clips, dataset, [predictor.card], _console.print)
+    chosen = choose_unseen(clips, dataset, predictor.card, _console.print)
     for note in {note for clip in chosen for note in predictor.card.doubt(clip.recovered_by)}:
         _note(note)
     with counting("Evaluating") as progress:

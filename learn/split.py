@@ -94,16 +94,14 @@ def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]
 
 
 def choose_unseen(
-    clips: list[Clip], dataset: Path, cards: Sequence[ModelCard], note: Note = lambda text: None
+    clips: list[Clip], dataset: Path, card: ModelCard, note: Note = lambda text: None
 ) -> list[Clip]:
-    """Sequences that no model was trained on; of a training dataset, of its test side. UserError: none."""
+    """Sequences that a model was not trained on; of a training dataset, of its test side. UserError: none."""
     split, candidates = read_split(dataset, required=False), clips
-    known = {name for card in cards for part in card.split.values() for name in part}
+    known = {name for part in card.split.values() for name in part}
     if split.sides and any(clip.content_hash in known for clip in clips):
         candidates = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = candidates
-    for card in cards:
-        chosen = unseen(chosen, card)
+    chosen = unseen(candidates, card)
     if not chosen:
         raise UserError(
             f"{dataset}: the model was trained on the brains of all {len(candidates)} test sequences; use "

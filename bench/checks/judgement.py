@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.checks import contradiction, files, scale, sensor, stereo, times
+from bench.checks import contradiction, files, sensor, stereo, times
 from bench.checks.sensor import SensorMotion
 from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
@@ -13,8 +13,8 @@ from synth.recording_flow.finding import Finding, by_severity, first_fault
 # Of the files alone.
 RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     files.check_notes,
-    scale.check_stiffness,
-    scale.check_scale,
+    files.check_stiffness,
+    files.check_scale,
     sensor.check_samples,
     sensor.check_free_spans,
 )
@@ -23,7 +23,7 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     files.check_pictures,
     files.check_tool,
     files.check_tracking,
-    scale.check_field_of_view,
+    files.check_field_of_view,
     stereo.check_pairing,
     stereo.check_quality,
     stereo.check_scale,

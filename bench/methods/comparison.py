@@ -13,14 +13,10 @@ PHYSICS = "physics"
 FUSION = "network and physics"
 
 
-def untrained() -> dict[str, Method]:
-    """Methods of ours that need no training data."""
-    return {PHYSICS: Physics()}
-
-
 def simpler_methods() -> dict[str, Method]:
     """Physics and the plug-ins of installed packages. UserError if one has the name of a method of ours."""
-    methods, others = untrained(), plugins.installed()
+    methods: dict[str, Method] = {PHYSICS: Physics()}
+    others = plugins.installed()
     if taken := {FUSION, MAIN, *methods} & set(others):
         raise UserError(f"method {min(taken)}: this name is reserved; rename the plug-in's method")
     return methods | others

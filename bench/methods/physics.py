@@ -19,7 +19,7 @@ from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
 from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
-from learn.data.clips import assumed_young
+from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
@@ -136,7 +136,7 @@ class Physics:
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
-        young = assumed_young(self._scene.young_kpa)
+        young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
         found = infer(self._weights, frame)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
         low, high = size_interval(found.force, gain, cameras)
@@ -274,7 +274,7 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
     if scene.membrane != "unknown":
         return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
-    young = assumed_young(scene.young_kpa)
+    young = scene.young_kpa or UNKNOWN_YOUNG_KPA
     bare, covered = max(1 - weights.membrane, 1e-3), max(weights.membrane, 1e-3)
     if covered <= bare:
         least = f"no evidence for a membrane above {TISSUES.thin_mm * young:.2g} {unit}"

@@ -48,19 +48,16 @@ class ScaleCalibration(Section):
     distance_mm: Positive | None = None
     """Distance from the lens to the tissue [mm]; with `focal_px`."""
     bar_px: tuple[Point, Point] | None = None
-    """Ends of a scale bar, or the two edges of an instrument of known width, as (x, y) [px]."""
+    """Ends of a scale bar, edges of an instrument of known width, or the tool's tip before and after a known
+    move parallel to the tissue plane, as (x, y) [px]."""
     bar_mm: Positive | None = None
-    """Length of the bar, or width of the instrument [mm]."""
+    """Length of the bar or the move, or width of the instrument [mm]."""
     checkerboard: Path | None = None
     """Picture of a checkerboard in the tissue plane, in the recording's folder."""
     corners: tuple[Corners, Corners] | None = None
     """Inner corners of the board: columns, rows."""
     square_mm: Positive | None = None
     """Side of one of its squares [mm]."""
-    travel_px: tuple[Point, Point] | None = None
-    """Tool tip before and after a known move parallel to the tissue plane, as (x, y) [px]."""
-    travel_mm: Positive | None = None
-    """Length of that move [mm]."""
 
     @model_validator(mode="after")
     def _exactly_one_way(self) -> ScaleCalibration:
@@ -68,13 +65,12 @@ class ScaleCalibration(Section):
             (self.focal_px, self.distance_mm),
             (self.bar_px, self.bar_mm),
             (self.checkerboard, self.corners, self.square_mm),
-            (self.travel_px, self.travel_mm),
         )
         begun = [way for way in ways if any(part is not None for part in way)]
         if len(begun) != 1 or any(part is None for part in begun[0]):
             raise ValueError(
-                "give one whole way: focal_px + distance_mm, bar_px + bar_mm, "
-                "checkerboard + corners + square_mm, or travel_px + travel_mm"
+                "give one whole way: focal_px + distance_mm, bar_px + bar_mm, or "
+                "checkerboard + corners + square_mm"
             )
         return self
 

@@ -52,20 +52,18 @@ def _calibrated(way: ScaleCalibration, folder: Path) -> PixelScale:
     if way.focal_px is not None and way.distance_mm is not None:
         return PixelScale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
     if way.bar_px is not None and way.bar_mm is not None:
-        return _bar(way.bar_px, way.bar_mm, "scale bar")
-    if way.travel_px is not None and way.travel_mm is not None:
-        return _bar(way.travel_px, way.travel_mm, "known move of the tool")
+        return _bar(way.bar_px, way.bar_mm)
     assert way.checkerboard is not None
     assert way.corners is not None
     assert way.square_mm is not None
     return _checkerboard(folder / way.checkerboard, way.corners, way.square_mm)
 
 
-def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float, source: str) -> PixelScale:
+def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float) -> PixelScale:
     length = float(np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]))
     if length < 2:
-        raise UserError(f"calibration: the ends of the {source} are {length:.1f} px apart")
-    return PixelScale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, source)
+        raise UserError(f"calibration: the ends of the bar are {length:.1f} px apart")
+    return PixelScale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, "scale bar")
 
 
 def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> PixelScale:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _SENSOR, _MAIN, _RED, _INTERVAL = "#3b3f46", "#1f6feb", "#c2352b", "#2b7a4b"
 _OTHERS = ("#8a6d00", "#2b7a4b", "#a04f9c", "#b8562b", "#5b6b7a", "#00798c", "#7a5195", "#6b8e23", "#a61c3c")
-_WIDE, _HALF, _HIGH = 1150, 560, 300  # points
+_WIDE, _HIGH = 1150, 300  # points
 
 
 def draw_force(result: Result, others: bool = False) -> str:
@@ -97,31 +97,6 @@ def draw_components(result: Result) -> str:
     return _chart((_WIDE, _HIGH), draw, "time [s]", unit, columns=6)
 
 
-def draw_bland_altman(result: Result, limits: dict[str, float]) -> str:
-    """Difference against mean, with the `limits` of agreement."""
-    x, y = _scored_pairs(result)
-
-    def draw(axes: Axes) -> None:
-        _dots(axes, (x + y) / 2, y - x)
-        for key, name, colour in (
-            ("bias_mn", "bias", _MAIN),
-            ("low_mn", "95% low", _RED),
-            ("high_mn", "95% high", _RED),
-        ):
-            if math.isfinite(limits[key]):
-                axes.axhline(limits[key], ls="--", color=colour, label=f"{name} {limits[key]:+.3g}")
-
-    return _chart((_HALF, _HIGH), draw, "mean of both [mN]", "predicted − sensor [mN]", columns=3)
-
-
-def _scored_pairs(result: Result) -> tuple[Floats, Floats]:
-    """Sensor and main method in the scored frames for which both have a force."""
-    assert result.sensor_mn is not None
-    predicted = result.methods[result.main].size_mn
-    good = result.scored & np.isfinite(result.sensor_mn) & np.isfinite(predicted)
-    return result.sensor_mn[good], predicted[good]
-
-
 def _largest(values: Floats) -> float:
     """The largest value; 1 if none is above zero."""
     return float(np.nanmax(values, initial=0.0)) or 1.0
@@ -129,11 +104,6 @@ def _largest(values: Floats) -> float:
 
 def _band(axes: Axes, x: Floats, low: Floats, high: Floats, name: str, colour: str) -> None:
     axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0, label=name)
-
-
-def _dots(axes: Axes, x: Floats, y: Floats) -> None:
-    many = len(x) > 100
-    axes.scatter(x, y, 12 if many else 28, _MAIN, alpha=0.45 if many else 0.8, linewidths=0)
 
 
 def _chart(size: tuple[int, int], draw: Callable[[Axes], None], x: str, y: str, columns: int = 2) -> str:

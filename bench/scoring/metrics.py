@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 
 from bench import bootstrap
@@ -30,10 +29,8 @@ METRICS = {
     "gain": Metric("gain", "", "Least-squares slope of predicted on sensor.", column="gain"),
     "shape_error": Metric("shape error", "%", _SHAPE_ERROR, 3, True, "shape err."),
     "lag_s": Metric("lag", "ms", "Delay of predicted, at the best correlation.", 3, True, "lag"),
-    "r_at_lag": Metric("r at that lag", "", "Correlation with the lag removed.", relative=True),
     "contact_f1": Metric("contact F1", "", "F1 of contact, by sample.", column="contact F1"),
     "false_positive_rate": Metric("false positives", "%", "Free samples with contact.", column="FPR"),
-    "background_mn": Metric("background force", "mN", "Mean predicted force without contact.", 2),
     "threshold_mn": Metric("contact threshold", "mN", "Sensor's force at contact.", 2, True),
     "events": Metric("contacts", "", "Contacts in the sensor's curve.", relative=True),
     "event_peak_mn": Metric("event peak", "mN", "Mean peak of the contacts.", 2, True),
@@ -87,30 +84,26 @@ def gain(sensor: Floats, predicted: Floats, where: Mask) -> float:
     return ratio(float(sensor[good] @ predicted[good]), float(predicted[good] @ predicted[good]))
 
 
-def lag(time_s: Floats, sensor: Floats, predicted: Floats) -> dict[str, float]:
-    """The lag of `predicted` behind `sensor`, lag_s [s], and the correlation with it removed, r_at_lag.
+def lag(time_s: Floats, sensor: Floats, predicted: Floats) -> float:
+    """The lag of `predicted` behind `sensor` [s] at the best correlation; NaN: undefined.
 
     Scores are at lag 0. It is found in steps of a quarter of the median frame time, within half a second in
     both directions. `time_s`: (T,) rising [s]; others (T,) mN.
     """
     both = np.isfinite(sensor) & np.isfinite(predicted) & np.isfinite(time_s)
     t, x, y = time_s[both], sensor[both], predicted[both]
-    nothing = {"lag_s": math.nan, "r_at_lag": math.nan}
     if len(t) < 8 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return nothing
+        return math.nan
     step = float(np.median(np.diff(t))) / 4
     search = min(_LARGEST_LAG_S, 0.25 * float(t[-1] - t[0]))
     lags = np.arange(-round(search / step), round(search / step) + 1) * step
     inner = (t >= t[0] + search) & (t <= t[-1] - search)
     if inner.sum() < 8:
-        return nothing
+        return math.nan
     shifted = [np.interp(t[inner] + shift, t, y) for shift in lags]
     with np.errstate(divide="ignore", invalid="ignore"):  # constant curves
         r = np.corrcoef([x[inner], *shifted])[0, 1:]
-    if not np.isfinite(r).any():
-        return nothing
-    best = int(np.nanargmax(r))
-    return {"lag_s": float(lags[best]), "r_at_lag": float(r[best])}
+    return float(lags[np.nanargmax(r)]) if np.isfinite(r).any() else math.nan
 
 
 def contact_threshold(sensor: Floats, noise_floor_mn: float) -> float:
@@ -168,11 +161,10 @@ def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> di
     """Scores of contact detection, as `METRICS` describes them."""
     both = np.isfinite(sensor) & np.isfinite(predicted)
     truth, found = (in_contact(curve, threshold_mn)[both] for curve in (sensor, predicted))
-    free, background = ~truth, np.abs(predicted[both][~truth])
+    free = ~truth
     return {
         "contact_f1": float(f1_score(truth, found)) if (truth | found).any() else math.nan,
         "false_positive_rate": float(found[free].mean()) if free.any() else math.nan,
-        "background_mn": float(background.mean()) if free.any() else math.nan,
     }
 
 
@@ -197,9 +189,9 @@ def compute_all(
     # The error after the best gain, known only in hindsight, is that of the curve's shape.
     best = gain(sensor, predicted, np.isfinite(sensor)) * predicted
     scores["shape_error"] = ratio(agreement(sensor, best)["mae_mn"], peak)
-    scores |= lag(time_s, sensor, predicted)
     scores |= contact_scores(sensor, predicted, threshold)
     scores |= {
+        "lag_s": lag(time_s, sensor, predicted),
         "threshold_mn": threshold,
         "events": float(len(rows)),
         "event_peak_mn": peak,
@@ -220,31 +212,6 @@ def without_prediction(rows: list[dict[str, float]]) -> list[dict[str, float]]:
     """The contacts with all values that require predicted newtons set to NaN."""
     own = ("from_s", "to_s", "peak_mn", "impulse_mns")
     return [{key: value if key in own else math.nan for key, value in row.items()} for row in rows]
-
-
-def limits_of_agreement(difference: Floats, group: NDArray[np.integer]) -> dict[str, float]:
-    """Bias and 95% limits of agreement, bias_mn, low_mn, high_mn, of differences (T,) mN, NaN left out, in
-    groups (T,) of correlated error: contacts, and spans between them.
-
-    Bland and Altman, "Agreement between methods of measurement with multiple observations per individual" (J.
-    Biopharmaceutical Statistics 2007), true value varying: variance between groups plus within.
-    """
-    good = np.isfinite(difference)
-    d, names = difference[good], np.unique(group[good], return_inverse=True)[1]
-    n, size = len(d), np.bincount(names).astype(float) if good.any() else np.zeros(0)
-    k = len(size)
-    bias = float(d.mean()) if n else math.nan
-    if n < 2:
-        return {"bias_mn": bias, "low_mn": math.nan, "high_mn": math.nan}
-    means = np.bincount(names, d) / size
-    variance = float(d.var(ddof=1))
-    if 1 < k < n:
-        within = float(np.square(d - means[names]).sum()) / (n - k)
-        between = float((size * np.square(means - bias)).sum()) / (k - 1)
-        repeats = (n - float(np.square(size).sum()) / n) / (k - 1)
-        variance = within + max(between - within, 0.0) / repeats
-    spread = 1.96 * float(np.sqrt(variance))
-    return {"bias_mn": bias, "low_mn": bias - spread, "high_mn": bias + spread}
 
 
 def _mean_size(rows: list[dict[str, float]], key: str) -> float:

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from rich.markup import escape
 from rich.table import Table
 
-from bench.scoring import charts, metrics
+from bench.scoring import charts
 from bench.scoring.headline import headline
 from bench.scoring.metrics import METRICS
 from bench.scoring.result import Result
@@ -43,8 +43,6 @@ def render_report(result: Result, title: str = "") -> str:
     figures = {"force": charts.draw_force(result), "methods": charts.draw_force(result, others=True)}
     if np.isfinite(main.force_mn).any(axis=0).all():
         figures["components"] = charts.draw_components(result)
-    if math.isfinite(main.scores.get("mae_mn", math.nan)):
-        figures["bland"] = charts.draw_bland_altman(result, limits_of_agreement(result))
     panels, flow_px, force_kpa = pictures(result)
     columns, mae = _columns(result), main.scores.get("mae_mn", math.nan)
     lower = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
@@ -68,7 +66,6 @@ def render_report(result: Result, title: str = "") -> str:
         masks=None if (masked := picture_masks(result.tracked)) is None else _jpeg(masked),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
-        cost=_cost(result),
     )
 
 
@@ -96,18 +93,6 @@ def _columns(result: Result) -> dict[str, Metric]:
         for key, metric in METRICS.items()
         if metric.column and any(math.isfinite(scores.get(key, math.nan)) for scores in every)
     }
-
-
-def limits_of_agreement(result: Result) -> dict[str, float]:
-    """Bias and limits of agreement over the scored frames, grouped by contact."""
-    assert result.sensor_mn is not None
-    scored, predicted = result.scored, result.methods[result.main].size_mn
-    threshold = metrics.contact_threshold(result.sensor_mn[scored], result.noise_floor_mn)
-    contact = metrics.in_contact(result.sensor_mn, threshold)
-    # A span that is not scored also ends a group: contact before and after it are different contacts.
-    state = np.where(scored, contact, -1)
-    run = np.cumsum(np.diff(state, prepend=state[:1]) != 0)
-    return metrics.limits_of_agreement((predicted - result.sensor_mn)[scored], run[scored])
 
 
 def shown(value: float | None, unit: str = "") -> str:
@@ -197,16 +182,6 @@ def _caption(result: Result, snap: Snapshot) -> str:
     if result.sensor_mn is not None and math.isfinite(result.sensor_mn[k]):
         caption += f", sensor {shown(result.sensor_mn[k])} mN"
     return caption
-
-
-def _cost(result: Result) -> list[tuple[str, str, str]]:
-    """Stage, CPU milliseconds per frame, share of real time."""
-    frames, duration = len(result.time_s), float(np.ptp(result.time_s)) or math.nan
-    return [
-        (stage, f"{1000 * spent['cpu_s'] / frames:.1f}", f"{spent['wall_s'] / duration:.2f}")
-        for stage, spent in result.tracked.timings.items()
-        if isinstance(spent, dict)
-    ]
 
 
 def _flat(tree: dict[str, Any], before: str = "") -> list[tuple[str, str]]:

@@ -17,7 +17,7 @@ from evidence.training import nested
 from learn.evaluation.evaluate import evaluate
 from learn.inference.predict import load_model
 from learn.settings import preset, replace
-from learn.training.threads import make_fabric, set_threads
+from learn.training.threads import choose_device, set_threads
 from learn.training.train import train
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.job import reader
@@ -43,7 +43,8 @@ def measure(
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         made = [index for index in pool.map(partial(_make, job, size, cache), range(sequences)) if index >= 0]
     clips = [labels.whole(job, index, base.grid, cache) for index in made]
-    on_gpu = accelerator != "cpu" and torch.cuda.is_available()
+    device = choose_device(accelerator)
+    on_gpu = device.type == "cuda"
     settings = replace(
         base,
         arch=replace(base.arch, output="magnitude"),
@@ -52,13 +53,12 @@ def measure(
         precision="bf16-mixed" if on_gpu else "32-true",
     )
     split = nested(clips, 10, 0, settings.seed)
-    fabric = make_fabric(accelerator=accelerator, devices=1, precision=settings.precision)
     whole_run = not (out / "model").exists()  # a continued training has no meaningful rate
     began = time.perf_counter()
-    train(clips, split, settings, out / "model", fabric=fabric)
+    train(clips, split, settings, out / "model", device=device)
     trained = time.perf_counter() - began
     tested = [clips[i] for i in split.test]
-    scores = evaluate(load_model(out / "model", fabric.device), tested, "ideal").summary()
+    scores = evaluate(load_model(out / "model", device), tested, "ideal").summary()
     count = sum(clips[i].frames for i in split.fit)
     result = {
         "device": torch.cuda.get_device_name() if on_gpu else "cpu",

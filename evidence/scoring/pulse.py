@@ -8,8 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.methods.comparison import untrained
+from bench.methods.comparison import PHYSICS
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
+from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
@@ -43,7 +44,7 @@ def measure(seconds: float = 20.0, count: int = 2, size: int = 160, seed: int = 
             for name, pulse, remove in (("still", 0, True), ("pulse", 1, False), ("removed", 1, True)):
                 folder = Path(scratch, name)
                 record(folder, contact, pulse, size, remove, np.random.default_rng([seed, k, 1]))
-                runs[name] = score(folder, untrained(), "tvl1")
+                runs[name] = score(folder, {PHYSICS: Physics()}, "tvl1")
         for method in runs["still"].methods:
             row: dict[str, Any] = {"recording": k, "method": method}
             row |= {f"{name}_mn": run.methods[method].scores["mae_mn"] for name, run in runs.items()}

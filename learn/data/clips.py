@@ -251,8 +251,3 @@ def amount(clip: Clip, components: int, pitch_mm: float) -> Floats:
         return clip.force / clip.young_kpa
     length = np.sqrt(np.square(np.asarray(clip.density), dtype=np.float64).sum(1))
     return np.asarray(length.sum((1, 2))[:, None] * pitch_mm**2)
-
-
-def assumed_young(young_kpa: float | None) -> float:
-    """E [kPa] that a method uses: the known one, else `UNKNOWN_YOUNG_KPA`."""
-    return UNKNOWN_YOUNG_KPA if young_kpa is None else young_kpa

@@ -14,6 +14,8 @@ from learn.data.grid import Scales, channels, divergence, membrane_code
 from learn.settings import TrainingSettings
 from synth.errors import UserError
 
+SHARE = 0.6  # of a GPU's free memory that frames may take; the rest is the network's
+_CPU = torch.device("cpu")
 MEMBRANE_HIDDEN = 1 / 3  # share of training frames with an unknown membrane: `arch.membrane` works without it
 
 
@@ -25,9 +27,6 @@ class Batch(NamedTuple):
     confidence: Tensor  # (B, 1, N, N) 0..1, with depth (B, 2, N, N)
     target: Tensor  # (B, C, N, N) in the unit of `Scales.target`
     membrane: Tensor  # (B,) of `membrane_code`
-
-    def to(self, device: torch.device) -> Batch:
-        return Batch(*(values.to(device, non_blocking=True) for values in self))
 
     def turned(self, turn: int) -> Batch:
         """All fields turned by `turned`; each confidence is a scalar."""
@@ -83,14 +82,21 @@ def turned(values: Tensor, turn: int) -> Tensor:
 
 
 class FrameDataset:
-    """All frames of some clips, in batches."""
+    """All frames of some clips, in batches on a device; a GPU with enough memory stores what it has read."""
 
-    def __init__(self, clips: Sequence[Clip], settings: TrainingSettings) -> None:
-        self.clips, self.settings = list(clips), settings
+    def __init__(
+        self, clips: Sequence[Clip], settings: TrainingSettings, device: torch.device = _CPU
+    ) -> None:
+        self.clips, self.settings, self.device = list(clips), settings, device
         self.sources = sources(settings.input)
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
                 raise UserError(f"{clip.name}: its grid is {len(clip.mask)}², the model's {settings.size}²")
+        self._masks = [torch.from_numpy(np.array(c.mask))[None, None].to(device) for c in self.clips]
+        self._stored = dict[tuple[int, int, str], tuple[Tensor, ...]]()
+        planes = 2 * settings.arch.displacements - 1 + settings.arch.components
+        needed = sum(c.frames for c in self.clips) * len(self.sources) * planes * 4 * settings.size**2
+        self._stores = device.type == "cuda" and needed < SHARE * torch.cuda.mem_get_info(device)[0]
 
     def order(self, rng: np.random.Generator, share_recovered: float) -> list[FrameItem]:
         """The frames of one epoch, turned at random, in random order."""
@@ -123,13 +129,22 @@ class FrameDataset:
         """The frames of `items` as tensors."""
         frames = []
         for c, t, source, turn, known in items:
+            moved, confidence, true = self._read(c, t, source)
+            code = membrane_code(self.clips[c].membrane) if known else 0.0
+            codes = torch.full((1,), code, device=self.device)
+            frames.append(Batch(moved, self._masks[c], confidence, true, codes).turned(turn))
+        return Batch(*map(torch.cat, zip(*frames, strict=True)))
+
+    def _read(self, c: int, t: int, source: str) -> tuple[Tensor, ...]:
+        """Displacement, confidence and target of a frame of clip `c`."""
+        if (found := self._stored.get((c, t, source))) is None:
             clip = self.clips[c]
             truth = target(clip, t, self.settings.arch.components)
-            arrays = clip.displacement[source][t], clip.mask[None], clip.confidence_of(source)[t], truth
-            code = np.float32(membrane_code(clip.membrane) if known else 0)
-            one = Batch(*(torch.from_numpy(np.array(values))[None] for values in (*arrays, code)))
-            frames.append(one.turned(turn))
-        return Batch(*map(torch.cat, zip(*frames, strict=True)))
+            arrays = clip.displacement[source][t], clip.confidence_of(source)[t], truth
+            found = tuple(torch.from_numpy(np.array(one))[None].to(self.device) for one in arrays)
+            if self._stores:
+                self._stored[c, t, source] = found
+        return found
 
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:

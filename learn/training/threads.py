@@ -1,17 +1,12 @@
-"""CPU threads and devices of a training."""
+"""CPU threads and the device of a training."""
 
 from __future__ import annotations
 
 import os
-import warnings
-from typing import TYPE_CHECKING, Any
 
 import torch
 
 from synth.errors import UserError
-
-if TYPE_CHECKING:
-    from lightning_fabric import Fabric
 
 
 def set_threads(wanted: int | None = None) -> int:
@@ -27,12 +22,16 @@ def set_threads(wanted: int | None = None) -> int:
     return count
 
 
-def make_fabric(**settings: Any) -> Fabric:
-    """`Fabric(**settings)` without its hints; a GPU multiplies 32-bit numbers in TF32."""
-    from lightning_fabric import Fabric
+def choose_device(accelerator: str) -> torch.device:
+    """The device of `cpu`, `cuda` or `auto`: a GPU if there is one, which multiplies 32-bit numbers in TF32.
 
-    if settings.get("accelerator") != "cpu" and torch.cuda.is_available():
-        torch.set_float32_matmul_precision("high")
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "The `srun` command is available")
-        return Fabric(**settings)
+    UserError: another name, or no GPU.
+    """
+    gpu = torch.cuda.is_available()
+    if accelerator not in ("cpu", "cuda", "auto") or (accelerator == "cuda" and not gpu):
+        why = "no GPU was found" if accelerator == "cuda" else "must be cpu, cuda or auto"
+        raise UserError(f"accelerator {accelerator}: {why}")
+    if accelerator == "cpu" or not gpu:
+        return torch.device("cpu")
+    torch.set_float32_matmul_precision("high")
+    return torch.device("cuda")

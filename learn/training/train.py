@@ -7,17 +7,14 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning_fabric import Fabric
 from tensorboardX import SummaryWriter
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import ReduceLROnPlateau
-from torchmetrics.aggregation import MeanMetric
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
@@ -29,8 +26,6 @@ from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
 from learn.split import Split, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
-from learn.training.gpu_batches import place_frames
-from learn.training.threads import make_fabric
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
 from synth.system import checked_file
@@ -51,7 +46,7 @@ def train(
     out: Path,
     *,
     report: ProgressCallback = lambda done, of: None,
-    fabric: Fabric | None = None,
+    device: torch.device | str = "cpu",
     log: Callable[[dict[str, float]], None] = lambda numbers: None,
 ) -> ModelCard:
     """Trains on `split.fit` and chooses the epoch on `split.select`; `split.test` is not used.
@@ -61,8 +56,6 @@ def train(
 
     Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
     """
-    fabric = fabric or make_fabric(accelerator="cpu", devices=1, precision=settings.precision)
-    fabric.launch()
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     typical_young = float(np.exp(np.mean([np.log(clip.young_kpa) for clip in fit])))
@@ -72,30 +65,25 @@ def train(
     card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)
     state = _open(out, card)
     try:
-        run = _start(card, state)
-        net, run.optimizer = fabric.setup(run.model, run.optimizer)
-        frames, chooser = (place_frames(part, settings, fabric.device) for part in (fit, select))
-        board = None
-        if fabric.is_global_zero:  # events after the epoch that a run is continued from are dropped
-            board = SummaryWriter(str(out / "tensorboard"), purge_step=run.epoch)
-        with board or nullcontext():
+        run = _start(card, state, torch.device(device))
+        frames, chooser = (FrameDataset(part, settings, torch.device(device)) for part in (fit, select))
+        # Events after the epoch that a run is continued from are dropped.
+        with SummaryWriter(str(out / "tensorboard"), purge_step=run.epoch) as board:
             for epoch in range(run.epoch, settings.epochs):
-                numbers = _epoch(fabric, net, run.optimizer, frames, scales, epoch, report)
-                numbers |= select_score(net, chooser, scales, fabric.device)
+                numbers = _epoch(run.model, run.optimizer, frames, scales, epoch, report)
+                numbers |= select_score(run.model, chooser, scales)
                 improved = run.end_epoch(numbers["select_r2"], settings)
                 numbers |= {"epoch": epoch + 1.0, "lr": run.optimizer.param_groups[0]["lr"]}
-                if board is not None:
-                    _write_numbers(out / "history.jsonl", board, epoch, numbers)
-                    if improved:
-                        gain = numbers["select_gain"]
-                        best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
-                        checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
-                    checkpoint.save_tensors(out / "last.pt", run.as_dict())
-                fabric.barrier()
+                _write_numbers(out / "history.jsonl", board, epoch, numbers)
+                if improved:
+                    gain = numbers["select_gain"]
+                    best = dataclasses.replace(card, epoch=run.epoch, score=run.best, force_gain=gain)
+                    checkpoint.write_model(out, best, _cpu(run.model.state_dict()))
+                checkpoint.save_tensors(out / "last.pt", run.as_dict())
                 log(numbers)
     except (UserError, OSError):
         # A new run without a checkpoint, on a full disk for instance, leaves no folder.
-        if state is None and fabric.is_global_zero and not (out / "last.pt").exists():
+        if state is None and not (out / "last.pt").exists():
             shutil.rmtree(out)
         raise
     return checkpoint.read_card(out)
@@ -135,11 +123,11 @@ class _Run:
         return {"epoch": self.epoch, "best": self.best, "model": _cpu(self.model.state_dict()), **moving}
 
 
-def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
+def _start(card: ModelCard, state: dict[str, Any] | None, device: torch.device) -> _Run:
     """A new run, or one continued from a state of `_Run.as_dict`."""
     settings = card.settings
     torch.manual_seed(settings.seed)
-    model = D2FNet(settings.arch).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = D2FNet(settings.arch).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     # `fused` saves a fifth of a small network's training time on a CPU.
     optimizer = AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=WEIGHT_DECAY, fused=True)
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=PATIENCE)
@@ -154,8 +142,7 @@ def _start(card: ModelCard, state: dict[str, Any] | None) -> _Run:
 
 
 def _epoch(
-    fabric: Fabric,
-    net: Any,
+    net: torch.nn.Module,
     optimizer: Any,
     frames: FrameDataset,
     scales: Scales,
@@ -165,17 +152,15 @@ def _epoch(
     settings = frames.settings
     # Seeds depend on (seed, epoch) alone, so a resumed run draws as an uninterrupted one.
     seed = np.random.SeedSequence([settings.seed, epoch])
-    torch.manual_seed(int(seed.generate_state(1)[0]) + fabric.global_rank)
+    torch.manual_seed(int(seed.generate_state(1)[0]))
     order = frames.order(np.random.default_rng(seed), min(1.0, epoch / max(settings.epochs // 2, 1)))
-    step = settings.batch * fabric.world_size
-    batches = max(len(order) // step, 1)
+    batches = max(len(order) // settings.batch, 1)
     net.train()
-    mean = MeanMetric().to(fabric.device)
+    total = torch.zeros((), device=frames.device)
     for i in range(batches):
-        batch = frames.batch(order[i * step : (i + 1) * step][fabric.global_rank :: fabric.world_size])
-        batch = batch.to(fabric.device)
+        batch = frames.batch(order[i * settings.batch : (i + 1) * settings.batch])
         if settings.surface_motion_mm > 0:
-            draws = np.random.SeedSequence([settings.seed, epoch, i, fabric.global_rank])
+            draws = np.random.SeedSequence([settings.seed, epoch, i])
             rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
             batch = add_surface_motion(batch, settings, rng)
         predicted = forward(net, batch, settings, scales)
@@ -188,12 +173,12 @@ def _epoch(
             for group in optimizer.param_groups:
                 group["lr"] = settings.learning_rate * cosine(progress)
         optimizer.zero_grad()
-        fabric.backward(error)
-        fabric.clip_gradients(net, optimizer, max_norm=CLIP)
+        error.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(net.parameters(), CLIP)
         optimizer.step()
-        mean.update(error.detach())
+        total += error.detach()
         report(epoch * batches + i + 1, settings.epochs * batches)
-    return {"loss": _finite(float(mean.compute()), epoch)}
+    return {"loss": _finite(float(total) / batches, epoch)}
 
 
 def _finite(value: float, epoch: int) -> float:
@@ -212,19 +197,19 @@ def cosine(progress: float, warm: float = 0.05) -> float:
 def forward(net: Any, batch: Batch, settings: TrainingSettings, scales: Scales) -> torch.Tensor:
     """The network's map in physical units per unit stiffness: (B, C, N, N), unit of `Scales.target`."""
     x = inputs(batch, settings, scales).contiguous(memory_format=torch.channels_last)
-    predicted: torch.Tensor = net(x)
+    with torch.autocast(x.device.type, torch.bfloat16, enabled=settings.precision == "bf16-mixed"):
+        predicted: torch.Tensor = net(x)
     return predicted.float() * scales.target
 
 
 @torch.no_grad()
-def select_score(net: Any, frames: FrameDataset, scales: Scales, device: torch.device) -> dict[str, float]:
+def select_score(net: torch.nn.Module, frames: FrameDataset, scales: Scales) -> dict[str, float]:
     """R² and RMSE over all tissue cells and components, on the input kind's last source, and the gain that
     corrects the underestimate of force by noise and the penalty on off-target force."""
     net.eval()
     sums, forces = np.zeros(7), np.zeros(7)
     for c in range(len(frames.clips)):
-        for batch in frames.sequential(c, frames.sources[-1]):
-            here = batch.to(device)
+        for here in frames.sequential(c, frames.sources[-1]):
             inside = here.mask.bool().expand_as(here.target)
             pair = here.target, forward(net, here, frames.settings, scales)
             sums = sums + moments(*(one[inside].cpu().numpy() for one in pair))

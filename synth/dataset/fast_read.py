@@ -61,10 +61,10 @@ class ShardReader:
         return np.frombuffer(data, "<u8").reshape(-1, 2)
 
 
-def open_frames(array: zarr.Array[Any], folder: Path | None) -> ShardReader | None:
+def open_frames(array: zarr.Array[Any], folder: Path) -> ShardReader | None:
     """A fast reader of the frames of `array`, stored in `folder`; None for another layout."""
     codecs = [type(codec).__name__ for codec in (*array.filters, array.serializer, *array.compressors)]  # type: ignore[list-item]
-    if folder is None or array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:
+    if array.shards is None or array.chunks != (1, *array.shape[1:]) or codecs != _CODECS:
         return None
     if array.shards[1:] != array.shape[1:] or np.dtype(array.dtype).byteorder == ">":
         return None

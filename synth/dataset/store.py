@@ -190,9 +190,7 @@ class _FieldWriter:
 class FieldReader:
     """A field of a sealed sequence, read when indexed. UserError, with store and field, if it is damaged."""
 
-    def __init__(
-        self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path | None = None
-    ) -> None:
+    def __init__(self, array: zarr.Array[Any], dtype: np.dtype[Any], where: str, folder: Path) -> None:
         self._array, self._where = array, where
         self._shards = fast_read.open_frames(array, folder)
         self.shape: tuple[int, ...] = array.shape
@@ -212,10 +210,7 @@ class FieldReader:
         except IndexError:
             raise
         except Exception as error:  # Zarr, its codecs and the file system raise various errors for damage
-            why = "the store is damaged"
-            if self._where.startswith("http"):
-                why += " or its server does not support range requests"
-            raise UserError(f"{self._where}: cannot be read, {why} ({error})") from error
+            raise UserError(f"{self._where}: cannot be read, the store is damaged ({error})") from error
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.asarray(self[...], dtype)
@@ -224,8 +219,8 @@ class FieldReader:
 class Sequence:
     """One sealed sequence: `sequence["rgb"][t]`, `sequence.attrs["young_kpa"]`."""
 
-    def __init__(self, path: Path, group: zarr.Group, where: location.StoreLocation) -> None:
-        self.path, self._group, self._location = path, group, where
+    def __init__(self, path: Path, group: zarr.Group) -> None:
+        self.path, self._group = path, group
         self.attrs = dict(group.attrs)
 
     @property
@@ -282,7 +277,7 @@ class Sequence:
             values have changed since the seal.
         """
         field, found = _field(name), self[name]
-        where = f"{self._location.name}: {name}"
+        where = f"{self.path}: {name}"
         hasher = field_hasher(name, found.stored, found.shape)
         every: Any = range(len(found)) if field.framed else [...]
         for part in every:
@@ -301,7 +296,7 @@ class Sequence:
             raise UserError(f"{where}: values were changed after the seal; run `synth verify`")
 
     def __getitem__(self, name: str) -> FieldReader:
-        field, where = _field(name), f"{self._location.name}: {name}"
+        field, where = _field(name), f"{self.path}: {name}"
         if name not in self:
             hint = "; it was made without mechanics.force" if name in ("force", "traction") else ""
             raise UserError(f"{where}: the sequence has no such field{hint}")
@@ -316,25 +311,20 @@ class Sequence:
         rest = "/0" * (len(expected) - 1)
         for k in range(-(-expected[0] // (array.shards or array.chunks)[0])):
             # Zarr reads a missing or empty file as zeros.
-            if not self._location.size(f"{name}/c/{k}{rest}"):
+            if not _size(self.path / f"{name}/c/{k}{rest}"):
                 raise UserError(f"{where}: file c/{k}{rest} is missing or empty, the store is damaged")
-        return FieldReader(array, dtype, where, self._location.folder and self._location.folder / name)
+        return FieldReader(array, dtype, where, self.path / name)
 
 
 class Dataset:
-    """The sealed sequences of a folder or address, sorted by name, with `len`, iteration and indexing."""
+    """The sealed sequences of a folder, sorted by name, with `len`, iteration and indexing."""
 
     @checked
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-        self._addresses: list[str] | None = None
-        if isinstance(root, str) and "://" in root:
-            self._addresses = location.stores(root)
-            self.paths = [Path(address.partition("::")[0]) for address in self._addresses]
-        elif not self.root.is_dir():
+        if not self.root.is_dir():
             raise UserError(f"{self.root}: no such folder")
-        else:
-            self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
+        self.paths = sorted(path for path in self.root.glob("[0-9]*.zarr") if path.is_dir())
         if not self.paths:
             raise UserError(f"{self.root}: contains no finished sequence")
 
@@ -343,7 +333,7 @@ class Dataset:
 
     @checked
     def __getitem__(self, position: int) -> Sequence:
-        return open_sequence((self._addresses or self.paths)[position])
+        return open_sequence(self.paths[position])
 
     def __iter__(self) -> Iterator[Sequence]:
         return (self[position] for position in range(len(self)))
@@ -351,7 +341,7 @@ class Dataset:
 
 @checked
 def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
-    """Opens a sealed sequence, by path or address.
+    """Opens a sealed sequence.
 
     Args:
         path: of the store.
@@ -360,15 +350,15 @@ def open_sequence(path: Path | str, *, sealed: bool = True) -> Sequence:
     Raises:
         UserError: the store is missing, unfinished, not a sequence, truncated or edited.
     """
-    if str(path).partition("::")[0].endswith(".part"):
+    path = Path(path)
+    if path.suffix == ".part":
         raise UserError(f"{path}: is an unfinished sequence")
-    at = location.find_location(path)
-    path = Path(str(path).partition("::")[0])
-    if at.size("zarr.json") > LARGEST_BYTES:
+    if not path.is_dir():
+        raise UserError(f"{path}: no such sequence")
+    if _size(path / "zarr.json") > LARGEST_BYTES:
         raise UserError(f"{path}: its metadata is larger than {LARGEST_BYTES:,} bytes")
     try:
-        group = zarr.open_group(at.store, mode="r", zarr_format=3, use_consolidated=False)
-        sequence = Sequence(path, group, at)
+        sequence = Sequence(path, zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False))
     except Exception as error:  # as in FieldReader
         raise UserError(f"{path}: is not a Zarr v3 group, or its metadata is damaged") from error
     check_attributes(sequence.attrs, str(path))
@@ -391,6 +381,11 @@ def content_hash(attrs: Mapping[str, Any]) -> str:
 def seal_hash(attrs: Mapping[str, Any]) -> str:
     """Hash of all root attributes except itself, timings included, to detect edits."""
     return identity.digest({key: value for key, value in attrs.items() if key != "seal_hash"})
+
+
+def _size(file: Path) -> int:
+    """Bytes of a file; 0 if it is missing."""
+    return file.stat().st_size if file.is_file() else 0
 
 
 def _field(name: str) -> Field:

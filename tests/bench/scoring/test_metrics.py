@@ -25,9 +25,7 @@ def test_lag_is_found_on_uneven_times(late_s: float) -> None:
     def signal(at: np.ndarray) -> np.ndarray:
         return np.sin(1.7 * at) + 0.5 * np.sin(4.1 * at + 1)
 
-    got = metrics.lag(t, signal(t), signal(t - late_s))
-    assert got["lag_s"] == pytest.approx(late_s, abs=0.02)
-    assert got["r_at_lag"] > 0.99
+    assert metrics.lag(t, signal(t), signal(t - late_s)) == pytest.approx(late_s, abs=0.02)
 
 
 def test_contact_has_hysteresis() -> None:
@@ -68,20 +66,7 @@ def test_false_positives_are_counted_only_without_contact() -> None:
     predicted = x + np.where(t < 2, 30.0, 0.0)
     scores, _ = metrics.compute_all(t, x, predicted)
     assert scores["false_positive_rate"] == pytest.approx(np.mean(t[x == 0] < 2))
-    assert scores["background_mn"] == pytest.approx(30 * np.mean(t[x == 0] < 2))
     assert metrics.compute_all(t, x, x)[0]["contact_f1"] == 1
-
-
-def test_limits_of_agreement_account_for_groups_of_correlated_error() -> None:
-    rng = np.random.default_rng(0)
-    group = np.repeat(np.arange(200), 20)
-    difference = rng.normal(0, 3, 200)[group] + rng.normal(0, 4, len(group)) + 1
-    got = metrics.limits_of_agreement(difference, group)
-    assert got["bias_mn"] == pytest.approx(1, abs=0.6)
-    assert got["high_mn"] - got["low_mn"] == pytest.approx(2 * 1.96 * 5, rel=0.05)
-    # With two groups, plain pooling would underestimate the variance between groups.
-    pair = metrics.limits_of_agreement(np.repeat([0.0, 10.0], 50), np.repeat([0, 1], 50))
-    assert pair["high_mn"] - pair["low_mn"] == pytest.approx(2 * 1.96 * np.sqrt(50), rel=0.02)
 
 
 def autoregressive(n: int, phi: float, rng: np.random.Generator) -> np.ndarray:

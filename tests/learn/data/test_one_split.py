@@ -106,7 +106,7 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     assert sides == {"fit": {"train"}, "select": {"validation"}, "test": {"test"}}
     assert sum(map(len, card.split.values())) == len(on)
     clips = load_clips(own, BASE.grid, ["ideal"])
-    assert {clip.content_hash for clip in choose_unseen(clips, own, [card])} == set(card.split["test"])
+    assert {clip.content_hash for clip in choose_unseen(clips, own, card)} == set(card.split["test"])
     grouped = regroup(clips, find_unit(card))
     used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
     assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
@@ -121,10 +121,10 @@ def test_training_sequences_are_not_scored_whatever_another_split_says(tmp_path:
     split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
     clips = load_clips(own, BASE.grid, ["ideal"])
     with pytest.raises(UserError):
-        choose_unseen(clips, own, [card])
+        choose_unseen(clips, own, card)
     # All sequences of a dataset that is new to the model are scored.
     foreign = make(tmp_path / "foreign", [*range(20, 26)], first=30)
-    assert len(choose_unseen(load_clips(foreign, BASE.grid, ["ideal"]), foreign, [card])) == 6
+    assert len(choose_unseen(load_clips(foreign, BASE.grid, ["ideal"]), foreign, card)) == 6
 
 
 def test_several_datasets_keep_their_splits_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:

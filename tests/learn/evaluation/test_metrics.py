@@ -13,7 +13,7 @@ from learn.checkpoint import ModelCard
 from learn.data.clips import Clip
 from learn.evaluation.evaluate import EvaluationReport, score
 from learn.evaluation.metrics import agreement, contact_mm, moments
-from learn.evaluation.statistics import interval, over_groups, pooled_r2
+from learn.evaluation.statistics import over_groups, pooled_r2
 from learn.network.d2fnet import Architecture
 from learn.settings import TrainingSettings
 from learn.training.batches import measure_scales
@@ -98,15 +98,6 @@ def test_opposite_forces_cancel_in_vectors_and_add_up_in_lengths(clips: list[Cli
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-def test_the_interval_has_its_nominal_coverage() -> None:
-    draw = np.random.default_rng(2)
-    hits = 0
-    for _ in range(200):
-        i = interval(draw.exponential(1.0, 30), draw, draws=400)
-        hits += i.low <= 1.0 <= i.high
-    assert 0.87 <= hits / 200 <= 0.99
 
 
 def test_specimens_are_resampled_whole() -> None:

@@ -154,7 +154,7 @@ def test_the_force_gain_corrects_an_underestimate(
     monkeypatch.setattr("learn.training.train.forward", forward)
     select = [dataclasses.replace(clips[i % len(clips)], group=str(i % anatomies)) for i in range(10)]
     chosen = FrameDataset(select, settings)
-    found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings), torch.device("cpu"))
+    found = select_score(torch.nn.Identity(), chosen, measure_scales(clips, settings))
     slope = np.dot(true, predicted) / max(np.dot(predicted, predicted), 1e-30)
     assert found["select_gain"] == pytest.approx(np.clip(slope, low, high), rel=1e-6)
     assert low == high or low < slope < high, "else the limits are tested twice"

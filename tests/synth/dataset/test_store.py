@@ -1,12 +1,7 @@
 """The sequence store: values are read as written, nothing unfinished is visible, damage is reported."""
 
 import shutil
-import threading
-import zipfile
-from collections.abc import Iterator
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -169,64 +164,3 @@ def test_a_truncated_or_flipped_shard_is_an_error_and_never_zeros(root: Path, cu
         open_sequence(root / "000000.zarr")["flow"][:]
     with pytest.raises(UserError, match="flow"):
         [open_sequence(root / "000000.zarr")["flow"][t] for t in range(7)]
-
-
-def test_a_zip_equals_its_folder_and_missing_files_are_named(root: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "out of it.zip"
-    with zipfile.ZipFile(archive, "w") as target:
-        for file in sorted(root.rglob("*.zarr/**/*")):
-            if file.is_file() and file != root / "000001.zarr/depth/c/0/0/0":
-                target.write(file, file.relative_to(root))
-    dataset = Dataset(f"zip://::{archive}")
-    assert [one.index for one in dataset] == [0, 1]
-    assert np.array_equal(dataset[0]["flow"][3], Dataset(root)[0]["flow"][3])
-    assert dataset[1].path.name == "000001.zarr"
-    with pytest.raises(UserError, match="depth"):
-        dataset[1]["depth"]
-    with pytest.raises(UserError):
-        open_sequence(f"zip://000009.zarr::{archive}")
-
-
-class Handler(SimpleHTTPRequestHandler):
-    """Serves files and byte ranges of them, which Python's own handler does not support."""
-
-    def do_GET(self) -> None:
-        path, wanted = Path(self.translate_path(self.path)), self.headers.get("Range", "")
-        if not (wanted and path.is_file()):
-            return super().do_GET()
-        data = path.read_bytes()
-        first, _, last = wanted.removeprefix("bytes=").partition("-")
-        start = int(first) if first else len(data) - int(last)
-        part = data[start : int(last) + 1] if first and last else data[start:]
-        self.send_response(206)
-        self.send_header("Content-Range", f"bytes {start}-{start + len(part) - 1}/{len(data)}")
-        self.send_header("Content-Length", str(len(part)))
-        self.end_headers()
-        self.wfile.write(part)
-        return None
-
-    def log_message(self, *_: Any) -> None:
-        """Nothing on the terminal."""
-
-
-@pytest.fixture
-def server(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.chdir(root)  # which the handler serves
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as serving:
-        thread = threading.Thread(target=serving.serve_forever, daemon=True)
-        thread.start()
-        yield f"http://127.0.0.1:{serving.server_port}"
-        serving.shutdown()
-        thread.join()
-
-
-def test_a_dataset_over_http_equals_its_folder(root: Path, server: str) -> None:
-    pytest.importorskip("aiohttp", reason="fsspec's HTTP needs aiohttp")
-    here, there = Dataset(root), Dataset(server)
-    assert [one.index for one in there] == [0, 1]
-    for name in here[1].fields:
-        assert np.array_equal(there[1][name][:], here[1][name][:])
-    assert np.array_equal(there[0]["flow"][2], here[0]["flow"][2])
-    assert there[0].attrs == here[0].attrs
-    with pytest.raises(UserError, match="no such sequence"):
-        open_sequence(f"{server}/000009.zarr")
