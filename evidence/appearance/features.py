@@ -98,7 +98,7 @@ def of_job(job: Job) -> tuple[Pixels, Ints]:
 
     Pictures are scaled to the photograph's mm per px, if they differ by more than a twentieth.
     """
-    drawn = {name: share for name, share in getattr(job, "randomize", {}).items() if name != "instruments"}
+    drawn = {name: share for name, share in job.randomize.items() if name != "instruments"}
     bare = changed(job, {"fem.instrument": "none", "sensor.bitrate_mbps": None})
     bare = changed(bare, {"randomize": drawn}) if drawn else bare
     pictures, of = [], []
@@ -195,4 +195,5 @@ def page(found: Mapping[str, Any]) -> report.Page:
     )  # fmt: skip
 
 
-STUDY = Study(measure, "render/features/features.json", page, ("{photo}",))
+_STEP = "{photo} --job default --job randomized --frames 60"
+STUDY = Study(measure, "render/features/features.json", page, (_STEP,))

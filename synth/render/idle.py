@@ -85,12 +85,8 @@ def _drawn(rng: np.random.Generator, opening_mm: float, visible_mm: float) -> Id
     high = max(_TISSUE_MM + high, _RIM_MM - np.tan(lean) * (opening_mm - away))
     high += radius if kind in RADII_MM else 1.5
     if cloth:
-        away, lean, high, moves = (
-            min(visible_mm, opening_mm) + rng.uniform(-0.5, 0.7) * radius,
-            np.pi / 2,
-            0.0,
-            0.0,
-        )
+        away, lean = min(visible_mm, opening_mm) + rng.uniform(-0.5, 0.7) * radius, np.pi / 2
+        high = moves = 0.0
     tip = float(away * np.cos(around)), float(away * np.sin(around)), float(high)
     c, s = float(np.cos(hand)), float(np.sin(hand))
     shaft = c * float(np.cos(lean)), s * float(np.cos(lean)), float(np.sin(lean))

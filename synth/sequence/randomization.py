@@ -29,15 +29,8 @@ Keys = dict[str, dict[str, Any]]  # values by section and key
 
 _PATCH_MM = 10.0, 14.0  # radius of an opening in the patch as it is grown, before it is scaled
 _FOR_TWO_MM = 8.0  # least radius of an opening that takes two instruments
-_CONTRASTS = {
-    "spectrum": 0.2,
-    "fat": 0.2,
-    "liver": 0.2,
-    "silicone": 0.2,
-    "cells": 0.7,
-    "speckle": 0.7,
-    "dots": 0.7,
-}
+_CONTRASTS = dict.fromkeys(("spectrum", "fat", "liver", "silicone"), 0.2)
+_CONTRASTS |= dict.fromkeys(("cells", "speckle", "dots"), 0.7)  # least of a kind's colours
 _NATURAL: dict[str, Colours] = {
     "fat": ((0.6, 0.3, 0.05), (0.8, 0.55, 0.15), (0.9, 0.7, 0.35)),
     "liver": ((0.1, 0.01, 0.01), (0.25, 0.04, 0.03), (0.4, 0.1, 0.07)),

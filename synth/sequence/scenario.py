@@ -354,7 +354,6 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     drawn["bump"] *= 1 + 3 * square
     drawn["roughness"] += 0.12 * square
     drawn["dry_roughness"] *= 1 - 0.6 * lighting.glare
-    rng.uniform()  # unused; the draws below stay those of earlier versions
     appearance = Appearance(
         family=family,
         **drawn,

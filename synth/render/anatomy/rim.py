@@ -14,9 +14,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Map
+from synth.arrays import Array, Floats, Map
 from synth.geometry.triangles import Shape, grid_faces
-from synth.render.anatomy import noise, suture
+from synth.render.anatomy import noise
 from synth.render.anatomy.chart import places
 from synth.render.anatomy.layers import Rgb, over, ridge, speckled, step, through
 from synth.render.anatomy.surface import CortexSurface
@@ -51,6 +51,14 @@ class CutEdge:
     albedo: Rgb = (0.88, 0.68, 0.62)  # of its section
     width: float = 0.3
     shadow: Rgb = (0.35, 0.9, 1.0)  # absorption that darkens its underside
+
+
+class Suture:
+    """A stitch's black thread."""
+
+    albedo: Rgb = (0.025, 0.025, 0.035)
+    half_mm: float = 0.075
+    raised_mm: float = 0.08
 
 
 class Dura:
@@ -135,7 +143,7 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     flat = xy.reshape(-1, 2)
     extent = 2 * (radius_mm * 1.25 + _WIDTH_MM)
     lumps = noise.sample(noise.band(rng, 256, extent, 3.5, 0.6), flat, extent).reshape(away.shape)
-    asides = np.stack([suture.aside(angle, stitch) for stitch in stitches]) * float(edge.mean())
+    asides = np.stack([_aside(angle, stitch) for stitch in stitches]) * float(edge.mean())
     dura = _uneven(rng, angle, *Dura.width) + Dura.pulled[0] * ridge(asides, Dura.pulled[1]).max(axis=0)
     wall = dura + _uneven(rng, angle, *Wound.gutter)
     skin = wall + _uneven(rng, angle, *Skin.away)
@@ -241,7 +249,7 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     outer = step((away - reach) / 0.3 + 0.25 * mottle)
     gutter = outer * (1 - step(past / 1.5 + 0.3 * mottle))
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
-    aside = suture.aside(angle, rim.stitches.astype(np.float32)[stitch])
+    aside = _aside(angle, rim.stitches.astype(np.float32)[stitch])
     folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
     soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer)
     dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain)
@@ -266,7 +274,7 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
         cloth = away - _round(rim.cloth, angle)
         colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
     if rim.threads:
-        colour, bumps = suture.threaded(aside * (mean + away), away, colour, bumps)
+        colour, bumps = _threaded(aside * (mean + away), away, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 
@@ -324,3 +332,21 @@ def _under(surface: CortexSurface, xy: Floats) -> Floats:
     r2 = (surface.vertices[:, :2] ** 2).sum(axis=1)
     (slope, _), *_ = np.linalg.lstsq(np.stack([r2, np.ones_like(r2)], 1), surface.vertices[:, 2], rcond=None)
     return np.asarray(height + slope * ((xy**2).sum(axis=1) - (inner**2).sum(axis=1)))
+
+
+def _aside(angle: Array, stitch: Array | float) -> Array:
+    """Signed angle (...) from a stitch, the shorter way [rad]."""
+    return np.mod(angle - stitch + np.pi, 2 * np.pi) - np.pi
+
+
+def _threaded(across: Map, away: Map, colour: Map, bumps: Map) -> tuple[Map, Map]:
+    """Colour (r, n, 3) and bumps mm with threads: two strands from each stitch, meeting far out.
+
+    `across`, `away` (r, n) mm: signed distance from the nearest stitch along the edge, and beyond the edge.
+    """
+    # A loop, round where it pierces the dura, its strands together far out.
+    apart = 0.42 * np.sqrt(np.clip((away - 0.9) / 0.7, 0, 1)) * np.clip(1 - (away - 1.0) / 12.0, 0, 1)
+    line = np.where(away > 0.9, np.abs(np.abs(across) - apart), 9.0)
+    threads = step((Suture.half_mm - line) / 0.06 + 0.2)
+    colour = colour + threads[..., None] * (np.array(Suture.albedo, np.float32) - colour)
+    return colour, bumps + np.float32(Suture.raised_mm) * threads

@@ -82,44 +82,29 @@ def test_draws_are_wider_than_the_usual(low: float, high: float, of) -> None:  #
 
 def test_contacts_are_in_view_and_kinds_are_all_drawn() -> None:
     for one, case in drawn():
-        radius = camera.blur_radius(
-            camera.place(case.view, one.render), np.array([case.view.working_distance_mm])
-        )
-        assert radius[0] < 2.6, "px, of defocus"
-        at = camera.project(
-            camera.place(case.view, one.render), np.array([(*g.point_mm, 0.0) for g in case.gestures])
-        )
-        assert (at > 0).all()
-        assert (at < [95, 71]).all()
+        lens, away = camera.place(case.view, one.render), np.array([case.view.working_distance_mm])
+        assert camera.blur_radius(lens, away)[0] < 2.6, "px, of defocus"
+        at = camera.project(lens, np.array([(*g.point_mm, 0.0) for g in case.gestures]))
+        assert ((at > 0) & (at < [95, 71])).all()
         assert sum(lamp.share for lamp in case.appearance.light.lamps) == pytest.approx(1)
     hows = [case.randomized for _, case in drawn() if case.randomized]
-    assert {how.surroundings.kind for how in hows if how.surroundings} >= {
-        "drape",
-        "paper",
-        "metal",
-        "nothing",
-    }
-    coats = [how.pattern for how in hows if how.pattern]
+    sheets, coats = ([vars(how)[of] for how in hows if vars(how)[of]] for of in ("surroundings", "pattern"))
+    assert {one.kind for one in sheets} >= {"drape", "paper", "metal", "nothing"}
     assert {one.kind for one in coats} >= {"spectrum", "cells", "speckle", "dots", "fat", "liver", "silicone"}
     middle = np.array([one.colours[1] for one in coats])
     assert set(middle.argmax(axis=1)) == {0, 1, 2}, "red, green and blue tissue"
     assert middle.mean(axis=1).min() < 0.15 < 0.5 < middle.mean(axis=1).max()
-    grey = [
-        how.surroundings.pattern.colours
-        for how in hows
-        if how.surroundings and how.surroundings.kind == "metal"
-    ]
-    assert np.ptp(grey, axis=2).max() < 1e-12
+    assert np.ptp([one.pattern.colours for one in sheets if one.kind == "metal"], axis=2).max() < 1e-12, (
+        "grey"
+    )
     assert any(one.sensor.bitrate_mbps for one, _ in drawn())
 
 
 @pytest.mark.parametrize("layout", ["hole", "corner", "edges"])
 def test_tissue_is_visible_through_a_hole_in_a_corner_or_from_edge_to_edge(layout: str) -> None:
     for k, (_, case) in enumerate(drawn()):
-        aside, sheet = (
-            max(map(abs, case.view.off_centre)) > 0.2,
-            case.randomized and case.randomized.surroundings,
-        )
+        aside = max(map(abs, case.view.off_centre)) > 0.2
+        sheet = case.randomized and case.randomized.surroundings
         wide = drawn()[k][0].anatomy.craniotomy.radius_mm / case.view.field_mm > 0.65
         if (aside, wide) == (layout == "corner", layout == "edges") and sheet and sheet.kind != "nothing":
             break
@@ -190,9 +175,8 @@ def test_blur_and_fewer_pixels_take_the_highest_frequencies(soft: dict[str, floa
 def test_halos_are_as_wide_as_drawn_and_subsampling_and_codec_take_detail() -> None:
     edge = np.full((40, 80, 3), 0.2, np.float32)
     edge[:, 40:] = 0.5
-    rows = [
-        taken(edge, replace(SENSOR, sharpening=2.0, halo_px=px))[20, 40:, 1].astype(int) for px in (1.0, 3.0)
-    ]
+    sharp = (replace(SENSOR, sharpening=2.0, halo_px=px) for px in (1.0, 3.0))
+    rows = [taken(edge, one)[20, 40:, 1].astype(int) for one in sharp]
     narrow, wide = ((row - row[-1] > 2).sum() for row in rows)
     assert wide > 2 * narrow > 0
     odd = np.indices((72, 96)).sum(axis=0)[..., None] % 2
@@ -200,9 +184,7 @@ def test_halos_are_as_wide_as_drawn_and_subsampling_and_codec_take_detail() -> N
     full, half = (np.ptp(taken(checks, replace(SENSOR, chroma=one))[..., 0]) for one in ("4:4:4", "4:2:0"))
     assert half < 0.6 * full
     noisy = np.random.default_rng(1).integers(0, 255, (3, 72, 96, 3), dtype=np.uint8)
-    coded = min(
-        (one for one, _ in drawn() if one.sensor.bitrate_mbps), key=lambda one: one.sensor.bitrate_mbps or 9
-    )
+    coded = min((one for one, _ in drawn()), key=lambda one: one.sensor.bitrate_mbps or 9)
     assert np.abs(recorded(noisy, coded.sensor, coded.fps).astype(int) - noisy).mean() > 10
 
 
