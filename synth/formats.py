@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from synth.errors import UserError
 
-STORE, FOLDER, MODEL, SCORE = 2, 3, 2, 2
+STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
 MOTION = 1
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since

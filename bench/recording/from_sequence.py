@@ -18,11 +18,7 @@ _PAIR = "stereo.yaml"
 
 
 @checked
-def export_recording(
-    sequence: Sequence,
-    folder: str | Path,
-    instrument: int | None = None,
-) -> Path:
+def export_recording(sequence: Sequence, folder: str | Path, instrument: int | None = None) -> Path:
     """Writes one recording: frames, times, force in camera axes, tool masks, tissue, meta.yaml.
 
     A stereo sequence adds the right camera and the calibration. Ground truth that a real recording lacks is

@@ -169,11 +169,7 @@ def contact_scores(sensor: Floats, predicted: Floats, threshold_mn: float) -> di
 
 
 def compute_all(
-    time_s: Floats,
-    sensor: Floats,
-    predicted: Floats,
-    noise_floor_mn: float = 0.0,
-    used: Mask | None = None,
+    time_s: Floats, sensor: Floats, predicted: Floats, noise_floor_mn: float = 0.0, used: Mask | None = None
 ) -> tuple[dict[str, float], list[dict[str, float]]]:
     """All scores of a predicted curve against a sensor's, and the table of its contacts.
 

@@ -106,10 +106,7 @@ def _choose_model(
 
 
 def _choose_methods(
-    network: Model | None,
-    model: Path | Predictor | None,
-    own: Mapping[str, Method],
-    baselines: bool,
+    network: Model | None, model: Path | Predictor | None, own: Mapping[str, Method], baselines: bool
 ) -> dict[str, Method]:
     """All methods by name, in the table's order; the result is about the first."""
     chosen: dict[str, Method] = {} if network is None else {MAIN: network}

@@ -14,7 +14,7 @@ from learn.data.grid import Scales, channels, divergence, membrane_code
 from learn.settings import TrainingSettings
 from synth.errors import UserError
 
-SHARE = 0.6  # of a GPU's free memory that frames may take; the rest is the network's
+SHARE = 0.3  # of a GPU's free memory that frames of a part may take: those to fit, and those to select by
 _CPU = torch.device("cpu")
 MEMBRANE_HIDDEN = 1 / 3  # share of training frames with an unknown membrane: `arch.membrane` works without it
 

@@ -60,11 +60,10 @@ class Folder:
         """The dataset's job; its plug-ins need not be installed."""
         described = self.described()
         job = described["job"]
-        names = ("appearance", "render", "fem")
-        if described["format_version"] < 3 and all(isinstance(job.get(name), dict) for name in names):
-            job["appearance"].pop("cottonoid", None)
-            if not job["render"].pop("tool", True):
-                job["fem"]["instrument"] = "none"
+        render, sensor = job.get("render"), job.get("sensor")
+        if described["format_version"] < 4 and isinstance(render, dict) and isinstance(sensor, dict):
+            render["scenery"] = [part for part in render.get("scenery", ()) if part != "cottonoid"]
+            sensor["blur_px"] = sensor.get("blur_px", 0.0) * 640 / render.get("size", (640,))[0]
         return validated(Job, job, f"{self.root / _NAME}: is damaged", STORED)
 
     def sealed(self) -> list[int]:

@@ -28,20 +28,10 @@ class OpenCvTvl1:
         self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
     ) -> tuple[Map, Map]:
         """See `Estimator.flow`."""
-        solver = _cv2.optflow.DualTVL1OpticalFlow_create(
-            tau=0.25,
-            lambda_=self.weight,
-            theta=0.3,
-            nscales=5,
-            warps=self.warps,
-            epsilon=0.01,
-            innnerIterations=10,
-            outerIterations=1,
-            scaleStep=0.5,
-            gamma=0.0,
-            medianFiltering=5,
-            useInitialFlow=initial is not None,
-        )
+        pyramid = {"nscales": 5, "scaleStep": 0.5, "warps": self.warps, "useInitialFlow": initial is not None}
+        energy = {"tau": 0.25, "lambda_": self.weight, "theta": 0.3, "gamma": 0.0, "epsilon": 0.01}
+        rounds = {"outerIterations": 1, "innnerIterations": 10, "medianFiltering": 5}
+        solver = _cv2.optflow.DualTVL1OpticalFlow_create(**pyramid, **energy, **rounds)
         return _solve(solver, rest, now, rest_usable, now_usable, initial)
 
 

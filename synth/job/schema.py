@@ -17,7 +17,17 @@ from synth.job.mechanics import PulseSection as PulseSection
 from synth.job.microscope import LightSection as LightSection
 from synth.job.microscope import RenderSection as RenderSection
 from synth.job.microscope import SensorSection as SensorSection
-from synth.job.types import Direction, Group, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
+from synth.job.types import (
+    Direction,
+    Groups,
+    NonNegative,
+    PlugInName,
+    Positive,
+    Range,
+    Section,
+    Share,
+    Vector,
+)
 from synth.plugins import ESTIMATORS, STORED
 
 
@@ -213,7 +223,7 @@ class Job(Section):
     fem: FemSection = FemSection()
     render: RenderSection = RenderSection()
     flow: FlowSection = FlowSection()
-    randomize: dict[Group, Share] = Field(default_factory=dict)
+    randomize: Groups = Groups()
     """Domain randomisation, wider than reality: groups, each with its strength from 0 (off) to 1, such as
     {texture: 1, light: 0.5}. A group draws its keys anew for every sequence and replaces the job's values of
     them. Needs a procedural block for `field`."""
@@ -232,9 +242,12 @@ class Job(Section):
             anatomy = self.anatomy.model_copy(update={"vertices": fine})
             anatomy.model_fields_set.discard("vertices")  # so that they follow a later change of the size
             object.__setattr__(self, "anatomy", anatomy)
-        given = self.anatomy.mesh or self.mechanics.source or self.render.calibration
-        if self.randomize.get("field") and given is not None:
-            raise ValueError("randomize.field: needs a procedural block and a camera without calibration")
+        fixed = self.anatomy.mesh, self.mechanics.source, self.render.calibration, self.fem.instrument_list
+        if self.randomize.get("field") and any(fixed):
+            needs = "a procedural block, a camera without calibration, and no fem.instrument_list"
+            raise ValueError(f"randomize.field: needs {needs}")
+        if self.randomize.get("instruments") and self.mechanics.source is not None:
+            raise ValueError("randomize.instruments: idle ones may be in the way of mechanics.source")
         right = [name for name in self.store.extra if name.endswith("_right")]
         if right and self.render.stereo_mm == 0:
             raise ValueError(f"store.extra: {right[0]} needs a right camera; set render.stereo_mm")

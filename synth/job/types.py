@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import GetCoreSchemaHandler as Handler
+from pydantic_core.core_schema import no_info_after_validator_function
 
 Number = TypeVar("Number")
 
@@ -55,4 +57,18 @@ MembraneState = Literal["stripped", "unknown", "intact"]
 Scenery = Literal["retractor", "bone", "drape"]
 Group = Literal["instruments", "texture", "surroundings", "light", "camera", "field"]
 """What domain randomisation draws at random."""
+
+
+class Groups(dict[Group, float]):
+    """Groups that are on, with their strengths; hashable, as a job is."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Handler) -> Any:
+        known = handler(dict[Group, Share])
+        return no_info_after_validator_function(lambda got: cls({k: v for k, v in got.items() if v}), known)
+
+
 PlugInName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=100)]

@@ -56,7 +56,10 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
         touching = (np.concatenate(part) for part in zip(*ready, strict=True))
         tips, shafts = with_idle(scene.scenario.idle, 0.0, *touching)
         state = SceneState(scene.surface.vertices, tips, shafts)
-    scene = replace(scene, view=resized(scene.view, size))
+    sensor, part = scene.scenario.appearance.sensor, size[0] / job.render.size[0]
+    sensor = replace(sensor, blur=part * sensor.blur)  # which is in px of the whole picture
+    case = replace(scene.scenario, appearance=replace(scene.scenario.appearance, sensor=sensor))
+    scene = replace(scene, view=resized(scene.view, size), scenario=case)
     frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
     acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")

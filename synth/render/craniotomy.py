@@ -25,7 +25,7 @@ from synth.render.finish import Finish
 from synth.render.idle import IdleInstrument
 from synth.render.materials import Body, Coat, Metal, Wet
 from synth.render.randomized import pattern, surroundings
-from synth.render.randomized.randomization import Randomization
+from synth.render.randomized.surroundings import Randomization
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
@@ -95,7 +95,7 @@ def craniotomy(
 def _retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int) -> Body:
     """A straight blade on the rim, its end over the opening's edge."""
     rng = np.random.default_rng([seed, 5])
-    turn, lean, inside, wide = rng.uniform((0, 0.1, 0.8, 3.5), (2 * np.pi, 0.2, 2.0, 5.2))
+    turn, lean, inside, wide = rng.uniform((0, 0.1, 1.5, 3.5), (2 * np.pi, 0.2, 3.5, 5.2))
     parts, half = instrument.shape_of("spatula", float(wide))
     out, up = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([0.0, 0.0, 1.0])
     start = float(edge[int(turn / (2 * np.pi) * len(edge))]) - inside

@@ -142,10 +142,7 @@ def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part
     """A cloth that lies on points (N, 3) mm, gauze in folds."""
     half = one.radius_mm, one.radius_mm * (0.46 if one.kind == "patty" else 0.8)
     rows, columns = (int(2 * side / _SHEET_MM) for side in half)
-    sides = (
-        np.linspace(-half[0], half[0], rows),
-        np.linspace(half[1], -half[1], columns),
-    )
+    sides = (np.linspace(-half[0], half[0], rows), np.linspace(half[1], -half[1], columns))
     u, v = (axis.ravel() for axis in np.meshgrid(*sides, indexing="ij"))  # faces turn upwards
     (tip, _), (shaft, _) = one.at(0.0)
     at = np.column_stack([u, v, np.zeros(len(u))])

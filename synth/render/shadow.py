@@ -55,11 +55,11 @@ def shadow_map(hits: Hits, shapes: Sequence[Shape], lamps: Sequence[Lamp], size:
     at = at[shaded]
     normal = blend(scene.faces, hits.face[at], hits.bary[at], bent)
     light = np.zeros((len(at), 2))  # that arrives without the instruments, and what they take of it
-    for lamp, (start, axes, local, vertices, taken) in zip(lamps, views, strict=True):
-        local = np.ascontiguousarray(local[shaded])
-        others = _blocked(start, local, vertices, around)
+    for lamp, (start, axes, near, vertices, taken) in zip(lamps, views, strict=True):
+        near = np.ascontiguousarray(near[shaded])
+        others = _blocked(start, near, vertices, around)
         power = float(lamp.intensity.sum())
-        _add_light(start, local, normal @ axes.T, power, others, taken[shaded], light)
+        _add_light(start, near, normal @ axes.T, power, others, taken[shaded], light)
     found = np.zeros(size[0] * size[1], np.float32)
     found[at] = light[:, 1] / np.maximum(light[:, 0], 1e-300)
     return found.reshape(size[::-1])

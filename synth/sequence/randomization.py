@@ -16,12 +16,11 @@ from synth.job.schema import AttachmentSection, Job
 from synth.job.types import Group, Scenery
 from synth.render.appearance.family import Appearance, Colour
 from synth.render.appearance.light import FreeLamp, Lighting, blackbody
-from synth.render.camera.camera import CameraView
+from synth.render.camera.camera import CameraView, place
 from synth.render.camera.camera_sensor import BLUR_WIDTH_PX
 from synth.render.camera.colour_processing import KNOTS, encoded
 from synth.render.randomized.pattern import Pattern
-from synth.render.randomized.randomization import Randomization
-from synth.render.randomized.surroundings import Surroundings
+from synth.render.randomized.surroundings import Randomization, Surroundings
 
 Ends = tuple[float, float]
 Colours = tuple[Colour, Colour, Colour]
@@ -133,7 +132,7 @@ def vary_view(view: CameraView, job: Job, index: int) -> CameraView:
     x, y = _draw_field(job, index)[2] if job.randomize.get("field") else (0.0, 0.0)
     # Radius of the circle of confusion: 2 px at most; stronger ones are rarer.
     defocus_px = 2.0 * draw.strength * draw.rng.uniform(-1, 1) ** 3
-    share = defocus_px * view.field_mm / across / max(job.render.aperture_mm, 0.1)
+    share = defocus_px * place(view, job.render).mm_per_px / max(job.render.aperture_mm, 0.1)
     share = float(np.clip(share, -0.5, 0.5))  # of the plane's distance by which it is out of focus
     focus_mm = view.focus_mm + view.working_distance_mm * share / (1 - share)
     return replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))

@@ -30,7 +30,7 @@ from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import BLUR_WIDTH_PX, CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
 from synth.render.idle import IdleInstrument, draw_idle
-from synth.render.randomized.randomization import Randomization
+from synth.render.randomized.surroundings import Randomization
 from synth.sequence.randomization import draw_randomization, randomized, vary_appearance, vary_view
 
 Random = np.random.Generator
@@ -91,7 +91,8 @@ class Scenario:
 def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenario:
     """Draws sequence `index` of `job`, independently of the others' number and order.
 
-    `attempt`: number of earlier draws of its gestures; all else is the same in every attempt.
+    `attempt`: number of earlier draws of its gestures; all else is the same in every attempt
+    but idle instruments, which keep away from them.
     """
     job = as_job(job)
     if index < 0:
@@ -173,12 +174,12 @@ def draw_gestures(
     Raises UserError if not all instruments fit into the opening, or not in their places.
     """
     given, (fewest, most) = fem.instrument_list, fem.instruments
-    count = max(int(others.integers(fewest, most + 1)), len(given))
-    wanted = [*given, *[InstrumentSection()] * (count - len(given))]
-    order = sorted(range(count), key=lambda k: wanted[k].place is None)
+    drawn = max(int(others.integers(fewest, most + 1)), len(given))
     sight, least = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
-    for _ in range(_ROUNDS):  # all anew: the shaft of one may be in the way of the next
-        found: dict[int, Gesture] = {}
+    # Each time all anew: the shaft of one may be in the way of the next. At last fewer, if the job allows it.
+    for count in (*[drawn] * _ROUNDS, *range(drawn - 1, max(fewest, len(given)) - 1, -1)):
+        wanted = [*given, *[InstrumentSection()] * (count - len(given))]
+        order, found = sorted(range(count), key=lambda k: wanted[k].place is None), dict[int, Gesture]()
         for k in order:
             for _ in range(_TRIES):
                 own = others if k else rng

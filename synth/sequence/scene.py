@@ -241,9 +241,10 @@ def at_rest(
 ) -> RestScene:
     """Draws sequence `index` of a job and builds its surface and renderer.
 
-    The renderer accepts any state: `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`. `case`:
-    a scenario to use instead of the drawn one; `content`: what is drawn around the surface and of it,
-    `draw_craniotomy` if None. UserError: the job's surface or calibration cannot be used.
+    The renderer takes any state, `scene.renderer.render(SceneState(vertices, tips, shafts), seed)`: two tips
+    and shafts of each of `instruments`, idle ones last. `case`: a scenario instead of the drawn one;
+    `content`: what is drawn around the surface and of it, `draw_craniotomy` if None. UserError: the job's
+    surface or calibration cannot be used.
     """
     case = case or scenario.draw_scenario(job, index)
     dataset, job = job, randomized(job, index)

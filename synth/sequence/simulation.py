@@ -60,7 +60,7 @@ def simulate(
         raise UserError(f"sequence {index}: the job has sequences 0 to {job.sequences - 1}")
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
-    ours = mechanics is None and not len(motions)
+    ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
     stated = any(one.load or one.force_mn for one in job.fem.instrument_list)
     left = 0 if case or stated or not ours else ATTEMPTS - 1
     case = case or draw_scenario(job, index)

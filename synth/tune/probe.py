@@ -21,6 +21,7 @@ from synth.flow.estimator import create
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.camera import camera
+from synth.sequence.scenario import draw_scenario
 from synth.sequence.scene import Frame, Scene, at_rest
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import Stopwatch
@@ -39,7 +40,7 @@ class Probe:
         """UserError if the sequence cannot be carried out, or shows no force."""
         scene = simulate(job)  # which also compiles what all others need: it counts for no cost
         frames = [scene.frame(round(part * scene.strongest)) for part in _PARTS]
-        self._numbers = [frame.index for frame in frames]
+        self._numbers, self._attempt = [frame.index for frame in frames], scene.scenario.attempt
         self._weights = linearise(scene, frames)
         self._true_mm = np.stack([cells_mm(scene, frame.flow) for frame in frames])
 
@@ -52,7 +53,7 @@ class Probe:
         at_rest(job)  # grows the surface, which stays in memory for other settings: it counts for none
         watch = Stopwatch()
         with watch.stage("physics"):
-            scene = simulate(job)
+            scene = simulate(job, case=draw_scenario(job, 0, self._attempt))
         with watch.stage("scene"):  # the first frame prepares it
             rest = scene.frame(0)
         with watch.stage("rendering"):
@@ -88,7 +89,7 @@ def linearise(scene: Scene, frames: list[Frame]) -> Floats:
     own = [trajectory(gesture, scene.job.frames) for gesture in scene.scenario.gestures]
     for i, stronger in enumerate(own):
         weaker = [*own[:i], replace(stronger, load=(1 - _LESS) * stronger.load), *own[i + 1 :]]
-        moved = simulate(scene.job, motions=weaker).motion.displacement
+        moved = simulate(scene.dataset, case=scene.scenario, motions=weaker).motion.displacement
         for k in np.flatnonzero(force[:, i] >= _FAINT):
             states = (rest + state[numbers[k]] for state in (scene.motion.displacement, moved))
             pixels = np.subtract(*(camera.project(scene.view, state) for state in states))

@@ -165,13 +165,9 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
     writer.put("disparity", np.full((height, width), 1.0 if fault == "disparity" else 0.0))
     baseline = job.render.stereo_mm
     shifted = width / 2 + focal * baseline / distance
-    right = {
-        "K": [[focal, 0, shifted], [0, focal, height / 2], [0, 0, 1]],
-        "distortion": [0.0] * 5,
-        "rotation": np.eye(3).tolist(),
-        "translation": [-baseline, 0.0, distance],
-        "baseline_mm": baseline,
-    }
+    both = {"distortion": [0.0] * 5, "rotation": np.eye(3).tolist()}
+    right = both | {"K": [[focal, 0, shifted], [0, focal, height / 2], [0, 0, 1]], "baseline_mm": baseline}
+    right["translation"] = [-baseline, 0.0, distance]
     focal *= 0.5 if fault == "camera" else 1.0
     tip = np.zeros((frames, 2, 3))
     tip[:, :, 0] = (6.0 * share * distance / 1000.0 + (3.0 if fault == "contact" else 0.0))[:, None]
@@ -180,19 +176,11 @@ def consistent(job: Job, index: int, folder: Path, report: ProgressCallback, fau
     described = attributes(index, rng)
     described["scenario"]["gestures"][0]["footprint_mm"] = 3.0
     described["scale_mm_per_px"] = distance / 1000.0 * (1.5 if fault == "scale" else 1.0)
-    writer.seal(
-        **described,
-        K=[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]],
-        distortion=[0.0] * 5,
-        rotation=np.eye(3).tolist(),
-        translation=[0.0, 0.0, distance],
-        **({"right": right} if baseline else {}),
-        mechanics={
-            "elastic": True,
-            "energy_mn_mm": energy.tolist(),
-            "instruments": [{"tip_mm": tip.tolist(), "force_mn": force.tolist()}],
-        },
-    )
+    described["translation"] = [0.0, 0.0, distance]
+    described["K"] = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    instruments = [{"tip_mm": tip.tolist(), "force_mn": force.tolist()}]
+    mechanics = {"elastic": True, "energy_mn_mm": energy.tolist(), "instruments": instruments}
+    writer.seal(**described, **both, **({"right": right} if baseline else {}), mechanics=mechanics)
 
 
 def _texture(rng: np.random.Generator) -> Callable[..., Any]:

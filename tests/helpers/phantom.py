@@ -19,12 +19,6 @@ RADIUS_MM = 4.0
 NOISE_PX = 0.05
 
 
-def density(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of the force a mm², (1 − r²/a²)² inside the contact; integrates to 1."""
-    r2 = (x**2 + y**2) / RADIUS_MM**2
-    return np.where(r2 < 1, (1 - np.minimum(r2, 1)) ** 2, 0.0) * 3 / (np.pi * RADIUS_MM**2)
-
-
 def displacement(
     x: NDArray[np.float64], y: NDArray[np.float64], force: NDArray[np.float64], young_kpa: float
 ) -> NDArray[np.float64]:
@@ -85,7 +79,7 @@ def write(
     writer.put("tissue", tissue)
     writer.put("area", area)
     writer.put("disparity", np.zeros(SIZE, np.float32))
-    share = density(gx, gy)
+    share = (1 - np.minimum((gx**2 + gy**2) / RADIUS_MM**2, 1)) ** 2  # (1 − r²/a²)² inside the contact
     share /= (share * area).sum()
     picture = np.random.default_rng(index).integers(60, 120, (*SIZE, 3), dtype=np.uint8)
     for t, level in enumerate(ramp):

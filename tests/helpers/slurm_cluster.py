@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 PROGRAMS = ("slurmctld", "slurmd", "sbatch", "scancel", "scontrol", "squeue")
 
 _CONFIGURATION = """
@@ -60,41 +62,29 @@ def slurm_cluster(home: Path) -> Iterator[str]:
     host = socket.gethostname().split(".")[0]
     for name in ("state", "spool"):
         (home / name).mkdir(parents=True)
-    ports = _free_ports(2)
-    text = _CONFIGURATION.format(home=home, host=host, controller=ports[0], daemon=ports[1])
-    (home / "slurm.conf").write_text(text)
-    before = os.environ.get("SLURM_CONF")
-    os.environ["SLURM_CONF"] = str(home / "slurm.conf")
+    with socket.socket() as one, socket.socket() as other:
+        for free in (one, other):
+            free.bind(("127.0.0.1", 0))
+        ports = {"controller": one.getsockname()[1], "daemon": other.getsockname()[1]}
+    (home / "slurm.conf").write_text(_CONFIGURATION.format(home=home, host=host, **ports))
     daemons: list[subprocess.Popen[bytes]] = []
-    try:
-        for program in ("slurmctld", "slurmd"):
-            log = (home / f"{program}.out").open("wb")
-            daemons.append(subprocess.Popen([program, "-D"], stdout=log, stderr=log))
-            log.close()
-        _wait_for_node(daemons, home)
-        yield host
-    finally:
-        for daemon in reversed(daemons):
-            daemon.terminate()
-        for daemon in daemons:
-            try:
-                daemon.wait(timeout=20)
-            except subprocess.TimeoutExpired:
-                daemon.kill()
-        if before is None:
-            del os.environ["SLURM_CONF"]
-        else:
-            os.environ["SLURM_CONF"] = before
-
-
-def _free_ports(count: int) -> list[int]:
-    held = [socket.socket() for _ in range(count)]
-    for one in held:
-        one.bind(("127.0.0.1", 0))
-    ports = [one.getsockname()[1] for one in held]
-    for one in held:
-        one.close()
-    return ports
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("SLURM_CONF", str(home / "slurm.conf"))
+        try:
+            for program in ("slurmctld", "slurmd"):
+                log = (home / f"{program}.out").open("wb")
+                daemons.append(subprocess.Popen([program, "-D"], stdout=log, stderr=log))
+                log.close()
+            _wait_for_node(daemons, home)
+            yield host
+        finally:
+            for daemon in reversed(daemons):
+                daemon.terminate()
+            for daemon in daemons:
+                try:
+                    daemon.wait(timeout=20)
+                except subprocess.TimeoutExpired:
+                    daemon.kill()
 
 
 def _wait_for_node(daemons: list[subprocess.Popen[bytes]], home: Path) -> None:

@@ -40,18 +40,12 @@ def write_meshes(dataset: Dataset, target: Path) -> None:
         same = known.shape == now.shape and np.allclose(known, now, _ROUNDING, 1e-6, equal_nan=True)
         if not same or sequence.attrs["job"] != name_of_job:
             raise UserError(f"{sequence.path}: can't be simulated again from the dataset's job")
-        _write(
-            target, name, scene.time, ((*scene.shape, TRIANGLE, _fields(scene, t)) for t in range(len(scene)))
-        )
+        outside = ((*scene.shape, TRIANGLE, _fields(scene, t)) for t in range(len(scene)))
+        _write(target, name, scene.time, outside)
         if (under := scene.motion.volume) is not None:
             each = zip(under.displacement, under.stress, strict=True)
-            fields = ({"displacement": moved, "stress": stress} for moved, stress in each)
-            _write(
-                target,
-                f"{name}-volume",
-                scene.time,
-                ((under.points, under.cells, _TET, one) for one in fields),
-            )
+            inside = ((under.points, under.cells, _TET, {"displacement": u, "stress": s}) for u, s in each)
+            _write(target, f"{name}-volume", scene.time, inside)
 
 
 def _write(

@@ -1,4 +1,4 @@
-"""Randomised surroundings: a sheet with a hole over the tissue, in place of the rim of a craniotomy.
+"""Randomisation of one sequence, and its surroundings: a sheet with a hole in place of a craniotomy's rim.
 
 Shapes were chosen by eye.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from synth.arrays import Floats
 from synth.geometry.triangles import grid_faces
 from synth.render.anatomy import noise
+from synth.render.appearance.family import Colour
 from synth.render.materials import Body, Wet
 from synth.render.randomized.pattern import Pattern, paint
 
@@ -31,6 +32,17 @@ class Surroundings:
     rise: float  # outwards, a slope
     folds: float  # height of its folds
     index: float  # refractive index of its coat
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """What neither a job's keys nor an appearance express; of a group that is off as here."""
+
+    scale: float = 1.0  # of the tissue: mm in a mm of the patch as it is grown and painted
+    pattern: Pattern | None = None  # on the tissue; None: a painted cortex, or the job's photograph
+    tint: Colour = (1.0, 1.0, 1.0)  # linear RGB of a cortex or photograph
+    tinted: float = 0.0  # share of its colour that the tint replaces
+    surroundings: Surroundings | None = None  # None: the rim of a craniotomy
 
 
 def sheet(drawn: Surroundings, tissue: Floats, radius_mm: float, width_mm: float, ambient: Floats) -> Body:

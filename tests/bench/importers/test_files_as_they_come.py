@@ -115,18 +115,15 @@ def test_stacks_bits_numbers_and_hidden_files(tmp_path: Path) -> None:
 def test_tables_of_forces(tmp_path: Path) -> None:
     """The stamp counts, not the arrival; blank rows are left out; units, dates and encodings are read."""
     np.save(tmp_path / "v.npy", np.zeros((3, 48, 64), np.uint8))
-    for text, expected in (
-        (
-            "%time,field.header.stamp,a.force.x,a.force.y,a.force.z\n9e9,17e17,1,2,3\n9e9,17000000001e8,1,2,3",
-            [0, 0.1],
-        ),
-        ("time (ms);Fx (N);Fy (N);Fz (N)\n0;1;2;3\n50;;;\n100,0;1;2;3", [0, 0.1]),
-        ("timestamp,fx,fy,fz\n2023-11-14T22:13:20Z,1,2,3\n2023-11-14 22:13:20.1,1,2,3", [0, 0.1]),
-        ("t,fx,fy,fz\n1700000000000000,1,2,3\n1700000000100000,1,2,3", [0, 0.1]),
+    for text in (
+        "%time,field.header.stamp,a.force.x,a.force.y,a.force.z\n9e9,17e17,1,2,3\n9e9,17000000001e8,1,2,3",
+        "time (ms);Fx (N);Fy (N);Fz (N)\n0;1;2;3\n50;;;\n100,0;1;2;3",
+        "timestamp,fx,fy,fz\n2023-11-14T22:13:20Z,1,2,3\n2023-11-14 22:13:20.1,1,2,3",
+        "t,fx,fy,fz\n1700000000000000,1,2,3\n1700000000100000,1,2,3",
     ):
         (tmp_path / "f.csv").write_text(text, "utf-16")
         found = registry.read_source(tmp_path / "v.npy", {"fps": "10", "force": str(tmp_path / "f.csv")})
-        assert found.force_s - found.force_s[0] == pytest.approx(expected, abs=1e-6)
+        assert found.force_s - found.force_s[0] == pytest.approx([0, 0.1], abs=1e-6)
         assert found.force.tolist() == 2 * [[1, 2, 3]]
     (tmp_path / "f.csv").write_text("t,fx\nnoon,1\n")
     with pytest.raises(UserError, match=":2:"):

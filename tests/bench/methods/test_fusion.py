@@ -23,12 +23,14 @@ def fuse_one(network: ForceEstimate, physics: ForceEstimate) -> ForceEstimate:
     return Fusion("network", "physics").fuse([{"network": network, "physics": physics}], SCENE, 2)[0]
 
 
-def test_gaussians_are_weighted_by_their_precisions() -> None:
+def test_gaussians_are_weighted_by_their_precisions_and_the_network_alone_without_a_stated_error() -> None:
     a, b = np.array([3.0, 0.0, 1.0]), np.array([1.0, 2.0, 0.0])
     physics = estimate([b], [0.5], [1.0])
     found = fuse_one(estimate([a], [1 / CAUTION], [1.0]), physics)
     np.testing.assert_allclose(found.force_mn, (a + 4 * b) / 5)
     np.testing.assert_allclose(physics.likely.observe(a, np.eye(3)).covariance[0], np.eye(3) / 5, atol=1e-12)
+    alone = fuse_one(estimate([a], [1.0], [1.0]), ForceEstimate(b))
+    np.testing.assert_array_equal(alone.force_mn, a)
 
 
 def test_components_that_contradict_the_network_lose_weight() -> None:
@@ -37,11 +39,6 @@ def test_components_that_contradict_the_network_lose_weight() -> None:
     odds = 0.7 / 0.3 * np.exp(-(3.0**2) / 2)  # variances add up to 1
     found = physics.observe(near, 0.36 * np.eye(3))
     np.testing.assert_allclose(found.weight, [1 / (1 + odds), odds / (1 + odds)])
-
-
-def test_without_a_stated_error_the_network_is_used_alone() -> None:
-    network, physics = estimate([np.ones(3)], [1.0], [1.0]), ForceEstimate(np.zeros(3))
-    np.testing.assert_array_equal(fuse_one(network, physics).force_mn, network.force_mn)
 
 
 def test_intervals_have_90_percent_coverage() -> None:

@@ -20,7 +20,7 @@ from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import RecordingFlowSettings
-from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, ROWS, K
+from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, ROWS, K, source
 
 FPS = 6.0
 DENT = np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 22.0**2))
@@ -35,14 +35,6 @@ def warped(along: np.ndarray) -> np.ndarray:
     wide = cv2.resize(data.astronaut(), (420, 420), interpolation=cv2.INTER_AREA)
     x = source(along) + 60
     return np.asarray(cv2.remap(wide, x.astype(np.float32), (ROWS + 30).astype(np.float32), cv2.INTER_CUBIC))
-
-
-def source(along: np.ndarray) -> np.ndarray:
-    """Rest columns (H, W) that are visible at each pixel."""
-    x = COLUMNS.astype(np.float64)
-    for _ in range(40):
-        x = COLUMNS - cv2.remap(along, x.astype(np.float32), ROWS.astype(np.float32), cv2.INTER_LINEAR)
-    return x
 
 
 def rise(amount: float) -> np.ndarray:

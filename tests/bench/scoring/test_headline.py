@@ -62,17 +62,14 @@ def test_lost_frames_are_not_scored_and_are_gaps_in_the_curves(make: Maker) -> N
     assert "tracking" in {one.cause for one in some.findings}
     assert "frames" in headline(whole).trust
     assert "frames" not in headline(some).trust, "nothing reassures over a finding"
+    most = headline(run(make("most"), set(range(8, 16))))
+    assert most.refused
+    assert most.tiles == (), "no numbers with over a fifth lost"
 
 
 def test_scale_uncertainty_counts_twice_as_force_is_proportional_to_its_square(make: Maker) -> None:
     result = run(make(frames=4, meta={"scale_uncertainty": 0.05, "young_uncertainty": 0.1}))
     assert result.relative_uncertainty == pytest.approx(math.hypot(0.10, 0.1))
-
-
-def test_with_over_a_fifth_lost_the_headline_has_no_numbers(make: Maker) -> None:
-    first = headline(run(make(), set(range(8, 16))))
-    assert first.refused
-    assert first.tiles == ()
 
 
 def test_the_first_number_and_its_share_of_the_peak_are_of_the_same_score(make: Maker) -> None:

@@ -28,12 +28,9 @@ def test_lag_is_found_on_uneven_times(late_s: float) -> None:
     assert metrics.lag(t, signal(t), signal(t - late_s)) == pytest.approx(late_s, abs=0.02)
 
 
-def test_contact_has_hysteresis() -> None:
+def test_contact_has_hysteresis_and_events_close_short_gaps_and_drop_short_contacts() -> None:
     curve = np.array([0, 9, 11, 6, 4, 6, 11, 0.0])
     assert metrics.in_contact(curve, 10).tolist() == [False, False, True, True, False, False, True, False]
-
-
-def test_events_close_short_gaps_and_drop_short_contacts() -> None:
     t = np.arange(100) / 10
     contact = np.zeros(100, bool)
     contact[10:20] = contact[21:30] = True  # one contact with a gap of one sample
@@ -74,17 +71,13 @@ def autoregressive(n: int, phi: float, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(lfilter([1], [1, -phi], [first, *rng.normal(size=n)[1:]]))
 
 
-def test_block_length_grows_with_dependence() -> None:
+def test_block_length_grows_with_dependence_and_counts_are_whole_resamples_in_blocks() -> None:
     rng = np.random.default_rng(0)
     drawn = [[autoregressive(500, phi, rng) for _ in range(20)] for phi in (0, 0.5, 0.9)]
     low, middle, high = (np.median([bootstrap.block_length(one) for one in some]) for some in drawn)
     assert low < 4 < 12 < high
     assert low < middle < high
-
-
-def test_counts_are_whole_resamples_in_blocks() -> None:
-    rng = np.random.default_rng(0)
-    got = bootstrap.counts(200, 20, 50, rng)
+    got = bootstrap.counts(200, 20, 50, np.random.default_rng(0))
     assert (got.sum(axis=1) == 200).all()
     # In blocks of 20 a drawn sample's neighbour is nearly always drawn as often.
     assert np.corrcoef(got[:, :-1].ravel(), got[:, 1:].ravel())[0, 1] > 0.8

@@ -57,9 +57,8 @@ ODD = {"lost": {"share": 0.3, "most": 0.2}}, {"fault": "it never changes"}, {"sy
 
 @pytest.mark.parametrize("odd", ODD)
 def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path: Path) -> None:
-    tree = pool.pool(
-        [score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}, score("b", 1.0) | odd]
-    )
+    some = score("a", 5.0) | {"lost": {"frames": 2, "share": 0.2, "most": 0.2}}
+    tree = pool.pool([some, score("b", 1.0) | odd])
     assert list(tree["left_out"]) == ["b"]
     assert tree["methods"]["net"]["scores"]["mae_mn"]["mean"] == 5.0
     with pytest.raises(UserError):

@@ -73,14 +73,11 @@ def test_stamps_in_bursts_are_filtered_or_reported_as_not(burst: int, filtered: 
     assert any("not filtered" in step for step in got.steps) is not filtered
 
 
-def test_a_gap_does_not_change_the_sample_interval() -> None:
+def test_a_gap_does_not_change_the_sample_interval_and_frames_in_it_have_no_force() -> None:
     t = np.concatenate([np.arange(0, 5, 0.01), np.arange(2000, 2005, 0.01)])
     got = force_sensor.process_force(Force(t, three(np.sin(2 * np.pi * 30 * t))), SensorMeta(), 0.0)
     assert got.steps == ("zero-phase Butterworth low-pass, order 4, 10 Hz",)
     assert np.abs(got.force_mn[50:450]).max() < 0.05
-
-
-def test_frames_in_a_gap_have_no_force() -> None:
     t = np.concatenate([np.arange(0, 1, 0.01), np.arange(2, 3, 0.01)])
     got = force_sensor.process_force(Force(t, three(t)), SensorMeta(low_pass_hz=None), 0.5)
     at = force_sensor.force_at(got, np.array([0.2, 0.75, 2.0, 2.75]))

@@ -14,21 +14,11 @@ import pytest
 from command import run
 
 from learn import cli
+from learn import split as partition
 from learn.checkpoint import ModelCard, read_card
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Scales
 from learn.settings import preset
-from learn.split import (
-    Split,
-    choose_unseen,
-    divide,
-    find_obstacle,
-    find_sides,
-    find_unit,
-    keep_back,
-    name_parts,
-    regroup,
-)
 from synth.cli import app as synth
 from synth.dataset import index, split
 from synth.dataset.folder import claim
@@ -50,11 +40,11 @@ def make(folder: Path, anatomies: list[int], first: int = 0, opening: list[str] 
     return folder
 
 
-def divided(*datasets: Path) -> tuple[ModelCard, Split]:
+def divided(*datasets: Path) -> tuple[ModelCard, partition.Split]:
     """The card of a model that would be trained on them, and the parts."""
     clips = [clip for one in datasets for clip in load_clips(one, BASE.grid, ["ideal"])]
-    clips, parts = divide(clips, datasets, seed=0)
-    named = name_parts(clips, parts)
+    clips, parts = partition.divide(clips, datasets, seed=0)
+    named = partition.name_parts(clips, parts)
     return ModelCard(BASE, SCALES, 1.7, *named, [*parts.hashes]), parts
 
 
@@ -106,9 +96,11 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     assert sides == {"fit": {"train"}, "select": {"validation"}, "test": {"test"}}
     assert sum(map(len, card.split.values())) == len(on)
     clips = load_clips(own, BASE.grid, ["ideal"])
-    assert {clip.content_hash for clip in choose_unseen(clips, own, card)} == set(card.split["test"])
-    grouped = regroup(clips, find_unit(card))
-    used = find_sides(grouped, card, set(card.split["test"]), from_test=False)
+    assert {clip.content_hash for clip in partition.choose_unseen(clips, own, card)} == set(
+        card.split["test"]
+    )
+    grouped = partition.regroup(clips, partition.find_unit(card))
+    used = partition.find_sides(grouped, card, set(card.split["test"]), from_test=False)
     assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
     assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
 
@@ -121,10 +113,10 @@ def test_training_sequences_are_not_scored_whatever_another_split_says(tmp_path:
     split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
     clips = load_clips(own, BASE.grid, ["ideal"])
     with pytest.raises(UserError):
-        choose_unseen(clips, own, card)
+        partition.choose_unseen(clips, own, card)
     # All sequences of a dataset that is new to the model are scored.
     foreign = make(tmp_path / "foreign", [*range(20, 26)], first=30)
-    assert len(choose_unseen(load_clips(foreign, BASE.grid, ["ideal"]), foreign, card)) == 6
+    assert len(partition.choose_unseen(load_clips(foreign, BASE.grid, ["ideal"]), foreign, card)) == 6
 
 
 def test_several_datasets_keep_their_splits_and_no_brain_is_on_two_sides(tmp_path: Path) -> None:
@@ -155,7 +147,7 @@ def test_only_overlapping_openings_are_one_group(tmp_path: Path) -> None:
     assert on[names[0]] == on[names[2]], "19 mm apart at 12 mm radius"
     assert on[names[6]] == on[names[8]]
     card, _ = divided(own)
-    assert find_unit(card) == "opening"
+    assert partition.find_unit(card) == "opening"
     assert all(card.split[part] for part in ("fit", "select", "test"))
 
 
@@ -184,24 +176,24 @@ def of(brains: Iterable[int]) -> tuple[int, ...]:
 
 def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: list[Clip]) -> None:
     some = many(clips, 40)
-    first = Split(of(range(10)), of(range(10, 30)), of(range(30, 40)))
-    found = keep_back(some, first, seed=0)
+    first = partition.Split(of(range(10)), of(range(10, 30)), of(range(30, 40)))
+    found = partition.keep_back(some, first, seed=0)
     assert len({some[i].group for i in found.intervals}) == 10
     assert sorted((*found.select, *found.intervals)) == sorted(first.select)
     assert not {some[i].group for i in found.select} & {some[i].group for i in found.intervals}
     assert (found.fit, found.test) == (first.fit, first.test)
-    assert keep_back(some, first, seed=0) == found
-    assert keep_back(some, first, seed=1) != found
-    assert find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
+    assert partition.keep_back(some, first, seed=0) == found
+    assert partition.keep_back(some, first, seed=1) != found
+    assert partition.find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
 
 
 def test_brains_in_the_card_or_in_a_test_are_not_used_for_intervals(clips: list[Clip]) -> None:
     some = many(clips, 30)
-    named = name_parts(some, Split(of(range(6)), of(range(6, 10)), of([10, 11])))
+    named = partition.name_parts(some, partition.Split(of(range(6)), of(range(6, 10)), of([10, 11])))
     known = ModelCard(preset("tiny"), SCALES, 1.7, *named)
     # A sequence of its own of a brain that was fitted, of one that is test, and a brain marked test.
     some += [replace(some[0], content_hash=f"new-{b}", group=f"brain-{b}") for b in (3, 10)]
-    found = find_sides(some, known, {"12-0"}, from_test=False)
+    found = partition.find_sides(some, known, {"12-0"}, from_test=False)
     assert {some[i].group for i in found.intervals} == {f"brain-{b}" for b in range(13, 30)}
     assert {some[i].group for i in found.test} == {"brain-10", "brain-11", "brain-12"}
     assert {some[i].group for i in found.fit} == {f"brain-{b}" for b in range(6)}

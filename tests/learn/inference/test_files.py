@@ -75,14 +75,9 @@ def test_predict_on_stores_and_on_arrays_agree(model: Path, dataset: Path, tmp_p
     store = sorted(dataset.glob("*.zarr"))[2]
     sequence = Dataset(dataset)[2]
     arrays = tmp_path / "mine.npz"
-    np.savez(
-        arrays,
-        flow=sequence["flow_recovered"][:],
-        confidence=sequence["flow_confidence"][:],
-        tissue=sequence["tissue"][:],
-        scale_mm_per_px=sequence.attrs["scale_mm_per_px"],
-        young_kpa=sequence.attrs["young_kpa"],
-    )
+    fields = {"flow": "flow_recovered", "confidence": "flow_confidence", "tissue": "tissue"}
+    known = {name: sequence.attrs[name] for name in ("scale_mm_per_px", "young_kpa")}
+    np.savez(arrays, **{name: sequence[field][:] for name, field in fields.items()}, **known)
     for source in (store, arrays):
         run(app, "predict", model, source, "-o", tmp_path / "out")
     before = arrays.read_bytes()

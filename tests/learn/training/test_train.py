@@ -34,11 +34,6 @@ def model(clips: list[Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def weights(folder: Path) -> dict[str, torch.Tensor]:
-    state: dict[str, torch.Tensor] = checked_file.read_tensors(folder / "last.pt")["model"]
-    return state
-
-
 @pytest.mark.slow
 def test_killed_and_resumed_equals_uninterrupted(clips: list[Clip], model: Path, tmp_path: Path) -> None:
     def kill(numbers: dict[str, float]) -> None:
@@ -49,8 +44,8 @@ def test_killed_and_resumed_equals_uninterrupted(clips: list[Clip], model: Path,
     with pytest.raises(KeyboardInterrupt):
         train(clips, SPLIT, small(input="mixed"), out, log=kill)
     card = train(clips, SPLIT, small(input="mixed"), out)
-    whole = weights(model)
-    for name, value in weights(out).items():
+    whole, resumed = (checked_file.read_tensors(folder / "last.pt")["model"] for folder in (model, out))
+    for name, value in resumed.items():
         assert torch.equal(value, whole[name]), name
     assert (out / "history.jsonl").read_text() == (model / "history.jsonl").read_text()
     assert card == checkpoint.read_card(model)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from learn.uncertainty.conformal import LEVELS
 from learn.uncertainty.features import MOTION
-from learn.uncertainty.intervals import Example, Intervals, Prediction, fit, make_example
+from learn.uncertainty.intervals import Intervals, Prediction, fit, make_example
 from learn.uncertainty.out_of_distribution import fit_distribution
 from synth.errors import UserError
 
@@ -32,14 +32,10 @@ def draw(rng: np.random.Generator, directed: bool = True) -> tuple[Prediction, F
     return Prediction(motion, estimate, np.abs(share[..., None]).astype(np.float32) * true, PITCH_MM), force
 
 
-def example(drawn: tuple[Prediction, Floats], unit: int) -> Example:
-    return make_example(*drawn, unit, UNIT_MN)
-
-
 def fitted(rng: np.random.Generator, count: int = 19, directed: bool = True, per_unit: int = 1) -> Intervals:
     """Intervals with factors from `count` sequences; error models and distribution are from others."""
-    first = [example(draw(rng, directed), k) for k in range(30)]
-    last = [example(draw(rng, directed), k // per_unit) for k in range(count)]
+    first = [make_example(*draw(rng, directed), k, UNIT_MN) for k in range(30)]
+    last = [make_example(*draw(rng, directed), k // per_unit, UNIT_MN) for k in range(count)]
     distribution = fit_distribution([draw(rng)[0].motion for _ in range(60)], [one.motion for one in first])
     return fit(first, last, distribution, MOTION, UNIT_MN, "recovered")
 
@@ -86,7 +82,6 @@ def test_sequences_of_one_brain_are_one_unit_and_too_few_are_refused() -> None:
     rng = np.random.default_rng(8)
     found = fitted(rng, count=9)
     assert (found.units, found.sequences) == (9, 9)
-    with pytest.raises(UserError, match="8"):
-        fitted(rng, count=8)
-    with pytest.raises(UserError, match="8"):
-        fitted(rng, count=24, per_unit=3)
+    for count, per_unit in ((8, 1), (24, 3)):
+        with pytest.raises(UserError, match="8"):
+            fitted(rng, count=count, per_unit=per_unit)

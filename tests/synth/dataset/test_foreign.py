@@ -19,9 +19,10 @@ def test_a_dataset_is_read_without_the_plug_ins_that_made_it(tmp_path: Path) -> 
     assert (read.flow.backend, read.fem.law) == ("gone", "gone")
     with pytest.raises(UserError, match=r"flow\.backend"):
         parse_job(json.dumps(job), "job.yaml", tmp_path)
-    before = {"appearance": {"cottonoid": 0.5}, "render": {"tool": False}, "fem": {}}
-    (tmp_path / "dataset.json").write_text(json.dumps(described | {"format_version": 2, "job": before}))
-    assert Folder(tmp_path).job().fem.instrument == ("none",)
+    before = {"render": {"scenery": ["cottonoid", "bone"], "size": [320, 240]}, "sensor": {"blur_px": 0.5}}
+    (tmp_path / "dataset.json").write_text(json.dumps(described | {"format_version": 3, "job": before}))
+    read = Folder(tmp_path).job()
+    assert (read.render.scenery, read.sensor.blur_px) == (("bone",), (1.0, 1.0))
     described.pop("format_version")
     (tmp_path / "dataset.json").write_text(json.dumps(described))
     with pytest.raises(UserError, match="format"):

@@ -8,10 +8,8 @@ from synth.dataset import provenance
 
 
 def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> None:
-    files = {
-        **{"engine/run.py": False, "flow/README.md": False},
-        **{"flow/tvl1.py": True, "flow/toolnet.pt": True, "fem/mesh/lattice.py": True},
-    }
+    files = dict.fromkeys(("engine/run.py", "flow/README.md"), False)
+    files |= dict.fromkeys(("flow/tvl1.py", "flow/toolnet.pt", "fem/mesh/lattice.py"), True)
     for name in files:
         file = tmp_path / "synth" / name
         file.parent.mkdir(parents=True, exist_ok=True)

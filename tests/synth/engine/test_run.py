@@ -3,6 +3,7 @@
 import json
 import signal
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -71,11 +72,8 @@ def test_another_versions_dataset_is_continued_only_on_request(
 @pytest.mark.slow
 def test_a_sequence_sealed_by_a_lost_attempt_is_not_computed_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
-    child = Child(Setup(JOB.model_dump(mode="json"), tmp_path / "made", "no:such"))
-    try:
-        assert child.run(0, lambda *_: None, threading.Event()).kind == "done"
-    finally:
-        child.close()
+    with closing(Child(Setup(JOB.model_dump(mode="json"), tmp_path / "made", "no:such"))) as process:
+        assert process.run(0, lambda *_: None, threading.Event()).kind == "done"
 
 
 @pytest.mark.slow
@@ -253,8 +251,7 @@ def test_a_missing_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
-    [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: [", "YAML")],
+    ("text", "named"), [("", "jobs"), ("cores: 4\nmemory: 8GB\n", "jobs"), ("jobs: [", "YAML")]
 )
 def test_wrong_slurm_files_are_refused(tmp_path: Path, text: str, named: str) -> None:
     (tmp_path / "slurm.yaml").write_text(text)

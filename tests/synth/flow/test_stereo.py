@@ -39,6 +39,14 @@ def view(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.repeat(np.clip(found, 0, 255).astype(np.uint8)[..., None], 3, axis=-1)
 
 
+def source(along: np.ndarray, up: float = 0.0) -> np.ndarray:
+    """Rest columns (H, W) that are visible at each pixel after tissue has moved by (along, -up)."""
+    x, rows = COLUMNS.astype(np.float64), (ROWS + up).astype(np.float32)
+    for _ in range(40):
+        x = COLUMNS - cv2.remap(along, x.astype(np.float32), rows, cv2.INTER_LINEAR, borderMode=1)
+    return x
+
+
 def dent(amount: float) -> np.ndarray:
     """Change of disparity (H, W) px of a dent in the middle."""
     return -amount * np.exp(-((COLUMNS - 80) ** 2 + (ROWS - 60) ** 2) / (2 * 18.0**2))
@@ -115,7 +123,7 @@ def test_a_dent_and_a_shift_are_found_in_millimetres() -> None:
 
     # The tissue lies at the distance of zero disparity.
     first = noisy(view(picture, COLUMNS, ROWS)), noisy(view(picture, COLUMNS, ROWS))
-    left, right = (noisy(view(picture, _source(along), ROWS - v)) for along in (u, u - d))
+    left, right = (noisy(view(picture, source(along, -v), ROWS - v)) for along in (u, u - d))
     tracker = StereoTracker(PARALLEL, first[0][None], first[1][None], NONE, NONE, EVERY)
     flow = np.stack([u, np.full_like(u, v)], axis=-1).astype(np.float32)
     moved = tracker.step(left, right, NONE, NONE, flow, TRUST)
@@ -173,15 +181,6 @@ def test_features_hold_the_remaining_step_of_depth_in_millimetres() -> None:
     np.testing.assert_allclose(features[[5, 7]], -0.02, rtol=1e-2)
     np.testing.assert_allclose(np.exp(features[6]), 1 / (100 * 5), rtol=1e-3)
     np.testing.assert_allclose(np.exp(features[11]), 0.1, rtol=1e-5)
-
-
-def _source(along: np.ndarray) -> np.ndarray:
-    """Rest columns (H, W) visible at each pixel after tissue has moved by (along, -0.8)."""
-    x = COLUMNS.astype(np.float64)
-    for _ in range(40):
-        rows = (ROWS + 0.8).astype(np.float32)
-        x = COLUMNS - cv2.remap(along, x.astype(np.float32), rows, cv2.INTER_LINEAR, borderMode=1)
-    return x
 
 
 def test_the_plate_penalises_bending_but_not_tilting() -> None:

@@ -10,10 +10,7 @@ from synth.dataset import index, split
 from synth.dataset.folder import Folder
 from synth.job.schema import Job
 
-ABOUT = {
-    **{"title": "Pulls: a test", "licence": "cc-by-4.0"},
-    **{"summary": "Made to be read.", "authors": ["A. Person"]},
-}
+ABOUT = {"title": "Pulls: a test", "licence": "cc-by-4.0", "summary": "A test.", "authors": ["A. Person"]}
 
 
 @pytest.fixture(scope="session")

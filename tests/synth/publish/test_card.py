@@ -30,9 +30,8 @@ def test_the_card_agrees_with_the_dataset(root: Path) -> None:
         assert f"| `{name}` |" in text
     stiffness = [row["young_kpa"] for row in index.read_index(root).to_pylist()]
     line = next(line for line in text.splitlines() if line.startswith("| Young's modulus"))
-    assert [float(cell) for cell in line.split("|")[2:5]] == pytest.approx(
-        [min(stiffness), float(np.median(stiffness)), max(stiffness)], rel=5e-3
-    )
+    cells = [float(cell) for cell in line.split("|")[2:5]]
+    assert cells == pytest.approx([min(stiffness), np.median(stiffness), max(stiffness)], rel=5e-3)
     # All pictures shown and all files named in it exist.
     for named in re.findall(r"\]\((\S+)\)|`(\w+\.(?:json|parquet|yaml|mp4))`", text):
         assert (root / (named[0] or named[1])).is_file(), named

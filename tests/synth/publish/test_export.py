@@ -164,12 +164,6 @@ def drawn(*words: Any) -> np.ndarray:
     return np.stack(list(sequence_video.draw_video(*words)))
 
 
-def decoded(path: Path) -> list[tuple[float, np.ndarray]]:
-    """Time [s] and picture of each frame of a video."""
-    with av.open(str(path)) as container:
-        return [(float(one.time), one.to_ndarray(format="rgb24")) for one in container.decode(video=0)]
-
-
 def test_lerobot_files_follow_its_format(root: Path, tmp_path: Path) -> None:
     export_dataset(root, tmp_path / "to", "lerobot")
     info = json.loads((tmp_path / "to/meta/info.json").read_text())
@@ -186,9 +180,10 @@ def test_lerobot_files_follow_its_format(root: Path, tmp_path: Path) -> None:
     for row in rows:
         for key in ("observation.images.left", "observation.images.right"):
             place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            frames = decoded(tmp_path / "to" / info["video_path"].format(video_key=key, **place))
-            assert [time for time, _ in frames] == pytest.approx(np.arange(3) / info["fps"])
-            assert list(frames[0][1].shape) == info["features"][key]["shape"]
+            with av.open(tmp_path / "to" / info["video_path"].format(video_key=key, **place)) as video:
+                frames = list(video.decode(video=0))
+                assert [frame.time for frame in frames] == pytest.approx(np.arange(3) / info["fps"])
+                assert [*frames[0].to_ndarray(format="rgb24").shape] == info["features"][key]["shape"]
 
 
 def moving(out: Path, job: Job) -> list[Camera]:
@@ -217,7 +212,6 @@ def moving(out: Path, job: Job) -> list[Camera]:
         flow = cv2.projectPoints(moved, np.zeros(3), np.zeros(3), K, bent)[0].reshape(-1, 2) - pixels
         motion = moved - (points @ cameras[0].rotation.T + cameras[0].translation)
         shade = np.clip(128 + 40 * np.sin(hit[:, 0]) + 40 * np.cos(1.3 * hit[:, 1]), 0, 255)
-        still = np.zeros((height, width))
         values = {
             "rgb": np.repeat(shade.reshape(height, width, 1), 3, axis=-1).astype(np.uint8),
             "depth": local[:, 2].reshape(height, width).astype(np.float32),
@@ -226,7 +220,7 @@ def moving(out: Path, job: Job) -> list[Camera]:
             "traction": np.zeros((height, width, 3), np.float32),
             "tool": columns < 5,
             "visible": (rows + columns + t) % 3 > 0,
-            "glare": still > 0,
+            "glare": np.zeros((height, width), bool),
         }
         for name in ("rgb", "flow", "visible", "depth"):
             values[f"{name}_right"] = values[name]  # not used
@@ -240,18 +234,15 @@ def moving(out: Path, job: Job) -> list[Camera]:
     writer.put("force", np.zeros((job.frames, 3)))
     writer.put("tissue", np.ones((height, width), bool))
     writer.put("area", np.ones((height, width), np.float32))
-    pose = cameras[0].rotation.tolist(), cameras[0].translation.tolist()
-    writer.seal(
-        K=K.tolist(),
-        distortion=bent.tolist(),
-        right={"K": shifted.tolist(), "distortion": bent.tolist(), "baseline_mm": baseline}
-        | {"rotation": pose[0], "translation": (np.array(pose[1]) - [baseline, 0, 0]).tolist()},
-        rotation=pose[0],
-        translation=pose[1],
-        young_kpa=1.0,
-        scale_mm_per_px=1 / 3,
-        scenario={"camera_motion": {"drift_mm": 1.0}},
-    )
+    place = cameras[0].translation
+    both = {"distortion": bent.tolist(), "rotation": cameras[0].rotation.tolist()}
+    right = {
+        "K": shifted.tolist(),
+        "translation": (place - [baseline, 0, 0]).tolist(),
+        "baseline_mm": baseline,
+    }
+    left = {"K": K.tolist(), "translation": place.tolist(), "scenario": {"camera_motion": {"drift_mm": 1.0}}}
+    writer.seal(**both, **left, right=both | right, young_kpa=1.0, scale_mm_per_px=1 / 3)
     return cameras
 
 

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import closing
 
 import numpy as np
@@ -21,31 +20,26 @@ from synth.recording_flow.passes import VideoPass
 from synth.video.read import Picture
 
 
-@pytest.fixture
-def elsewhere() -> Iterator[FlowProcess]:
-    with closing(FlowProcess(set_threads)) as flow:
-        yield flow
-
-
 @pytest.mark.slow
-def test_errors_and_the_end_of_the_process_are_reported(elsewhere: FlowProcess) -> None:
+def test_errors_and_the_end_of_the_process_are_reported() -> None:
     rest = texture(64, 80)
     moved, free = np.roll(rest, 2, axis=1), Proposal(*np.zeros((3, 64, 80), bool))
-    with pytest.raises(UserError, match="no estimator"):
-        elsewhere.begin("nonesuch", rest, free, ~free.known)
-    elsewhere.begin("dis", rest, free, ~free.known)
-    with pytest.raises(UserError, match="does not fit"):
-        elsewhere.submit(moved[:-1], free).result()
-    worker = elsewhere._pool.submit(os.getpid).result()
-    os.kill(worker, signal.SIGINT)  # Ctrl-C in a terminal reaches every process; it must not end this one
-    assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
-    pictures = [Picture(k, k / 25, one) for k, one in enumerate((rest, moved))]
-    settings = RecordingFlowSettings("dis", 1, None, masks="none")
-    frames = VideoPass(Footage(lambda: pictures, "video"), settings, flow=elsewhere).frames()
-    assert next(frames).is_rest
-    os.kill(worker, signal.SIGKILL)
-    with pytest.raises(UserError, match="ended"):
-        next(frames)
+    with closing(FlowProcess(set_threads)) as elsewhere:
+        with pytest.raises(UserError, match="no estimator"):
+            elsewhere.begin("nonesuch", rest, free, ~free.known)
+        elsewhere.begin("dis", rest, free, ~free.known)
+        with pytest.raises(UserError, match="does not fit"):
+            elsewhere.submit(moved[:-1], free).result()
+        worker = elsewhere._pool.submit(os.getpid).result()
+        os.kill(worker, signal.SIGINT)  # Ctrl-C in a terminal reaches every process; it must not end this one
+        assert np.abs(elsewhere.submit(moved, free).result().flow).max() > 1
+        pictures = [Picture(k, k / 25, one) for k, one in enumerate((rest, moved))]
+        settings = RecordingFlowSettings("dis", 1, None, masks="none")
+        frames = VideoPass(Footage(lambda: pictures, "video"), settings, flow=elsewhere).frames()
+        assert next(frames).is_rest
+        os.kill(worker, signal.SIGKILL)
+        with pytest.raises(UserError, match="ended"):
+            next(frames)
 
 
 @pytest.mark.slow
@@ -54,13 +48,11 @@ def test_the_process_ends_when_its_parent_is_killed() -> None:
         "import os, time; from synth.recording_flow.flow import FlowProcess; flow = FlowProcess(int);"
         "print(flow._pool.submit(os.getpid).result(), flush=True); time.sleep(60)"
     )
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    worker = int(parent.stdout.readline())
-    os.kill(worker, 0)
-    parent.kill()
-    parent.wait()
-    parent.stdout.close()
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        os.kill(worker, 0)
+        parent.kill()
     deadline = time.monotonic() + 20
     while os.path.exists(f"/proc/{worker}") and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -29,16 +29,13 @@ def simulate(
     """Tracked motion, its times, and the pulsation with the noise of the rest frame [px]."""
     rng = np.random.default_rng(0)
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.02, 0.02, round(10 * seconds))
-    load = np.zeros_like(time)
-    if period_s is not None:
-        load = np.clip(np.sin(2 * np.pi * time / period_s), 0, None)
-    else:
-        begin = 2.0
-        while begin < seconds - 2:
-            long = rng.uniform(1, 2.5)
-            inside = (time > begin) & (time < begin + long)
-            load += inside * rng.uniform(0.5, 1) * np.sin(np.pi * (time - begin) / long)
-            begin += long + rng.uniform(0.8, 2.5)
+    load = np.clip(np.sin(2 * np.pi * time / period_s), 0, None) if period_s else np.zeros_like(time)
+    begin = seconds if period_s else 2.0  # irregular contacts, where none are periodic
+    while begin < seconds - 2:
+        long = rng.uniform(1, 2.5)
+        inside = (time > begin) & (time < begin + long)
+        load += inside * rng.uniform(0.5, 1) * np.sin(np.pi * (time - begin) / long)
+        begin += long + rng.uniform(0.8, 2.5)
     surface, lay = SurfaceMotion(np.ones(SIZE, bool)), []
     at_rest = rng.normal(0, rest_px, (SIZE[0] // 8, SIZE[1] // 8, 2)).repeat(8, 0).repeat(8, 1)
     for t, force in zip(time, load, strict=True):

@@ -120,14 +120,8 @@ def test_what_is_not_supported_is_named(text: str, named: str, tmp_path: Path) -
 
 def test_the_baseline_is_that_of_a_pair_also_of_equal_cameras(tmp_path: Path) -> None:
     alone = json.dumps({"K": K, "D": D, "R": TURN, "T": [-4.4, 0, 0]})
-    for text, baseline_mm in (
-        (pair(), 4.4),
-        (pair().replace('"K', '"M'), 4.4),
-        (KALIBR, 4.4),
-        (alone, 0.0),
-        ("damaged", 0.0),
-    ):
-        file = tmp_path / "a.json"
+    file, of_a_pair = tmp_path / "a.json", (pair(), pair().replace('"K', '"M'), KALIBR)
+    for text, baseline_mm in (*((one, 4.4) for one in of_a_pair), (alone, 0.0), ("damaged", 0.0)):
         file.write_text(text)
         assert find_baseline_mm(file) == pytest.approx(baseline_mm)
 

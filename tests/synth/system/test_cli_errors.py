@@ -45,13 +45,9 @@ def test_control_characters_of_names_are_escaped() -> None:
     assert ended(UserError("a\x1b[31m\nb\u202e"))[:2] == (2, "error: a\\x1b[31m\nb\\u202e\n")
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        OSError(errno.EIO, "Input/output error"),
-        ValueError("a bug"),
-        ModuleNotFoundError("No module named 'synth.shop'", name="synth.shop"),
-    ],
-)
+OWN_MODULE = ModuleNotFoundError("No module named 'synth.shop'", name="synth.shop")
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), ValueError("a bug"), OWN_MODULE])
 def test_bugs_are_not_hidden(error: Exception) -> None:
     assert ended(error) == (1, "", error)

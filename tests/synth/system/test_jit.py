@@ -13,12 +13,9 @@ from synth.system import cache
 def test_the_cache_is_in_a_private_writable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     mine, set_to = tmp_path / f"sulcus-{os.getuid()}", tmp_path / "set"
-    for name, value, at in (
-        ("SULCUS_CACHE", str(set_to), set_to),
-        ("XDG_CACHE_HOME", str(set_to), set_to / "sulcus"),
-        ("HOME", "/dev/null", mine),
-    ):
-        for one in ("SULCUS_CACHE", "XDG_CACHE_HOME", "HOME"):
+    names, values = ("SULCUS_CACHE", "XDG_CACHE_HOME", "HOME"), (str(set_to), str(set_to), "/dev/null")
+    for name, value, at in zip(names, values, (set_to, set_to / "sulcus", mine), strict=True):
+        for one in names:
             monkeypatch.delenv(one, raising=False)
         monkeypatch.setenv(name, value)
         assert cache.folder.__wrapped__("loops") == at / "loops"
