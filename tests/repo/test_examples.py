@@ -27,7 +27,7 @@ def test_reading_a_dataset(out: Path) -> None:
     assert found["young_kpa"] == pytest.approx(0.81474, abs=1e-4)
     assert found["peak_force_mn"] == pytest.approx(4.5239, abs=1e-3)
     assert found["labelled_force_mn"] == pytest.approx(found["peak_force_mn"], rel=0.02)
-    assert found["largest_motion_px"] == pytest.approx(4.9154, abs=0.01)
+    assert found["largest_motion_px"] == pytest.approx(5.0368, abs=0.01)
     assert found["median_flow_error_px"] < 0.2
 
 
@@ -49,10 +49,10 @@ def test_rendering_a_frame() -> None:
     found = render_frame.describe(scene, frame)
     assert found["force_mn"] == pytest.approx(9.71, rel=1e-3)
     assert found["labelled_force_mn"] == pytest.approx(found["force_mn"], rel=0.03)
-    assert found["largest_motion_mm"] == pytest.approx(1.563, rel=1e-2)
-    assert found["largest_flow_px"] == pytest.approx(6.288, rel=1e-2)
+    assert found["largest_motion_mm"] == pytest.approx(1.528, rel=1e-2)
+    assert found["largest_flow_px"] == pytest.approx(7.311, rel=1e-2)
     assert frame.rgb.shape == (240, 320, 3)
-    assert frame.rgb[100:140, 140:180].mean() == pytest.approx(171.3, abs=3)
+    assert frame.rgb[100:140, 140:180].mean() == pytest.approx(179.3, abs=3)
     half = render_frame.push(0.15)
     assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
@@ -96,13 +96,13 @@ def test_a_custom_law_stiffens() -> None:
     for name, b in (("example-stiff", 4.0), ("example-plain", 1e-4)):
         synth.add_law(name, own_law.Stiffening(b))
     soft, stiff = own_law.peak_mm("neo-hookean"), own_law.peak_mm("example-stiff")
-    assert soft == pytest.approx(0.6874, abs=0.002)
-    assert stiff == pytest.approx(0.6518, abs=0.002)
+    assert soft == pytest.approx(0.7758, abs=0.002)
+    assert stiff == pytest.approx(0.7252, abs=0.002)
     assert own_law.peak_mm("example-plain") == pytest.approx(soft, rel=1e-3), "for small b it is neo-Hookean"
 
 
 def test_a_custom_flow_back_end(out: Path) -> None:
-    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.566, rel=0.1)
+    assert own_flow.error_px(Dataset(out)[0]) == pytest.approx(0.2926, rel=0.1)
 
 
 def test_a_custom_method(out: Path, tmp_path: Path) -> None:
