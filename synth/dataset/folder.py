@@ -17,6 +17,7 @@ from synth.dataset import location, provenance
 from synth.errors import UserError
 from synth.formats import FOLDER, check_format
 from synth.job import identity, writer
+from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.schema import Job
 from synth.plugins import STORED
 from synth.system import checked_file, file_lock
@@ -63,7 +64,7 @@ class Folder:
         render, sensor = job.get("render"), job.get("sensor")
         if described["format_version"] < 4 and isinstance(render, dict) and isinstance(sensor, dict):
             render["scenery"] = [part for part in render.get("scenery", ()) if part != "cottonoid"]
-            sensor["blur_px"] = sensor.get("blur_px", 0.0) * 640 / render.get("size", (640,))[0]
+            sensor["blur_px"] = sensor.get("blur_px", 0.0) * BLUR_WIDTH_PX / render.get("size", (640,))[0]
         return validated(Job, job, f"{self.root / _NAME}: is damaged", STORED)
 
     def sealed(self) -> list[int]:

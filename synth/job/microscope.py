@@ -11,6 +11,8 @@ from synth.job.types import Curve, Distortion, NonNegative, Positive, Range, Sce
 from synth.plugins import STORED
 from synth.system import camera_file
 
+BLUR_WIDTH_PX = 640.0  # of the picture that `sensor.blur_px` refers to
+
 
 class LightSection(Section):
     """The microscope's lamps."""

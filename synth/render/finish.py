@@ -1,7 +1,7 @@
 """Finishes of instruments: satin metal, insulation, paint, gloves, cotton; their wear and blood.
 
-Reflectances of steel and titanium are those of physicallybased.info. All else was chosen by eye, also the
-roughness of instruments that are blasted or brushed against glare.
+All numbers were chosen by eye, also reflectances of steel and titanium, and the roughness of instruments that
+are blasted or brushed against glare.
 """
 
 from __future__ import annotations

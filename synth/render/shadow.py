@@ -8,10 +8,11 @@ storage ray/triangle intersection", 1997).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from synth.arrays import Array, Floats, Indices, Map
+from synth.arrays import Array, Floats, Indices, Ints, Map
 from synth.geometry.triangles import Shape, joined, normals
 from synth.render.materials import Lamp
 from synth.render.truth import Hits, Size, blend
@@ -89,9 +90,8 @@ def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) ->
 
     Points are sorted into cells of a plane across the lamp's axis, onto which each window's point projects.
     """
-    count, rays = len(points), len(start)
-    start_x, start_y = start[:, 0].copy(), start[:, 1].copy()
-    every = (np.uint64(1) << np.uint64(rays)) - np.uint64(1)
+    count, start_x, start_y = len(points), start[:, 0].copy(), start[:, 1].copy()
+    every = (np.uint64(1) << np.uint64(len(start))) - np.uint64(1)
     bits = np.zeros(count, np.uint64)
     ahead = points[:, 2] > _NEAR_MM
     if not ahead.any():
@@ -105,17 +105,10 @@ def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) ->
     cell = max(np.sqrt(wide * high / count), max(wide, high) / 2000, 1e-9)
     columns, rows = int(wide / cell) + 1, int(high / cell) + 1
     number = np.full(count, -1)
-    first = np.zeros(columns * rows + 1, np.int64)
     for i in range(count):
         if ahead[i]:
             number[i] = int((y[i] - top) / cell) * columns + int((x[i] - left) / cell)
-            first[number[i] + 1] += 1
-    first = np.cumsum(first)
-    order, filled = np.empty(first[-1], np.int64), first[:-1].copy()
-    for i in range(count):
-        if ahead[i]:
-            order[filled[number[i]]] = i
-            filled[number[i]] += 1
+    order, first = _sorted(number, columns * rows)
     for f in range(len(faces)):
         a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
         if not min(a[2], b[2], c[2]) > _NEAR_MM:
@@ -127,32 +120,51 @@ def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) ->
         if x1 < left or y1 < top or x0 > left + wide or y0 > top + high:
             continue
         u0, u1 = int(max(x0 - left, 0) / cell), int(min(x1 - left, wide) / cell)
-        e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
-        off = n0 * a[0] + n1 * a[1] + n2 * a[2]
         for v in range(int(max(y0 - top, 0) / cell), int(min(y1 - top, high) / cell) + 1):
             for k in range(first[v * columns + u0], first[v * columns + u1 + 1]):
-                i = order[k]
-                if bits[i] == every:
-                    continue
-                # Moeller and Trumbore's triple products are linear in the ray's start.
-                p0, p1, p2 = points[i, 0] - a[0], points[i, 1] - a[1], points[i, 2] - a[2]
-                behind = n0 * p0 + n1 * p1 + n2 * p2
-                q0, q1, q2 = p1 * g2 - p2 * g1, p2 * g0 - p0 * g2, p0 * g1 - p1 * g0
-                r0, r1, r2 = e1 * p2 - e2 * p1, e2 * p0 - e0 * p2, e0 * p1 - e1 * p0
-                q, r = q0 * a[0] + q1 * a[1] + q2 * a[2], r0 * a[0] + r1 * a[1] + r2 * a[2]
-                near = _HIDDEN_MM / np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2)
-                sign = 1.0 if behind >= 0.0 else -1.0  # that of a plane between lamp and point
-                found = np.uint64(0)
-                for s in range(rays):
-                    along = sign * (off - n0 * start_x[s] - n1 * start_y[s])
-                    whole = along + sign * behind
-                    across = sign * (q - q0 * start_x[s] - q1 * start_y[s])
-                    down = sign * (r - r0 * start_x[s] - r1 * start_y[s])
-                    hair = 1e-10 * whole  # rays must not slip between faces that share an edge
-                    inside = (across >= -hair) & (down >= -hair) & (across + down <= whole + hair)
-                    hit = inside & (along > 0.0) & (sign * behind > near * whole)
-                    found |= np.uint64(hit) << np.uint64(s)
-                bits[i] |= found
+                if bits[order[k]] != every:
+                    bits[order[k]] |= _stopped(start_x, start_y, points[order[k]], a, b, c)
     return bits
+
+
+@compiled
+def _sorted(number: Ints, cells: int) -> tuple[Ints, Ints]:
+    """Indices of points in the order of their cells (N,), -1 for none, and where each cell begins."""
+    first = np.zeros(cells + 1, np.int64)
+    for one in number:
+        first[one + 1] += one >= 0
+    first = np.cumsum(first)
+    order, filled = np.empty(first[-1], np.int64), first[:-1].copy()
+    for i in range(len(number)):
+        if number[i] >= 0:
+            order[filled[number[i]]] = i
+            filled[number[i]] += 1
+    return order, first
+
+
+@partial(compiled, inline="always")
+def _stopped(x: Floats, y: Floats, point: Floats, a: Floats, b: Floats, c: Floats) -> np.uint64:
+    """Bits of the rays from points x, y (S,) on a window to a point (3,) that a triangle stops."""
+    e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    g0, g1, g2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    n0, n1, n2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+    off = n0 * a[0] + n1 * a[1] + n2 * a[2]
+    # Moeller and Trumbore's triple products are linear in the ray's start.
+    p0, p1, p2 = point[0] - a[0], point[1] - a[1], point[2] - a[2]
+    behind = n0 * p0 + n1 * p1 + n2 * p2
+    q0, q1, q2 = p1 * g2 - p2 * g1, p2 * g0 - p0 * g2, p0 * g1 - p1 * g0
+    r0, r1, r2 = e1 * p2 - e2 * p1, e2 * p0 - e0 * p2, e0 * p1 - e1 * p0
+    q, r = q0 * a[0] + q1 * a[1] + q2 * a[2], r0 * a[0] + r1 * a[1] + r2 * a[2]
+    near = _HIDDEN_MM / np.sqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2)
+    sign = 1.0 if behind >= 0.0 else -1.0  # that of a plane between lamp and point
+    found = np.uint64(0)
+    for s in range(len(x)):
+        along = sign * (off - n0 * x[s] - n1 * y[s])
+        whole = along + sign * behind
+        across = sign * (q - q0 * x[s] - q1 * y[s])
+        down = sign * (r - r0 * x[s] - r1 * y[s])
+        hair = 1e-10 * whole  # rays must not slip between faces that share an edge
+        inside = (across >= -hair) & (down >= -hair) & (across + down <= whole + hair)
+        hit = inside & (along > 0.0) & (sign * behind > near * whole)
+        found |= np.uint64(hit) << np.uint64(s)
+    return found

@@ -12,12 +12,12 @@ from typing import Any, get_args
 import numpy as np
 
 from synth.job import identity
+from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.schema import AttachmentSection, Job
 from synth.job.types import Group, Scenery
 from synth.render.appearance.family import Appearance, Colour
 from synth.render.appearance.light import FreeLamp, Lighting, blackbody
 from synth.render.camera.camera import CameraView, place
-from synth.render.camera.camera_sensor import BLUR_WIDTH_PX
 from synth.render.camera.colour_processing import KNOTS, encoded
 from synth.render.randomized.pattern import Pattern
 from synth.render.randomized.surroundings import Randomization, Surroundings
@@ -27,7 +27,6 @@ Colours = tuple[Colour, Colour, Colour]
 Keys = dict[str, dict[str, Any]]  # values by section and key
 
 _PATCH_MM = 10.0, 14.0  # radius of an opening in the patch as it is grown, before it is scaled
-_FOR_TWO_MM = 8.0  # least radius of an opening that takes two instruments
 _CONTRASTS = dict.fromkeys(("spectrum", "fat", "liver", "silicone"), 0.2)
 _CONTRASTS |= dict.fromkeys(("cells", "speckle", "dots"), 0.7)  # least of a kind's colours
 _NATURAL: dict[str, Colours] = {
@@ -110,7 +109,7 @@ def randomized(job: Job, index: int) -> Job:
 
 def draw_randomization(job: Job, index: int) -> Randomization | None:
     """What neither keys nor an appearance express for sequence `index`; None without groups."""
-    if not any(job.randomize.values()):
+    if not job.randomize:
         return None
     scale = _draw_field(job, index)[0] if job.randomize.get("field") else 1.0
     draw = _Draws(job, index, "texture")
@@ -180,7 +179,7 @@ def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
             "working_distance_mm": (max(draw((280, 320), (150, 500)), 2 * width),) * 2,
         },
     }
-    if (radius < _FOR_TWO_MM or layout == "corner") and not job.fem.instrument_list:
+    if radius < 8.0 or layout == "corner":  # two instruments rarely fit
         keys["fem"]["instruments"] = (1, 1)
     return scale, keys, (float(x), float(y))
 

@@ -19,6 +19,7 @@ from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Gesture, ToolContact
 from synth.job import schema
 from synth.job.mechanics import CLEAR_MM, InstrumentSection
+from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render import instrument
@@ -27,7 +28,7 @@ from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
 from synth.render.camera.camera import CameraView, place, visible_radius
 from synth.render.camera.camera_motion import CameraMotion
-from synth.render.camera.camera_sensor import BLUR_WIDTH_PX, CameraSensor
+from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
 from synth.render.idle import IdleInstrument, draw_idle
 from synth.render.randomized.surroundings import Randomization

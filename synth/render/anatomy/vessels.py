@@ -89,10 +89,8 @@ def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.rando
     ends = ends[~np.isin(ends, np.concatenate([roots, deep, out]))]
     starts = np.concatenate([roots, deep])
     radius = np.concatenate([rng.uniform(*kind.trunk, len(out)), rng.uniform(*kind.end, len(ends))])
-    made = used = least_cost(way, cost, starts, np.concatenate([out, ends]), radius, kind.sharing)
-    nodes, parent, own = made.nodes, made.parent, made.radius
-    between = float(np.median(way.lengths))
-    made = halved(joined(made, kind.loops, 3 * kind.spacing, between, rng))
+    used = least_cost(way, cost, starts, np.concatenate([out, ends]), radius, kind.sharing)
+    made = halved(joined(used, kind.loops, 3 * kind.spacing, float(np.median(way.lengths)), rng))
     nodes, parent, own = made.nodes, made.parent, made.radius
     beyond = np.where(np.arange(len(nodes)) < 2 * len(used.nodes), 0.0, kind.taper)
     nodes = relaxed(nodes, parent, own, kind.stiff, 100)

@@ -62,10 +62,9 @@ def lamps(camera: Camera, lighting: Lighting) -> tuple[Lamp, ...]:
     # Radiance of a white diffuser square to the light is I / (pi d^2); the opening is at an angle to it.
     total = lighting.power * np.pi * distance**2
     own = _WINDOW_DEG, blackbody(lighting.kelvin)
-    drawn = [(lighting.main, *own, _towards(camera, lighting, 0))]
-    drawn += [(1 - lighting.main, *own, _towards(camera, lighting, 1))]
-    if lighting.lamps:
-        drawn = [(a.share, a.window_deg, np.array(a.colour), _free(camera, a)) for a in lighting.lamps]
+    usual = (lighting.main, 0), (1 - lighting.main, 1)
+    drawn = [(a.share, a.window_deg, np.array(a.colour), _free(camera, a)) for a in lighting.lamps]
+    drawn = drawn or [(share, *own, _towards(camera, lighting, side)) for share, side in usual]
     made = []
     for share, window_deg, colour, towards in drawn:
         intensity = share * total * colour / max(float(towards[2]), 0.3)

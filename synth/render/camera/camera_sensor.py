@@ -14,8 +14,6 @@ from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, M
 from synth.system.jit import vectorised
 
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
-BLUR_WIDTH_PX = 640.0
-"""Width of the picture that the job's key `sensor.blur_px` refers to."""
 _STEPS = 4096  # of the tabulated tone curves per full scale
 
 MOST_BLANK = 0.95

@@ -197,13 +197,9 @@ def _lamp(mi: Any, lamp: Lamp, weight: float = 1.0) -> dict[str, Any]:
     up = [0.0, 1.0, 0.0] if abs(towards[1]) < 0.9 * np.linalg.norm(towards) else [1.0, 0.0, 0.0]
     placed = mi.ScalarTransform4f().look_at(lamp.position.tolist(), lamp.target.tolist(), up)
     placed = placed @ mi.ScalarTransform4f().scale([lamp.radius, lamp.radius, 1.0])
-    radiance = lamp.intensity * (weight == 1) / (np.pi * lamp.radius**2)
+    value = (lamp.intensity * (weight == 1) / (np.pi * lamp.radius**2)).tolist()
     # Equal weights: each lamp has half of a pixel's strata, and the choice makes no noise.
-    light = {
-        "type": "area",
-        "radiance": {"type": "rgb", "value": radiance.tolist()},
-        "sampling_weight": weight,
-    }
+    light = {"type": "area", "radiance": {"type": "rgb", "value": value}, "sampling_weight": weight}
     return {"type": "disk", "to_world": placed, "light": light}
 
 
