@@ -31,7 +31,7 @@ app = typer.Typer(
 Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
-Masks = Annotated[str, Option(help="auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png.")]
+Masks = Annotated[str, Option(help="auto, none, both, or a folder of NNNNNN.png or mask.png.")]
 ModelFolder = Annotated[Path | None, Option("--model", "-m", help="A model's folder, mono or stereo.")]
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 
@@ -98,7 +98,8 @@ def _print_result(result: Result, folder: Path) -> None:
     from bench.scoring.report import terminal_table
 
     console, first = Console(), headline(result)
-    for line in filter(None, (first.refused, *first.warnings)):
+    doubt = [one.message for one in result.tracked.doubt]
+    for line in filter(None, dict.fromkeys([*doubt, first.refused, *first.warnings])):
         console.print(line, style="bold red", markup=False, highlight=False)
     if not result.refused:
         console.print(terminal_table(result))
@@ -276,6 +277,7 @@ def live(
     from bench.tracking import live
     from learn.inference.shipped import choose_model
     from learn.training.threads import set_threads
+    from synth.flow.estimator import name_motion
     from synth.recording_flow.decode import Footage, RecordingFlowSettings
     from synth.recording_flow.flow import open_flow_process
     from synth.video.mask_files import read_choice
@@ -289,11 +291,14 @@ def live(
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
     threadpool_limits(set_threads(None))
+    method = None if model is None else Model(model)
+    for note in [] if method is None else method.predictor.card.doubt(name_motion(flow)):
+        typer.echo(f"warning: network: {note}", err=True)
     with open_flow_process(set_threads) as process:
         stream = live.stream_video(
             footage,
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
-            method=None if model is None else Model(model),
+            method=method,
             scale_mm_per_px=read_scale(scale),
             young_kpa=young,
             paced=not every,

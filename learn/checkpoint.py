@@ -21,6 +21,7 @@ from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationErro
 from safetensors import torch as safetensors
 from torch import Tensor
 
+from learn.data.clips import RECOVERED, sources
 from learn.data.grid import Scales
 from learn.network.d2fnet import Architecture, D2FNet
 from learn.settings import TrainingSettings
@@ -64,16 +65,18 @@ class ModelCard:
     intervals: Intervals | None = None  # prediction intervals; None if not fitted
     no_intervals: str = ""  # why they could not be fitted; else empty
     motion: list[str] = field(default_factory=list)
-    """Estimators and versions of the recovered motion it was fitted on, `tvl1 1`; empty: none, or unknown."""
+    """Estimators and versions of the motion of its training, as of `name_motion`; empty: true, or unknown."""
 
     def doubt(self, recovered_by: str) -> list[str]:
-        """A note if the network was not trained on motion recovered like that; "" is unknown."""
-        if not (recovered_by and self.motion) or recovered_by in self.motion:
+        """A note if the network was not, or not surely, trained on motion like that, for which its intervals
+        are then not calibrated. `recovered_by`: as of `name_motion`; "": true motion, or unknown."""
+        exact = not {*RECOVERED}.intersection(sources(self.settings.input))
+        if recovered_by in self.motion or (not recovered_by and (exact or self.motion)):
             return []
-        return [
-            f"the network was trained on motion by {' and '.join(self.motion)} (estimator and version), and "
-            f"this is by {recovered_by}: forces may be off; use that estimator, or train again"
-        ]
+        by = " and ".join(self.motion) or ("true" if exact else "")
+        trained = f"was trained on {by} motion" if by else "does not state the motion that it was trained on"
+        given = f", and this is by {recovered_by}" if recovered_by else ""
+        return [f"the network {trained}{given}: forces may be off, its intervals are not calibrated"]
 
     @property
     def used(self) -> set[str]:

@@ -146,7 +146,7 @@ def eval_command(
     json: Json = False,
 ) -> None:
     """Score a model on sequences that it was not trained on; forces in mN."""
-    from learn.data.clips import scored_source
+    from learn.data.clips import RECOVERED, scored_source
     from learn.evaluation.coverage import cover
     from learn.evaluation.evaluate import evaluate
     from learn.evaluation.tables import coverage_table, score_table
@@ -161,7 +161,8 @@ def eval_command(
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
     chosen = choose_unseen(clips, dataset, predictor.card, _console.print)
-    for note in {note for clip in chosen for note in predictor.card.doubt(clip.recovered_by)}:
+    recovered_by = {clip.recovered_by if source in RECOVERED else "" for clip in chosen}
+    for note in {note for one in recovered_by for note in predictor.card.doubt(one)}:
         _note(note)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
@@ -197,7 +198,7 @@ def predict_command(
     rate: Annotated[float, Option(min=0.0, help="Most frames per second of a video; 0: all.")] = 10.0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion.")] = True,
     masks: Annotated[
-        str, Option(help="Of a video: auto, none, glare, tool, both, or a folder of NNNNNN.png or mask.png.")
+        str, Option(help="Of a video: auto, none, both, or a folder of NNNNNN.png or mask.png.")
     ] = "auto",
     overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     threads: Threads = None,
@@ -225,10 +226,10 @@ def predict_command(
     for one in predict_files(*opened, source, out, young, membrane, overlay):
         found.append(one)
         if not json:
+            for note in one.notes:
+                _note(f"{one.name}: {note}")
             what = "no frame has a force" if one.peak_mn is None else f"peak force {one.peak_mn:.3g} mN"
             _console.print(f"{one.name}: {one.frames} frames, {what}")
-            for note in one.notes:
-                _note(note)
     if json:
         notes, peaks = {one.name: one.notes for one in found}, {one.name: one.peak_mn for one in found}
         print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))

@@ -1,15 +1,25 @@
 """Versions of the formats on disk: a changed meaning raises its number, and N reads N and N - 1."""
 
-from __future__ import annotations
+import hashlib
+from functools import cache
+from pathlib import Path
 
 from synth.errors import UserError
 
 STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
-MOTION = 1
+MOTION = 2
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
+MOTION_WEIGHTS = tuple(sorted(Path(__file__).with_name("flow").rglob("*.pt")))
 FIRST = 2  # written by 0.2, the first release: nothing older is read
+
+
+@cache
+def motion_version() -> str:
+    """Version of recovered motion, `MOTION` and a digest of the weights below it: `2-0a1b2c3d`."""
+    weights = b"".join(file.read_bytes() for file in MOTION_WEIGHTS if file.exists())
+    return f"{MOTION}-{hashlib.blake2b(weights, digest_size=4).hexdigest()}"
 
 
 def check_format(found: object, current: int, where: str) -> None:

@@ -83,7 +83,7 @@ def check_contradiction(sensor: SensorMotion) -> list[Finding]:
 
 
 def find_missed(sensor: SensorMotion) -> str:
-    """Which frames' 90% interval holds clearly fewer of the sensor's readings than stated; empty: none."""
+    """Which frames' interval holds clearly fewer of the sensor's readings than `LEVEL`; empty: none."""
     if sensor.leading_mn is None or sensor.bounds_mn is None:
         return ""
     low, high = sensor.bounds_mn.T
@@ -103,7 +103,8 @@ def find_missed(sensor: SensorMotion) -> str:
         few |= bool(parts[which].sum() >= LEAST_FRAMES and share < _HELD and chance < _CHANCE)
     of = ", ".join(f"{share:.0%}{which}" for which, share in shares.items() if which)
     holds = f"holds {shares['']:.0%} of the sensor's readings ({of})"
-    return f"the interval of {LEVEL:.0%} {holds}" if few else ""
+    level = f" of {LEVEL:.0%}" if sensor.calibrated else ", not calibrated for this motion,"
+    return f"the interval{level} {holds}" if few else ""
 
 
 def independent(curve: Floats) -> float:

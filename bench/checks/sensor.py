@@ -131,10 +131,11 @@ class SensorMotion:
     forces_mn: tuple[Floats, ...] = ()  # of independent methods, (T, 3) in the camera's axes; none without E
     observed_axes: int = 0  # number of camera axes that the video shows; 0 if the sensor has other axes
     leading_mn: Floats | None = None  # (T, 3) of the main method; None without E
-    bounds_mn: Floats | None = None  # (T, 2) its 90% interval, NaN where it states none
+    bounds_mn: Floats | None = None  # (T, 2) its interval, NaN where it states none
     rest_mn: Floats | None = None  # (3,) the sensor's force at the rest frame
     noise_mn: float = 0.0  # of the sensor without contact; 0 if unknown
     pulsates: bool = False  # the tissue moves by itself
+    calibrated: bool = True  # the interval has the level that it states
 
     @property
     def size_mn(self) -> Floats:
@@ -190,6 +191,7 @@ def find_sensor_motion(
         next((one for one in sensor.axes_mn[:2] if np.isfinite(one).all()), None),  # it may start later
         sensor.noise_floor_mn,
         bool(tracked.pulse),
+        main not in tracked.uncalibrated,
     )
 
 

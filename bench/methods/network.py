@@ -20,9 +20,8 @@ from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 class Model:
     """A model of `learn train`. Without a known E its forces are those of tissue of 1 kPa."""
 
-    def __init__(self, model: Path | Predictor, recovered_by: str = "") -> None:
-        """`model`: itself, or its folder, loaded as an optimised graph. `recovered_by`: of `name_motion`."""
-        self._recovered_by = recovered_by
+    def __init__(self, model: Path | Predictor) -> None:
+        """`model`: itself, or its folder, loaded as an optimised graph."""
         self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
         self._estimator: tuple[MethodContext, ForceEstimator] | None = None
 
@@ -50,10 +49,14 @@ class Model:
         return [note for note in self._all_notes if not note.startswith(OUT_OF_DISTRIBUTION)]
 
     @property
+    def doubt(self) -> list[str]:
+        """Notes of `ModelCard.doubt` on the last recording."""
+        return [] if self._estimator is None else self.predictor.card.doubt(self._estimator[0].recovered_by)
+
+    @property
     def warnings(self) -> list[str]:
         """Reasons to doubt these estimates."""
-        doubt = self.predictor.card.doubt(self._recovered_by)
-        return doubt + [note for note in self._all_notes if note.startswith(OUT_OF_DISTRIBUTION)]
+        return [note for note in self._all_notes if note.startswith(OUT_OF_DISTRIBUTION)]
 
     @property
     def _all_notes(self) -> list[str]:

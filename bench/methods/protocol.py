@@ -33,6 +33,8 @@ class MethodContext:
     """Relative standard uncertainty of `young_kpa`."""
     living: bool = True
     """Whether the tissue may move by heart and breath; False: ex vivo, or a phantom."""
+    recovered_by: str = ""
+    """Estimator and version of the motion; empty: unknown."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""

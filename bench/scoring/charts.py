@@ -37,7 +37,8 @@ def draw_force(result: Result, others: bool = False) -> str:
 
     def draw(axes: Axes) -> None:
         if result.absolute and method.low_mn is not None and method.high_mn is not None:
-            name = f"{method.interval['level']:.0%} interval"
+            level = method.interval.get("level")
+            name = f"{level:.0%} interval" if level else "interval, not calibrated for this motion"
             _band(axes, time_s, method.low_mn, method.high_mn, name, _INTERVAL)
         if spread > 0:
             name = f"±{100 * spread:.0f}% scale" + ("" if holds_young else ", stiffness")

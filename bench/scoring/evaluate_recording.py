@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -58,7 +58,7 @@ def evaluate_recording(
     sensor = align_sensor(recording, time_s, speed, tracked.turning)
     scored, unscored = _select_frames(meta, tracked, sensor)
     compared = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
-    findings = by_severity([*judge(recording, tracked, compared), *sensor.findings])
+    findings = by_severity([*tracked.doubt, *judge(recording, tracked, compared), *sensor.findings])
     missing = [one.message for one in findings if one.severity == "missing"]
     result = Result(
         recording=recording.name,
@@ -143,7 +143,7 @@ def _score_methods(
             gain = _fit_gain(_magnitude(force), first, against, press)
             force *= gain.mn_per_mm
         one = replace(_score(force, first, against, press, in_camera_axes), gain=gain)
-        scored[name] = _with_interval(one, against.tracked.bounds[name], against)
+        scored[name] = _with_interval(one, name, against)
     return scored
 
 
@@ -186,14 +186,15 @@ def _score(
     return Scored(force, size, scores, components, events, intervals, calibrated, worse)
 
 
-def _with_interval(scored: Scored, bounds: Sequence[tuple[float, float]], against: Result) -> Scored:
-    """Adds the method's prediction intervals, their mean width and their coverage of the sensor."""
-    low, high = np.where(against.lost, np.nan, np.array(bounds, np.float64).T)
+def _with_interval(scored: Scored, name: str, against: Result) -> Scored:
+    """Adds the method's prediction intervals, their level, mean width and coverage of the sensor."""
+    low, high = np.where(against.lost, np.nan, np.array(against.tracked.bounds[name], np.float64).T)
     known = np.isfinite(low)
     if not known.any():
         return scored
     known &= against.scored
-    interval = {"level": LEVEL, "width_mn": _mean((high - low)[known])}
+    interval = {} if name in against.tracked.uncalibrated else {"level": LEVEL}
+    interval["width_mn"] = _mean((high - low)[known])
     sensor = against.sensor_mn
     if sensor is not None and against.absolute:
         known &= np.isfinite(sensor)

@@ -49,10 +49,10 @@ class Scored:
     worse_by_mn: Interval | None = None
     """Interval of the main method's MAE minus this one's, paired; None for the main method."""
     gain: Gain | None = None  # of a length of flow; None for force estimators
-    low_mn: Floats | None = None  # (T,) lower end of the 90% prediction interval [mN]; None: no intervals
+    low_mn: Floats | None = None  # (T,) lower end of the prediction interval [mN]; None: no intervals
     high_mn: Floats | None = None  # (T,) upper end
     interval: dict[str, float] = field(default_factory=dict)
-    """`level`, mean `width_mn` and, with a sensor and a known E, `coverage` of those intervals."""
+    """`level` (absent: not calibrated for this motion), mean `width_mn`, with sensor and E `coverage`."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from learn.inference.shipped import choose_model, find_model
 from learn.training.threads import set_threads
 from synth.arguments import checked
 from synth.errors import UserError
-from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.flow import open_flow_process
 from synth.system import checked_file
@@ -83,7 +82,7 @@ def score(
         # Another process is given an estimator by its name.
         if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
             flow = stack.enter_context(open_flow_process(set_threads))
-        network = None if model is None else Model(model, name_motion(used.backend))
+        network = None if model is None else Model(model)
         chosen = _choose_methods(network, model, methods or {}, baselines)
         scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
         about = _describe(chosen)

@@ -10,6 +10,7 @@ import numpy as np
 
 from bench.methods.protocol import Method, MethodContext
 from synth.errors import UserError
+from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, problems
 from synth.recording_flow.flow import LocalFlow
@@ -76,7 +77,7 @@ def stream_video(
     stream = Stream(size=(video.rest.tissue.shape[0], video.rest.tissue.shape[1]))
     mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.rest.size[1]) * video.rest.shrink
     young = None if scale_mm_per_px == "unknown" else young_kpa
-    scene = MethodContext(video.rest.tissue, mm_per_px, young)
+    scene = MethodContext(video.rest.tissue, mm_per_px, young, recovered_by=name_motion(settings.backend))
     for found in video.frames():
         if found.is_rest:
             continue

@@ -18,6 +18,7 @@ from bench.recording.right_pictures import RightPictures, StereoQuality
 from bench.sensor.alignment import align_sensor
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
+from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
@@ -67,6 +68,8 @@ class TrackedRecording:
     notes: list[str] = field(default_factory=list)
     timings: dict[str, dict[str, float] | float] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)  # on the pictures
+    doubt: list[Finding] = field(default_factory=list)  # on the training of the leading method's network
+    uncalibrated: set[str] = field(default_factory=set)  # methods whose intervals aren't, for this motion
     decoded: list[tuple[int, float | None]] = field(default_factory=list)  # number, time [s] of every picture
     rest_s: float | None = None  # time of the rest frame
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
@@ -101,7 +104,7 @@ def track_recording(
     for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
         mm_per_px = scale_mm_per_px * video.rest.shrink
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
-        scene = MethodContext(video.rest.tissue, mm_per_px, *known)
+        scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
         for frame in video.frames():
@@ -136,9 +139,15 @@ def _describe(
     out.repeats, mm_per_px = decoder.faults.repeats(), out.scale_mm_per_px * video.rest.shrink
     if recording.masks:
         out.notes.append(recording.describe_tool(len(out.decoded)))
+    doubt = {name: getattr(method, "doubt", ()) for name, method in methods.items()}
+    parts = {name: one.parts if isinstance(one, Fusion) else (name,) for name, one in methods.items()}
+    out.uncalibrated = {name for name in methods if any(doubt.get(part) for part in parts[name])}
+    leading = parts.get(pictured, ())
+    out.doubt = [Finding("warning", part, note) for part in leading for note in doubt.get(part, ())]
     for name, method in methods.items():
         warnings = getattr(method, "warnings", ())
-        out.notes += [f"{name}: {note}" for note in (*getattr(method, "notes", ()), *warnings)]
+        own = (*(() if name in leading else doubt[name]), *getattr(method, "notes", ()), *warnings)
+        out.notes += [f"{name}: {note}" for note in own]
         # Doubts on a method that does not lead, or not alone, are in the interval of the one that does.
         out.findings += [Finding("warning", name, one) for one in warnings if name == pictured]
     if video.peak_bytes:

@@ -14,7 +14,7 @@ from torch import nn
 
 from evidence import report, status
 from evidence.flow.scenes import jpeg
-from evidence.render.realism import OUTLINE, bare_picture, corners, outlined, scaled_photograph
+from evidence.render.photograph import OUTLINE, bare_picture, corners, outlined, scaled_photograph
 from evidence.study import Study
 from synth.arrays import Floats, Ints, Mask, Pixels
 from synth.errors import UserError
@@ -107,7 +107,7 @@ def measure(
     """AUC of a patch classifier, photograph against rendered crops; two controls should be near 0.5.
 
     Fitted cameras are tested on sectors that `synth fit` did not use. `outline`, `width_mm`: of the cortex in
-    the photograph, as in realism; `frames`: number of rendered sequences, one frame each.
+    the photograph; `frames`: number of rendered sequences, one frame each.
     """
     (theirs, places), rng = of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
     away = places - places.mean(axis=0)

@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 
 from evidence import report, status
 from evidence.appearance.classifier import MM_PER_PX, SIDE_PX, ablated, crops, of_photograph, taken
-from evidence.render.realism import OUTLINE, bare_picture, corners
+from evidence.render.photograph import OUTLINE, bare_picture, corners
 from evidence.study import Study
 from synth.arrays import Floats, Ints, Pixels
 from synth.errors import UserError
@@ -137,7 +137,7 @@ def measure(
     """Kernel distance, precision, recall and coverage of renderings, photograph against rendered crops.
 
     `job`: named jobs or files, `default` for one without keys; repeatable; `outline`, `width_mm`: of the
-    cortex in the photograph, as in realism; `frames`: of each job, one a sequence.
+    cortex in the photograph; `frames`: of each job, one a sequence.
     """
     every, places = of_photograph(photo, outline, width_mm, SIDE_PX // 8)
     chosen = apart(places)

@@ -3,6 +3,7 @@
 With `--pack` they are written into the package, each with a card of these figures.
 """
 
+import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,8 @@ from evidence import report, status
 from evidence.curves.experiment import figures
 from evidence.end_to_end import models
 from evidence.study import Study
+from learn import checkpoint
+from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
@@ -21,8 +24,10 @@ from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
 from synth.errors import UserError
+from synth.system.checked_file import folder_bytes, write_whole
 
 _LEVEL = 0.9
+LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
 _LIMITS = (
     "Trained on rendered images alone, without recordings of real tissue.",
     "Force is proportional to Young's modulus and has at least its relative error.",
@@ -51,8 +56,42 @@ def measure(
         rows += [{"model": name} | row for row in own]
         if pack:
             limits = _LIMITS if predictor.card.settings.arch.depth else (*_LIMITS, *_MONOCULAR)
-            shipped.pack_model(folder, shipped.MODELS / name, report.commit(), _listed(own), limits)
+            pack_model(folder, shipped.MODELS / name, report.commit(), _listed(own), limits)
     return {"data": status.data(*data), "rows": rows}
+
+
+def pack_model(
+    model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
+) -> ModelCard:
+    """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
+
+    Args:
+        model: folder of `learn train`.
+        folder: of the pretrained network, `MODELS` and its name; replaced if it exists.
+        commit: of the code that trained it.
+        metrics: name and value of each measurement, with its unit.
+        limits: known limits, a sentence each.
+
+    Raises:
+        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is written then.
+    """
+    net, card = checkpoint.read_model(model)
+    shutil.rmtree(folder, ignore_errors=True)
+    card = checkpoint.write_model(folder, card, net.state_dict())
+    line = shipped.describe(card)
+    rows = {"data (hash of its sequences)": shipped.hash_data(card), "commit": commit, **metrics}
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
+    listed = "\n".join(f"- {one}" for one in limits)
+    head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
+    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{listed}\n".encode())
+    size = folder_bytes(folder)
+    if size > LARGEST_BYTES:
+        shutil.rmtree(folder)
+        raise UserError(
+            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
+            "train it with a smaller arch.width"
+        )
+    return card
 
 
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import skimage
 from scipy.ndimage import center_of_mass, convolve, distance_transform_edt, label
 
 from evidence import report, status
-from evidence.render.realism import OUTLINE, bare_picture, outlined, scaled_photograph
+from evidence.render.photograph import OUTLINE, bare_picture, outlined, scaled_photograph
 from evidence.study import Study
 from synth.job.schema import Job
 

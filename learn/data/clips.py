@@ -35,6 +35,7 @@ FIELDS = {
 """Store field of each displacement. `noisy`: true flow with the published noise. `motion`: recovered stereo
 motion in three components; `motion-ideal`: its ground truth."""
 UNKNOWN_YOUNG_KPA = 1.0  # E assumed where it is unknown: forces are then right up to a factor
+RECOVERED = ("recovered", "motion")  # displacements with the errors of an estimator
 _MIXED = {"mixed": ("ideal", "recovered"), "motion-mixed": ("motion-ideal", "motion")}
 _CURE = {
     "ideal": "render it anew",

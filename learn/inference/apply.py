@@ -53,7 +53,7 @@ def predict(
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia), for a model with that input.
         tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.
-        masks: auto, none, glare, tool or both; or instrument masks: (T, H, W), (H, W) or a folder.
+        masks: auto, none or both; or instrument masks: (T, H, W), (H, W) or a folder.
         pulse: whether heartbeat and breathing are subtracted from a video's motion.
         flow: estimator of a video's flow.
         shrink: factor by which a video is downsampled before flow; 0: to 320 columns.
@@ -127,13 +127,16 @@ def apply(
         out["time_s"] = times
     if last.force_mn is not None:
         out["force_mn"] = force
-    notes = [finding.message for finding in findings if finding.severity == "warning"]
-    notes += one.notes() + estimator.notes + predictor.card.doubt(motion.recovered_by)
+    doubt = predictor.card.doubt(motion.recovered_by)
+    warned = [finding.message for finding in findings if finding.severity == "warning"]
+    notes = [*doubt, *warned, *one.notes(), *estimator.notes]
     if motion.scale_known:
         notes += estimator.interval_notes
         out |= _ends(found, trusted)
+        if "low_mn" in out and not doubt:
+            out["level"] = np.array(LEVELS)
     if fault:
-        notes.insert(0, f"nothing can be measured: {fault}")
+        notes.insert(len(doubt), f"nothing can be measured: {fault}")
     elif not trusted.all():
         notes.append(f"{(~trusted).sum()} of {len(trusted)} frames could not be followed: they have no force")
     out["notes"] = np.array(notes, dtype=str)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from learn.data.clips import FIELDS, check_readable, has_depth
+from learn.data.clips import FIELDS, RECOVERED, check_readable, has_depth
 from synth.arrays import Array, Floats, Mask
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError, as_positive
@@ -118,7 +118,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
         young_kpa=sequence.attrs["young_kpa"],
-        recovered_by=sequence.recovered_by if source in ("recovered", "motion") else "",
+        recovered_by=sequence.recovered_by if source in RECOVERED else "",
         force_mn=np.linalg.norm(sequence.read_whole("force"), axis=1) if "force" in sequence else None,
     )
 

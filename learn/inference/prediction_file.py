@@ -49,6 +49,7 @@ FIELDS: dict[str, PredictedField] = {
     "high68_mn": PredictedField("T", "mN", "upper end of the size's 68% interval"),
     "force_low_mn": PredictedField("T, 3", "mN", "lower ends of the components' 90% intervals, camera axes"),
     "force_high_mn": PredictedField("T, 3", "mN", "upper ends of the components' 90% intervals, camera axes"),
+    "level": PredictedField("2", "-", "0.9, 0.68 of the intervals; absent: not calibrated for this motion"),
     "mask": PredictedField("N, N", "-", "cells with tissue"),
     "pitch_mm": PredictedField("", "mm", "width of a cell"),
     "scale_mm_per_px": PredictedField("", "mm/px", "of the video's own pixels"),

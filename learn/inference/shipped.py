@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
-from synth.errors import UserError
 from synth.job import identity
-from synth.system.checked_file import folder_bytes, write_whole
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")
-LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
 
 
 def find_model(named: Path | str) -> Path:
@@ -35,42 +30,7 @@ def find_name(card: ModelCard) -> str:
 
 def hash_data(card: ModelCard) -> str:
     """Hash of all sequences in a model's split, in any order."""
-    named = {part: sorted(hashes) for part, hashes in card.split.items()}
-    return identity.digest(named)
-
-
-def pack_model(
-    model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
-) -> ModelCard:
-    """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
-
-    Args:
-        model: folder of `learn train`.
-        folder: of the pretrained network, `MODELS` and its name; replaced if it exists.
-        commit: of the code that trained it.
-        metrics: name and value of each measurement, with its unit.
-        limits: known limits, a sentence each.
-
-    Raises:
-        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is written then.
-    """
-    net, card = checkpoint.read_model(model)
-    shutil.rmtree(folder, ignore_errors=True)
-    card = checkpoint.write_model(folder, card, net.state_dict())
-    line = describe(card)
-    rows = {"data (hash of its sequences)": hash_data(card), "commit": commit, **metrics}
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
-    listed = "\n".join(f"- {one}" for one in limits)
-    head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
-    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{listed}\n".encode())
-    size = folder_bytes(folder)
-    if size > LARGEST_BYTES:
-        shutil.rmtree(folder)
-        raise UserError(
-            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
-            "train it with a smaller arch.width"
-        )
-    return card
+    return identity.digest({part: sorted(hashes) for part, hashes in card.split.items()})
 
 
 def describe(card: ModelCard) -> str:

@@ -18,7 +18,7 @@ from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
-from learn.data.clips import Clip, scored_source, sources
+from learn.data.clips import RECOVERED, Clip, scored_source, sources
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
@@ -59,7 +59,7 @@ def train(
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = measure_scales(fit, settings)
     typical_young = float(np.exp(np.mean([np.log(clip.young_kpa) for clip in fit])))
-    is_recovered = scored_source(settings.input) in ("recovered", "motion")
+    is_recovered = scored_source(settings.input) in RECOVERED
     motion = sorted({clip.recovered_by for clip in fit if is_recovered} - {""})
     parts = name_parts(clips, split)
     card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)

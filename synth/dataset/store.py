@@ -19,7 +19,7 @@ from synth.dataset import fast_read, location, provenance
 from synth.dataset.attributes import FORMAT, LARGEST_BYTES, check_attributes
 from synth.errors import InvalidValue, NotFinite, UserError, did_you_mean
 from synth.fields import FIELDS, Field
-from synth.formats import MOTION, STORE
+from synth.formats import STORE, motion_version
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import packages
@@ -102,7 +102,8 @@ class Writer:
             **attributes,
             "summary": summary,
             "field_hashes": hashes,
-            "versions": {**packages.versions(), "generator": provenance.fingerprint(), "motion": str(MOTION)},
+            "versions": packages.versions()
+            | {"generator": provenance.fingerprint(), "motion": motion_version()},
         }
         attrs = json.loads(identity.canonical(attrs))  # as it is read back
         attrs["content_hash"] = content_hash(attrs)
@@ -246,8 +247,8 @@ class Sequence:
     @property
     def recovered_by(self) -> str:
         """Estimator and version of its recovered motion, as `name_motion`; empty if unknown."""
-        version = self.attrs.get("versions", {}).get("motion")
-        return f"{self.attrs['flow_backend']} {version}" if version and "flow_backend" in self.attrs else ""
+        version = self.attrs.get("versions", {}).get("motion", "0")
+        return f"{self.attrs['flow_backend']} {version}" if "flow_backend" in self.attrs else ""
 
     @property
     def fields(self) -> list[str]:

@@ -99,13 +99,14 @@ def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
 
     `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px.
     """
-    height, width = flow.shape[:2]
-    small = predict(net, features).transpose(1, 2, 0)
+    (height, width, _), small = flow.shape, predict(net, features).transpose(1, 2, 0)
     size = CELL * small.shape[1], CELL * small.shape[0]
     missing, spread = (cv2.resize(part, size)[:height, :width] for part in (small[..., :2], small[..., 2:]))
     # Log-variances are limited to the trained range; the deviation is the geometric mean of both components.
-    spread = np.clip(spread, -8, 5, out=spread)
-    return flow + missing, np.exp(0.25 * (spread[..., 0] + spread[..., 1]))
+    variance = np.exp(0.5 * spread.clip(-8, 5).sum(axis=-1))
+    signal = (missing * missing).mean(axis=-1)
+    share = signal / (signal + variance)  # Wiener's: the correction vanishes where it isn't sure
+    return flow + share[..., None] * missing, np.sqrt(variance + ((1 - share) ** 2) * signal)
 
 
 def predict(net: CorrectionNet, features: Map) -> Map:

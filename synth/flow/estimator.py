@@ -6,7 +6,7 @@ from typing import Protocol
 
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import as_user_error
-from synth.formats import MOTION
+from synth.formats import motion_version
 from synth.plugins import ESTIMATORS, check_answer
 
 
@@ -37,8 +37,8 @@ def name_backend(backend: str | Estimator) -> str:
 
 
 def name_motion(backend: str | Estimator) -> str:
-    """Estimator and version of motion that is recovered now, `tvl1 1`, as models' cards hold it."""
-    return f"{name_backend(backend)} {MOTION}"
+    """Estimator and version of motion that is recovered now, `tvl1 2-0a1b2c3d`, as models' cards hold it."""
+    return f"{name_backend(backend)} {motion_version()}"
 
 
 class CheckedEstimator:

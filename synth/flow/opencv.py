@@ -1,7 +1,5 @@
 """OpenCV's flow estimators as `Estimator`s, on contrast-normalised pictures with masked pixels filled."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -9,10 +9,10 @@ psi(s^2) = sqrt(s^2 + epsilon^2) is the robust data term on brightness and gradi
 accuracy optical flow estimation based on a theory for warping, ECCV 2004, eq. 5), |.|_h the Huber norm
 (Werlberger et al., Anisotropic Huber-L1 optical flow, BMVC 2009, eq. 6), and m the mask: visible in the
 rest frame, and visible now at x + w. Where m is 0 the regulariser alone determines the flow, with a larger h,
-that is, smoothed quadratically. lambda is scaled by (reference / median residual)^2, limited to 0.45-1.5, and
-rises where the initial flow is steep. The solver works coarse to
-fine with repeated warping (Brox); each warp is solved by the primal-dual algorithm 1 of Chambolle and Pock
-(J. Math. Imaging Vis. 40, 2011) with lagged weights.
+that is, smoothed quadratically. On the finest level grad is of w less its local mean. lambda is scaled by
+(reference / median residual)^2, limited to 0.45-1.5, and rises where the initial flow is steep. The solver
+works coarse to fine with repeated warping (Brox); each warp is solved by the primal-dual algorithm 1 of
+Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) with lagged weights.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class TVL1Settings:
     """Parameters of the energy and of the solver. A cold start has two stages: a guess on the coarse levels
     with two values of lambda, then the solution on the fine levels. A warm start solves on all levels."""
 
-    weight: float = 0.36  # lambda: data against smoothness
+    weight: float = 0.18  # lambda: data against smoothness
     noise: float = 0.115  # reference median residual [local standard deviations]; 0: lambda is constant
     gradient: float = 1.0  # gamma: weight of gradient constancy
     huber: float = 0.15  # h [px/px]: smaller flow gradients are smoothed quadratically, larger ones linearly
@@ -55,6 +55,9 @@ class TVL1Settings:
     steps: int = 16  # primal-dual steps per warp
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
+    bending_px: float = (
+        8.0  # on the finest level smoothness is of the flow less its mean over this; 0: of all
+    )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
     fine_levels: int = 2  # levels of the second stage
@@ -66,7 +69,7 @@ class TVL1Settings:
     def first_stage(self, weight: float) -> TVL1Settings:
         """Settings of the first stage of a cold start."""
         tau, warps = self.coarse_tau, self.coarse_warps
-        return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, tau=tau, warps=warps)
+        return replace(self, weight=weight, noise=0.0, hidden_huber=0.0, bending_px=0.0, tau=tau, warps=warps)
 
 
 class Tvl1:
@@ -176,12 +179,16 @@ def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tenso
         here = weight
         if weight.shape[-1] > 1:
             here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
-        flow = _solve_level(level, flow, here, s)
+        flow = _solve_level(level, flow, here, s, s.bending_px if level is levels[0] else 0.0)
     return flow
 
 
-def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
-    """All warps of a level: each linearises r about the flow, weights it and minimises the energy."""
+def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, bending_px: float) -> Tensor:
+    """All warps of a level: each linearises r about the flow, weights it and minimises the energy.
+
+    The smoothness term sees the flow less its Gaussian mean: of all of it, it damps a wave of wavenumber k by
+    1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
+    """
     rest, now, rest_usable, now_usable = (
         np.ascontiguousarray(field[0, 0].numpy())
         for field in (level.rest, level.now, level.rest_usable, level.now_usable)
@@ -208,10 +215,14 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) ->
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
             here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
+        whole = torch.from_numpy(found)[None]
+        around = image.window(whole, bending_px) if bending_px > 0 else 0 * image.halved(whole)
+        found -= (mean := image.doubled(around, whole)[0].numpy())
         linearise(before, after, mask, here, found, numbers, state)
         primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
             found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
+        found += mean
     return torch.from_numpy(found)[None]
 
 

@@ -14,8 +14,6 @@ from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.picture_faults import find_fault
 from synth.video.read import shrink_mask
 
-_WITHOUT_GLARE, _WITHOUT_TOOL = ("none", "tool"), ("none", "glare")  # of `MASKS`
-
 
 class ProposeMasks:
     """Proposes masks, from pictures or from given masks; flow selects among them."""
@@ -30,13 +28,13 @@ class ProposeMasks:
         return replace(frame, proposal=self._propose(frame), trusted=trusted)
 
     def _propose(self, frame: FrameMotion) -> Proposal:
-        known = nothing = np.zeros(frame.rgb.shape[:2], bool)
-        glare, tool = _glare(frame.rgb, self._kind), nothing
-        if self._tool is None:
-            tool = _tool(frame.rgb, self._kind)
-        elif self._kind not in _WITHOUT_TOOL:
-            given = self._tool(frame.index, self._rest.size)
-            known = nothing if given is None else shrink_mask(given, self._rest.shrink, 0)
+        glare = tool = known = nothing = np.zeros(frame.rgb.shape[:2], bool)
+        if self._kind != "none":
+            glare = mask_detection.glare(frame.rgb)
+            if self._tool is None:
+                tool = mask_detection.tool(frame.rgb)
+            elif (given := self._tool(frame.index, self._rest.size)) is not None:
+                known = shrink_mask(given, self._rest.shrink, 0)
         if frame.camera is not None:
             if known.any():
                 known = frame.camera.undo(known.astype(np.uint8) * 255) > 127
@@ -48,16 +46,6 @@ class ProposeMasks:
 
 def mask_right(rgb: Pixels, kind: str, left: Mask) -> Mask:
     """Mask (H, W) of tool and highlights in the right picture; `auto`: none if the left picture has none."""
-    if kind == "auto" and not left.any():
+    if kind == "none" or (kind == "auto" and not left.any()):
         return np.zeros(rgb.shape[:2], bool)
-    return _glare(rgb, kind) | _tool(rgb, kind)
-
-
-def _glare(rgb: Pixels, kind: str) -> Mask:
-    """Highlights (H, W), empty if the `kind` of masks has none."""
-    return np.zeros(rgb.shape[:2], bool) if kind in _WITHOUT_GLARE else mask_detection.glare(rgb)
-
-
-def _tool(rgb: Pixels, kind: str) -> Mask:
-    """Instruments (H, W), empty if the `kind` of masks has none."""
-    return np.zeros(rgb.shape[:2], bool) if kind in _WITHOUT_TOOL else mask_detection.tool(rgb)
+    return mask_detection.blocked(rgb)

@@ -15,12 +15,10 @@ from synth.video.read import read_mask
 
 MASKS = {
     "auto": "detected highlights and instrument, where masking them helps",
-    "glare": "all detected highlights",
-    "tool": "all of the detected instrument",
     "both": "all detected highlights and the detected instrument",
     "none": "nothing",
 }
-"""What is masked; given instrument masks are used in all cases but `glare` and `none`."""
+"""What is masked; given instrument masks are used in all cases but `none`."""
 
 
 @dataclass(frozen=True)

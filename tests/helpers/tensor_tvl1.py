@@ -4,22 +4,27 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from synth.flow import image
 from synth.flow.image import Level
 from synth.flow.tvl1 import TVL1Settings
 
 _WEIGHT_LIMITS = 0.45, 1.5
 
 
-def solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings) -> Tensor:
+def solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, bending_px: float) -> Tensor:
     """Runs all warps of a level; flow (B, 2, H, W) px, weight (B, 1, H, W)."""
     dual = flow.new_zeros(2, *flow.shape)
     for _ in range(s.warps):
-        flow, dual = step(level, flow, dual, weight, s)
+        mean = image.doubled(image.window(flow, bending_px), flow) if bending_px else torch.zeros_like(flow)
+        flow, dual = step(level, flow, mean, dual, weight, s)
     return flow
 
 
-def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> tuple[Tensor, Tensor]:
-    """One warp: linearises r about `flow`, weights it and minimises. dual: (2, B, 2, H, W), x and y parts."""
+Step = tuple[Tensor, Tensor]
+
+
+def step(level: Level, flow: Tensor, mean: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settings) -> Step:
+    """One warp: linearises r about `flow`, weights it, minimises over the flow less its `mean`."""
     warped, visible = warp(level.now, level.now_usable, flow)
     mask = level.rest_usable * visible
     # The gradient of the warped picture, which rotates and stretches with w, must equal that at rest.
@@ -35,6 +40,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settin
     xx = 1 + c * (rows * rows).sum(1, keepdim=True)
     xy = c * (rows * columns).sum(1, keepdim=True)
     yy = 1 + c * (columns * columns).sum(1, keepdim=True)
+    flow = flow - mean
     offset = residual - rows * flow[:, :1] - columns * flow[:, 1:]
     gx, gy = c * (rows * offset).sum(1, keepdim=True), c * (columns * offset).sum(1, keepdim=True)
     scale = 1 / (xx * yy - xy * xy)
@@ -44,7 +50,7 @@ def step(level: Level, flow: Tensor, dual: Tensor, weight: Tensor, s: TVL1Settin
     flow, dual = primal_dual(flow, dual, straight, cross, shift, s.huber + s.hidden_huber * (1 - mask), s)
     if s.median:
         flow = median3(flow)
-    return flow, dual
+    return flow + mean, dual
 
 
 def noise_weight(residual: Tensor, mask: Tensor, noise: float) -> Tensor:

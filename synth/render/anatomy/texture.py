@@ -2,7 +2,7 @@
 
 Sizes are mm, albedos linear RGB; an absorption is the optical depth (natural) of red, green and blue for one
 unit of the layer's depth map. All were chosen by eye on an intra-operative photograph
-(`evidence.render.realism` compares colours with one).
+(`evidence.appearance` compares renderings with one).
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Ranges:
     """Middle colours (linear RGB) and ranges of the quantities in `Appearance`, in drawing order.
 
     Defaults are those of healthy cortex. Chosen by eye on intra-operative photographs;
-    `evidence.render.realism` compares colours with one.
+    `evidence.appearance` compares renderings with one.
     """
 
     gyrus_albedo: Colour = (0.95, 0.765, 0.49)

@@ -2,18 +2,26 @@
 
 import math
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
+import fake_intervals
 import numpy as np
 import pytest
+from fake_model import write_model
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
 
 from bench.methods.flow_size import flow_sizes
+from bench.methods.fusion import Fusion
+from bench.methods.network import Model
 from bench.methods.protocol import ForceEstimate, Method, MethodContext
 from bench.scoring import charts
 from bench.scoring.headline import headline
+from bench.scoring.report import render_report
 from bench.scoring.result import Result, as_json
+from learn.checkpoint import read_card, write_card
 from synth.arrays import Mask, Pixels
+from synth.flow.estimator import name_motion
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -102,6 +110,18 @@ def test_shape_error_of_a_wrong_curve(make: Maker) -> None:
     peak = np.mean([x[:12].max(), x[12:].max()])
     expected = np.abs(g * np.sqrt(x) - x).mean() / peak
     assert result.methods["late"].scores["shape_error"] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("motion", [name_motion("tvl1"), "tvl1 0"])
+def test_an_interval_has_a_level_for_motion_as_in_training(motion: str, make: Maker, tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "model", "arch.output=vector")
+    write_card(folder, replace(read_card(folder), motion=[motion], intervals=fake_intervals.make()))
+    result = run(make(), fusion=Fusion("network", "bump"), network=Model(folder), bump=Bump())
+    intervals = [as_json(result)["methods"][name]["interval"] for name in ("fusion", "network")]
+    assert ["level" in one for one in intervals] == [motion != "tvl1 0"] * 2
+    for note in read_card(folder).doubt(name_motion("tvl1")):
+        assert headline(result).warnings[0] == note
+        assert render_report(result).count(note) == 1
 
 
 def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Maker) -> None:

@@ -1,6 +1,7 @@
 """Pretrained networks: complete, small, and equal to the models they were packed from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import fake_model
@@ -10,9 +11,11 @@ import torch
 from command import run
 
 import learn
+from evidence.learn.shipped import LARGEST_BYTES, pack_model
 from learn import checkpoint
 from learn.cli import app
 from learn.inference import shipped
+from synth.flow.estimator import name_motion
 from synth.system.checked_file import folder_bytes
 
 
@@ -27,7 +30,7 @@ def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def pack(models: Path, name: str, *changes: str) -> Path:
     """A tiny pretrained network."""
     source = fake_model.write_model(models.parent / f"trained-{name}", *changes)
-    shipped.pack_model(source, models / name, "c0ffee", {"error": "12% of the peak"}, ["It is for tests."])
+    pack_model(source, models / name, "c0ffee", {"error": "12% of the peak"}, ["It is for tests."])
     return models / name
 
 
@@ -57,6 +60,8 @@ def test_the_pretrained_networks_predict_the_same_as_before(name: str, force: li
 @pytest.mark.parametrize("name", shipped.NAMES)
 def test_pretrained_networks_are_small_complete_and_documented(name: str) -> None:
     folder, card = shipped.MODELS / name, learn.load_model(name).card
-    assert folder_bytes(folder) <= shipped.LARGEST_BYTES == 4_000_000
+    assert folder_bytes(folder) <= LARGEST_BYTES == 4_000_000
     assert card.settings.arch.depth == (name == "stereo")
+    for motion, doubts in ((card.motion, 1), ([], 1), ([name_motion("tvl1")], 0)):
+        assert len(replace(card, motion=motion).doubt(name_motion("tvl1"))) == doubts
     assert shipped.hash_data(card) in (folder / "README.md").read_text()

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import pytest
 from sources import imports
 
+from synth import formats
 from synth.dataset import provenance
 
 
@@ -25,6 +27,12 @@ def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> 
         before = now()
     (tmp_path / "synth/flow/tvl1.py").rename(tmp_path / "synth/flow/tvl2.py")
     assert now() != before
+
+
+def test_the_version_of_motion_follows_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "MOTION_WEIGHTS", (tmp_path / "a.pt",))
+    (tmp_path / "a.pt").write_bytes(b"one")
+    assert formats.motion_version.__wrapped__() != formats.motion_version()
 
 
 def test_packages_that_a_sequence_is_made_with_are_hashed_or_have_no_effect_on_values() -> None:

@@ -92,12 +92,3 @@ def test_invalid_results_of_an_estimator_are_reported_with_its_name(wrong: str) 
     frames = np.zeros((2, 24, 32, 3), np.uint8)
     with pytest.raises(UserError, match="Wrong"):
         track.track(Wrong(), frames, np.zeros((2, 24, 32), bool), np.ones((24, 32), bool))
-
-
-def test_estimators_are_deterministic() -> None:
-    (pair,) = pairs(Recipe(size=128), 1, 13)
-    for name in ("tvl1", "opencv-tvl1", "dis"):
-        given = pair.rest, pair.now, pair.rest_usable, pair.now_usable
-        first, *others = (estimator.create(name).flow(*given)[0] for _ in range(3))
-        for flow in others:
-            np.testing.assert_array_equal(flow, first, err_msg=name)
