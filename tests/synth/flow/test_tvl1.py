@@ -185,7 +185,7 @@ def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None
     for pair in pairs(Recipe(), 3, 23):
         pictures = pair.rest, pair.now, pair.rest_usable, pair.now_usable
         flows = [Tvl1(corrected=on).flow(*pictures)[0] for on in (False, True)]
-        off = [np.linalg.norm(flow - pair.flow, axis=-1)[pair.contact & ~pair.hidden] for flow in flows]
+        off = [np.linalg.norm(flow - pair.flow, axis=-1)[pair.inside & ~pair.hidden] for flow in flows]
         errors.append([one.mean() for one in off])
     before, after = np.mean(errors, axis=0)
     assert after < before
