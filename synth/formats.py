@@ -11,14 +11,14 @@ STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 MOTION = 2
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
-MOTION_WEIGHTS = tuple(sorted(Path(__file__).with_name("flow").rglob("*.pt")))
+MOTION_WEIGHTS = Path(__file__).with_name("flow")  # folder of the networks on which motion depends
 FIRST = 2  # written by 0.2, the first release: nothing older is read
 
 
 @cache
 def motion_version() -> str:
     """Version of recovered motion, `MOTION` and a digest of the weights below it: `2-0a1b2c3d`."""
-    weights = b"".join(file.read_bytes() for file in MOTION_WEIGHTS if file.exists())
+    weights = b"".join(file.read_bytes() for file in sorted(MOTION_WEIGHTS.rglob("*.pt")))
     return f"{MOTION}-{hashlib.blake2b(weights, digest_size=4).hexdigest()}"
 
 

@@ -215,14 +215,14 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
             here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
-        whole = torch.from_numpy(found)[None]
-        around = image.window(whole, bending_px) if bending_px > 0 else 0 * image.halved(whole)
-        found -= (mean := image.doubled(around, whole)[0].numpy())
+        whole, mean = torch.from_numpy(found)[None], None
+        if bending_px > 0:
+            found -= (mean := image.doubled(image.window(whole, bending_px), whole)[0].numpy())
         linearise(before, after, mask, here, found, numbers, state)
         primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
             found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
-        found += mean
+        found = found if mean is None else found + mean
     return torch.from_numpy(found)[None]
 
 
