@@ -5,6 +5,7 @@
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
 #   make docs    the pages in site/; open site/index.html
+#   make weights     trains the segmentation and the corrections of flow and of depth again, from nothing: some 12 CPU-hours
 #   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
 #   make clean   removes all of the above
 #
@@ -19,7 +20,7 @@ PYTEST := $(BIN)/python -m pytest -n 2
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
 UNREACHABLE := { echo "the packages could not be installed: check the connection to an index of Python packages" >&2; exit 2; }
 
-.PHONY: demo test trials quick docs evidence setup lint types slurm clean
+.PHONY: demo test trials quick docs weights evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
 setup: .venv/developed .venv/llvm
@@ -80,6 +81,9 @@ quick: setup lint types
 docs: setup
 	$(BIN)/python docs/generate.py
 	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
+
+weights: setup
+	$(BIN)/python -m evidence weights runs/weights
 
 evidence: setup
 	$(BIN)/python -m evidence all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \

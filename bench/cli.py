@@ -31,7 +31,7 @@ app = typer.Typer(
 Backend = Annotated[str, Option(help="Flow estimator, as in a job's flow.backend.")]
 Young = Annotated[float | None, Option(help="Young's modulus of the tissue [kPa], if known.")]
 Phantom = Annotated[bool, Option("--phantom", help="A phantom: forces above 50 N are allowed.")]
-Masks = Annotated[str, Option(help="auto, none, both, or a folder of NNNNNN.png or mask.png.")]
+Masks = Annotated[str, Option(help="auto, none, or a folder of NNNNNN.png or mask.png.")]
 ModelFolder = Annotated[Path | None, Option("--model", "-m", help="A model's folder, mono or stereo.")]
 Json = Annotated[bool, Option("--json", help="Print JSON to standard output.")]
 

@@ -43,7 +43,6 @@ def steps(out: Path) -> Mapping[str, Sequence[str]]:
         "dataset": ("synth", "render", "demo", "-o", data, "render.variant=cuda_ad_rgb"),
         "verify": ("synth", "verify", data),
         "training": training,
-        "full size": ("evidence", "learn.full_size", str(out / "labels"), str(out / "full")),
     }
     return {name: ("-m", *words) for name, words in found.items()}
 

@@ -198,7 +198,7 @@ def predict_command(
     rate: Annotated[float, Option(min=0.0, help="Most frames per second of a video; 0: all.")] = 10.0,
     pulse: Annotated[bool, Option(help="Subtract heartbeat and breathing from a video's motion.")] = True,
     masks: Annotated[
-        str, Option(help="Of a video: auto, none, both, or a folder of NNNNNN.png or mask.png.")
+        str, Option(help="Of a video: auto, none, or a folder of NNNNNN.png or mask.png.")
     ] = "auto",
     overlay: Annotated[bool, Option(help="Also NAME.force.mp4, the force over the video.")] = True,
     threads: Threads = None,

@@ -76,11 +76,10 @@ def _draw_tracking(frames: Sequence[FrameMotion], tissue: Mask, shrink: int) -> 
     gain, panels = arrow_gain(2 * tissue.shape[1], max(most)), []
     for k in sorted({0, strongest, *between}):
         frame, picture = frames[k], legible(frames[k].rgb)
-        hidden = frame.masked if k else frames[strongest].rest_masked
         times = picture.shape[1] // tissue.shape[1]
         outline, moving, masked = (
             legible(np.asarray(one, np.uint8)[..., None])[..., 0] > 0
-            for one in (tissue, trusted[k], np.zeros_like(tissue) if hidden is None else hidden)
+            for one in (tissue, trusted[k], frame.hidden)
         )
         picture = overlay(picture, np.full_like(picture, 255), 0.3 * outline)
         picture = overlay(picture, np.full_like(picture, _MASKED), 0.5 * masked)

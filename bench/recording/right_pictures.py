@@ -11,7 +11,7 @@ import numpy as np
 from bench.recording.stereo_timing import StereoTiming
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
-from synth.flow import image, mask_detection
+from synth.flow import image
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
 from synth.recording_flow import stereo
@@ -75,8 +75,7 @@ class RightPictures:
             change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)
             self._frozen += other < _SAME * change
         self._last = left, right, self._video.rest.tissue & ~masked
-        detected = masked if frame.proposal is None else masked | frame.proposal.tool
-        tool = detected & ~mask_detection.glare(left, 3)
+        tool = masked if frame.tool is None else frame.tool
         if tool.sum() > max(_LEAST_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 

@@ -27,7 +27,7 @@ from learn.data import clips as data
 from learn.data.clips import Clip
 from learn.data.grid import GridView
 from synth.dataset.folder import write_whole
-from synth.flow import mask_detection
+from synth.flow.segmentation import with_highlights
 from synth.flow.track import track
 from synth.job.schema import FemSection, FlowSection, Job, RenderSection
 
@@ -146,7 +146,7 @@ class Sequences:
             return replace(clip, displacement=clip.displacement | {"recovered": clip.displacement["ideal"]})
         rgb, tool, tissue = (sequence[name][:] for name in ("rgb", "tool", "tissue"))
         began = time.process_time()
-        found = track(flow, rgb, mask_detection.hidden(rgb, tool), tissue)
+        found = track(flow, rgb, with_highlights(rgb, tool), tissue)
         spent = (time.process_time() - began) / (clip.frames - 1)
         write_whole(self._folder / f"flow-{flow}-{index:06d}.cpu_s", str(spent), durable=False)
         scale = float(sequence.attrs["scale_mm_per_px"])

@@ -1,16 +1,14 @@
-"""Trains the corrections of flow and of depth on rendered ground truth and on motion in closed form.
+"""Trains the networks of the corrections of flow and of depth on rendered and on closed-form motion.
 
-Data are sequences of `mission` from the 2,000th on (no force estimator is trained on these), each as rendered
-and once more as from another camera (gain, colour, contrast, noise, blur, JPEG; if monocular also another
-size, and some corrupted frames that cannot be tracked). Flow is also trained on the warped pairs of
-`evidence.flow.scenes` and on drawn textures in motion. Examples are stored in EXAMPLES: an interrupted run
-continues. Depth is corrected after flow, hence trained by a second run with `--depth`. Writes weights and
-card next to `synth.flow.correction` or `synth.flow.stereo.depth_correction`.
+About a third each are rendered sequences, as rendered and once more as from another camera (gain, colour,
+contrast, noise, blur, JPEG; if monocular also another size, and some frames that cannot be tracked); warped
+cortex under an instrument; and drawn textures in motion, which need no correction. Examples are stored: an
+interrupted run continues. Depth is corrected after flow, hence trained after it.
 """
 
 import copy
 import time
-from functools import lru_cache
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evidence import training
 from evidence.flow import scenes as drawn_scenes
+from evidence.flow.foreign_scenes import photographs_of
 from evidence.flow.scenes import (
     Recipe,
     dilated,
@@ -32,88 +30,61 @@ from evidence.flow.scenes import (
     resampled,
     sensed,
 )
-from evidence.study import Study
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
-from synth.flow import correction, image, mask_detection
+from synth.flow import correction, image
+from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import depth_correction
 from synth.flow.stereo.depth_motion import Change
 from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
-from synth.job import reader
-from synth.sequence.simulation import simulate
 
 Pairs = tuple[tuple[int, int], ...]
 Frames = dict[str, Any]  # arrays of a sequence, by name
-_FIRST = 2000
 _RGB, _TOOLS = ("rgb", "rgb_right"), ("tool", "tool_right")
-_STORED = (*_RGB, *_TOOLS, "flow", "visible", "motion")
-_BASELINES_MM = 24, 24, 24, 14, 34
 _PRESSED = 2.5  # factor on the weight of depth at contacts
 _CORRUPTED = 0.06  # share of frames that cannot be tracked
-_FREEDOM, _PLAIN = 5.0, 4.0  # of Student's distribution; weight of the absolute error in the loss
+_FREEDOM, _PLAIN = 5.0, 2.0  # of Student's distribution; weight of the relative error in the loss
+_LEAST = 0.03  # px (or units of depth) that what an example misses is at least taken for
 _BATCH, _RATE = 8, 2e-3
 
 
-def measure(
-    examples: Path,
-    scenes: int = 480,
-    closed: int = 160,
-    drawn: int = 600,
-    minutes: float = 30.0,
-    seed: int = 0,
-    depth: bool = False,
-) -> None:
-    """Makes examples of `scenes`, `closed` warped and `drawn` pairs, and trains for some CPU-minutes."""
+def train(
+    examples: Path, sequences: Sequence[Path], drawn: int, minutes: float, seed: int, *, depth: bool
+) -> tuple[correction.CorrectionNet, dict[str, Any]]:
+    """The network of flow or depth after some CPU-minutes, and its data in numbers.
+
+    `sequences`: files of `evidence.weights`; `drawn`: number of drawn pairs; warped ones are a quarter of it.
+    """
     examples.mkdir(parents=True, exist_ok=True)
-    sources = _sources(scenes, closed, drawn, depth)
     describe, before = (depth_example, "depth_") if depth else (example, "")
+    made: dict[str, Any] = {}
+    for file in sequences:
+        for again in range(2):
+            made[f"{file.stem}_{again}"] = lambda file=file, again=again: _varied(
+                _load(file), np.random.default_rng([*file.stem.encode(), again]), again, depth
+            )
+    made |= {f"g{i:04d}": lambda i=i: (_drawn_depth if depth else _drawn)(i) for i in range(drawn)}
+    made |= {f"p{i:04d}": lambda i=i: _warped(i) for i in range(0 if depth else drawn // 4)}
     found = []
-    for name, make in sources:
+    for name, make in made.items():
         file = examples / f"{before}{name}.npz"
         if not file.exists():
             np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
             (examples / "part.npz").rename(file)
-        found.append(dict(np.load(file)))
+        found += (1 if name[0] in "rm" or depth else 3) * [dict(np.load(file))]  # a frame each: thrice
     net, steps = fit(found, depth, minutes, seed)
-    drawings = f"{drawn} drawn pairs" if depth else f"{closed} pulls, {drawn} drawn pairs"
-    card = {
-        "trained_on": f"sequences {_FIRST} to {_FIRST + scenes - 1} of mission, {drawings}",
-        "frames": sum(len(one["x"]) for one in found),
-        "cpu_minutes": minutes,
-        "steps": steps,
-    }
-    training.export(net, depth_correction.WEIGHTS if depth else correction.WEIGHTS, card)
+    counts = {"examples": len(made), "frames": sum(len(one["x"]) for one in found)}
+    return net, counts | {"cpu_minutes": minutes, "steps": steps}
 
 
-def _sources(scenes: int, closed: int, drawn: int, depth: bool) -> list[tuple[str, Any]]:
-    """Names of examples, and functions that make their frames."""
-    rendered = [
-        (f"{i:05d}_{k}", lambda i=i, k=k: _varied(_rendered(i), np.random.default_rng([i, k]), k, depth))
-        for i in range(_FIRST, _FIRST + scenes)
-        for k in range(2)
-    ]
-    if depth:
-        return rendered + [(f"g{i:04d}", lambda i=i: _drawn_depth(i)) for i in range(drawn)]
-    warped = [(f"p{i:04d}", lambda i=i: _warped(i)) for i in range(closed)]
-    return rendered + warped + 3 * [(f"g{i:04d}", lambda i=i: _drawn(i)) for i in range(drawn)]
-
-
-@lru_cache(1)
-def _rendered(index: int) -> Frames:
-    """Images, tool masks and calibration of both cameras; true `flow`, `visible`, `motion`, `pressed`."""
-    baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
-    scene = simulate(reader.load_job("mission", [f"render.stereo_mm={baseline_mm}"]), index)
-    shots = list(scene.frames())
-    frames = {name: np.stack([getattr(f, name) for f in shots]) for name in _STORED}
-    size = np.linalg.norm(np.stack([f.traction for f in shots]), axis=-1)
-    pressed = size > 0.05 * np.maximum(size.max((1, 2), keepdims=True), 1e-6)
-    left, right = scene.view, scene.renderer.right
-    assert right is not None
-    lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
-    return frames | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+def _load(file: Path) -> Frames:
+    """Images, masks, calibration and truth of a rendered sequence."""
+    with np.load(file) as arrays:
+        frames = dict(arrays)
+    return frames | {name: frames[name].astype(np.float32) for name in ("flow", "motion")}
 
 
 def _warped(index: int) -> Frames:
@@ -205,7 +176,7 @@ def _pair(rgb: list[Any], hidden: Any, flow: Any, there: Any, covered: Any, tiss
 
 
 def _texture(size: int, rng: np.random.Generator) -> Any:
-    kind, square = rng.integers(3), (size, size)
+    kind, square = rng.integers(4), (size, size)
     if kind == 0:
         periods = np.exp(rng.uniform(np.log(4), np.log(60), rng.integers(1, 4)))
         grey = sum(rng.uniform(0.2, 1) * noise_field(square, float(period), rng) for period in periods)
@@ -224,7 +195,14 @@ def _texture(size: int, rng: np.random.Generator) -> Any:
             cv2.ellipse(leaves, middle, axes, turn, 0, 360, colour, -1, cv2.LINE_AA)
         rough = rng.uniform(0, 10) * noise_field(square, float(rng.uniform(4, 20)), rng)
         return cv2.GaussianBlur(leaves, (0, 0), float(rng.uniform(0.7, 2))) + rough[..., None]
-    return 255 * drawn_scenes.cortex(size, rng)
+    if kind == 2:
+        return 255 * drawn_scenes.cortex(size, rng)
+    photographs, tint = photographs_of("tuning", 384), np.eye(3) + rng.normal(0, 0.25, (3, 3))
+    one = photographs[int(rng.integers(len(photographs)))]
+    part = int(rng.integers(192, 385))
+    top, left = rng.integers(0, 385 - part, 2)
+    wide = cv2.resize(one[top : top + part, left : left + part], square, interpolation=cv2.INTER_CUBIC)
+    return np.float32(np.clip(wide @ tint.T * rng.uniform(0.5, 1.2), 0, 255))
 
 
 def _motion(size: int, rng: np.random.Generator) -> Any:
@@ -246,7 +224,7 @@ def _motion(size: int, rng: np.random.Generator) -> Any:
 def example(frames: Frames) -> Frames:
     """Features, error of the flow and weights of the frames: x, y, w, each (T - 1, C, h, w)."""
     rgb, tissue = frames["rgb"], frames["tissue"]
-    hidden = frames["hidden"] if "hidden" in frames else mask_detection.hidden(rgb, frames["tool"])
+    hidden = frames["hidden"] if "hidden" in frames else with_highlights(rgb, frames["tool"])
     tracker = Tracker(Tvl1(corrected=False), rgb[0], hidden[0], tissue)
     rows = []
     rest = _normalised(rgb[0], tracker.usable)[0, 0].numpy()
@@ -288,9 +266,7 @@ class _Observed(StereoTracker):
 def depth_example(frames: Frames) -> Frames:
     """As `example`, for the depth solver: y in units of `depth_correction`."""
     tissue = frames["tissue"]
-    hidden = [
-        mask_detection.hidden(frames[rgb], frames[tool]) for rgb, tool in zip(_RGB, _TOOLS, strict=True)
-    ]
+    hidden = [with_highlights(frames[rgb], frames[tool]) for rgb, tool in zip(_RGB, _TOOLS, strict=True)]
     found = track(Tvl1(), frames["rgb"], hidden[0], tissue)
     cameras = Intrinsics(frames["K"], frames["dist"]), Intrinsics(frames["Kr"], frames["distr"])
     pair = StereoRig(*cameras, np.eye(3), np.array([-float(frames["baseline"]), 0, 0]), tissue.shape[::-1])
@@ -432,11 +408,15 @@ def _turned(x: Tensor, y: Tensor, w: Tensor, turn: int, vectors: Pairs) -> tuple
 
 
 def _loss(found: Tensor, missing: Tensor, weight: Tensor) -> Tensor:
+    """Mean over the examples, whose errors count in proportion to what each misses.
+
+    Errors in px would be lowered most where much is missing, and motion that is recovered well made worse.
+    """
     added, log_variance = found.chunk(2, 1)
     error, log_variance = missing - added, log_variance.clamp(-8, 5)
     surprise = torch.log1p(error**2 / (_FREEDOM * torch.exp(log_variance)))
     likely = 0.5 * log_variance + 0.5 * (_FREEDOM + 1) * surprise
-    return (weight * (likely + _PLAIN * torch.sqrt(error**2 + 1e-4))).sum() / weight.sum()
-
-
-STUDY = Study(measure, steps=())
+    total = weight.sum((1, 2, 3), keepdim=True) * missing.shape[1] + 1e-6
+    typical = (weight * missing.abs()).sum((1, 2, 3), keepdim=True) / total + _LEAST
+    loss = weight * (likely + _PLAIN * torch.sqrt(error**2 + (0.1 * typical) ** 2) / typical)
+    return (loss.sum((1, 2, 3), keepdim=True) / total).mean()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -108,6 +109,12 @@ def _surface(name: str, size: int, rng: np.random.Generator) -> Map:
     picture = _drawn(name[6:], fine, rng) if name.startswith("drawn ") else _photograph(name, fine)
     picture = cv2.GaussianBlur(picture, (0, 0), 0.55 * _FINE)
     return np.stack([spline_filter(picture[..., c], 3, np.float32, "mirror") for c in range(3)])
+
+
+@cache
+def photographs_of(half: str, side: int) -> list[Map]:
+    """Photographs (side, side, 3) float32 of 0..255 of a half."""
+    return [255 * _photograph(name, side) for name in _PHOTOGRAPHS[HALVES.index(half) :: 2]]
 
 
 def _photograph(name: str, fine: int) -> Map:

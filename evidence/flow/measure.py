@@ -8,8 +8,8 @@ import numpy as np
 
 from evidence.flow.scenes import Pair
 from synth.arrays import Array, Map
-from synth.flow import mask_detection
 from synth.flow.estimator import Estimator
+from synth.flow.segmentation import segment
 
 Errors = dict[str, float]
 _SIGMA = 1.0  # px: divergence is compared after this Gaussian, on both sides
@@ -62,7 +62,7 @@ def mean_errors(
     for pair in pairs:
         rest, now = pair.rest_usable, pair.now_usable
         if detected:
-            rest, now = (~mask_detection.blocked(picture) for picture in (pair.rest, pair.now))
+            rest, now = (~segment(pair.rest, picture).hidden for picture in (pair.rest, pair.now))
         initial = None if warm is None else warm * pair.flow
         begin = time.process_time()
         flow, _ = estimator.flow(pair.rest, pair.now, rest, now, initial)

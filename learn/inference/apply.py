@@ -53,7 +53,7 @@ def predict(
         young_kpa: of the tissue; None: the data's, else forces are those of tissue of 1 kPa.
         membrane: state of the membrane (pia), for a model with that input.
         tissue: mask (H, W) of the rest frame, or a picture of it; None: found by motion.
-        masks: auto, none or both; or instrument masks: (T, H, W), (H, W) or a folder.
+        masks: auto or none; or instrument masks: (T, H, W), (H, W) or a folder.
         pulse: whether heartbeat and breathing are subtracted from a video's motion.
         flow: estimator of a video's flow.
         shrink: factor by which a video is downsampled before flow; 0: to 320 columns.

@@ -12,7 +12,7 @@ from PIL import Image, JpegImagePlugin
 
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
-from synth.flow import mask_detection
+from synth.flow.segmentation import segment
 from synth.job.schema import RenderSection, SensorSection
 from synth.render.camera import video_link
 from synth.system import checked_file
@@ -23,6 +23,12 @@ _BITRATES = (0.25, 0.5, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.
 _SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 _BANDS_PX = ((0.7, 1.4), (2.8, 5.6))
 _BLOCK, _SMOOTHEST = 16, 0.2  # px; noise is measured where such blocks are smoothest
+_GROWN_PX = 2, 4  # around highlights, for colour and for sharpness
+_OUTLINE_PX = 240  # longer side of the downsampled picture in which the cortex is segmented
+_MIDDLE = 0.6  # squared radius of the initial ellipse of cortex, in half sides of the picture
+_BLACK, _BLOODY = 60, 0.42  # grey levels; ratio of green to red (sRGB)
+_VESSEL_MM = 3.0  # widest vessel: larger red areas are pooled blood
+_INSET_PX = 5  # px of the downsampled picture, kernel by which the outline is eroded
 _LAPLACIAN = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 
 
@@ -91,7 +97,7 @@ def read_photograph(path: Path, width_mm: float, mask: Path | None) -> Photograp
     own, usual = width_mm / rgb.shape[1], RenderSection()
     finer = max(1.0, sum(usual.field_mm) / 2 / usual.size[0] / own)
     painted = None if mask is None else np.asarray(checked_file.read_picture(mask, 0)) > 127
-    usable = mask_detection.cortex(rgb, own) if painted is None else painted
+    usable = find_cortex(rgb, own) if painted is None else painted
     if usable.shape != rgb.shape[:2]:
         raise UserError(f"{mask}: has another size than the photograph")
     both = np.dstack([rgb, 255 * usable.astype(np.uint8)])
@@ -114,7 +120,8 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     1996). `sharpness`: contrast of the finest octave relative to two octaves coarser, without noise. `rgb`:
     (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the photograph's.
     """
-    tissue, clear = (usable & ~mask_detection.glare(rgb, grown) for grown in (2, 4))
+    wet = (segment(rgb, rgb).highlight > 0.5).astype(np.uint8)
+    tissue, clear = (usable & (cv2.dilate(wet, np.ones((2 * by + 1,) * 2)) == 0) for by in _GROWN_PX)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     block = cv2.blur(np.abs(cv2.filter2D(grey, -1, _LAPLACIAN)), (_BLOCK, _BLOCK))
     full = cv2.erode(tissue.astype(np.uint8), np.ones((_BLOCK, _BLOCK))) > 0
@@ -132,3 +139,28 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     slopes, *_ = np.linalg.lstsq(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
     sharpness = float(np.sqrt(energy[0] / energy[1]))
     return {"noise": float(noise), "sharpness": sharpness, "vignette": -float(slopes[0])}
+
+
+def find_cortex(rgb: Pixels, mm_per_px: float) -> Mask:
+    """Mask (H, W) of the exposed cortex in a picture (H, W, 3) sRGB.
+
+    Pixels that resemble the middle of the picture more than its edge (C. Rother et al., "GrabCut", 2004),
+    without those that are black, blue, covered by blood or part of an instrument.
+    """
+    scale = min(1.0, _OUTLINE_PX / max(rgb.shape))
+    small = cv2.medianBlur(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), 5)
+    red, green, blue = np.moveaxis(small.astype(np.float32), 2, 0)
+    wide = (max(3, round(_VESSEL_MM / mm_per_px * scale)),) * 2
+    bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), wide) > 0.9
+    steel = cv2.resize(segment(rgb, rgb).instrument, small.shape[1::-1]) > 0.5
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in small.shape[:2]), indexing="ij")
+    label = np.where(x**2 + y**2 < _MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    label[(small.max(axis=2) < _BLACK) | (blue > 1.1 * red) | bloody | steel] = cv2.GC_BGD
+    if not (label == cv2.GC_PR_FGD).any():
+        return np.zeros(rgb.shape[:2], bool)
+    cv2.setRNGSeed(1)  # for the initial colour clusters
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), label, None, *models, 6, cv2.GC_INIT_WITH_MASK)
+    inside = (label == cv2.GC_PR_FGD).astype(np.uint8)
+    found = cv2.erode(inside, np.ones((_INSET_PX, _INSET_PX)), borderValue=1)
+    return np.asarray(cv2.resize(found, rgb.shape[1::-1]) > 0)

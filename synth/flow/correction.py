@@ -85,7 +85,7 @@ class CorrectionNet(nn.Module):
 
 
 @cache
-def load(path: Path = WEIGHTS, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
+def load(path: Path, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
     """A network with its weights."""
     net = CorrectionNet(channels, parts)
     state = checked_file.read_tensors(path)

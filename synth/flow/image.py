@@ -54,8 +54,8 @@ def tensor(picture: Pixels) -> Tensor:
     return grey.reshape(-1, 1, *grey.shape[-2:])
 
 
-def flags(mask: Mask) -> Tensor:
-    """(H, W) or (B, H, W) bool as (B, 1, H, W)."""
+def flags(mask: Mask | Map) -> Tensor:
+    """(H, W) or (B, H, W) as (B, 1, H, W) float32."""
     wide = torch.from_numpy(np.ascontiguousarray(mask)).float()
     return wide.reshape(-1, 1, *wide.shape[-2:])
 
@@ -100,11 +100,11 @@ def normalise(grey: Tensor, usable: Tensor) -> Tensor:
     """
     # Centring at 128 avoids cancellation in the difference of squares.
     centred = (grey - 128.0) * usable
-    sums = window(torch.cat([usable, centred, centred * centred], dim=1), _WINDOW)
+    sums = window(torch.cat([usable, centred, (grey - 128.0) * centred], dim=1), _WINDOW)
     mean = sums[:, 1:] / sums[:, :1].clamp_min(1e-4)
     deviation = (mean[:, 1:] - mean[:, :1] ** 2).clamp_min(0).sqrt() + _FLOOR
     smooth = doubled(torch.cat([mean[:, :1] + 128.0, 1 / deviation], 1), grey)
-    return usable * (grey - smooth[:, :1]) * smooth[:, 1:]
+    return (usable > 0) * (grey - smooth[:, :1]) * smooth[:, 1:]
 
 
 def fill(field: Tensor, usable: Tensor) -> Tensor:
@@ -124,8 +124,8 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
 
 
 def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and 1 where all pixels
-    read are usable and inside, else 0."""
+    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and how usable the
+    pixels read are, 0 where one of them is not or is outside."""
     out = np.empty((2, 1, 1, *now.shape[-2:]), np.float32)
     one, known, by = (field.contiguous().numpy() for field in (now[0, 0], usable[0, 0], flow[0]))
     kernels.warp_into(one, known, by, out[0, 0, 0], out[1, 0, 0])

@@ -43,9 +43,10 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> No
                 line += weights[0, 2, x] * picture[row, i + 1] + weights[0, 3, x] * picture[row, i + 2]
                 total += weights[1, k, x] * line
             warped[y, x] = total
-            some = (_ONE - fy) * ((_ONE - fx) * known[j, i] + fx * known[j, i + 1])
-            some += fy * ((_ONE - fx) * known[j + 1, i] + fx * known[j + 1, i + 1])
-            visible[y, x] = _ONE if some > _VISIBLE else _ZERO
+            first, second = known[j, i] + fx * (known[j, i + 1] - known[j, i]), known[j + 1, i]
+            some = first + fy * (second + fx * (known[j + 1, i + 1] - second) - first)
+            most = max(max(known[j, i], known[j, i + 1]), max(known[j + 1, i], known[j + 1, i + 1]))
+            visible[y, x] = min(some + (_ONE - _VISIBLE), most) if some > _VISIBLE * most else _ZERO
 
 
 @vectorised

@@ -9,9 +9,9 @@ import numpy as np
 from synth.arguments import checked
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
-from synth.flow import mask_detection
 from synth.flow.confidence import LOW_CONFIDENCE
 from synth.flow.estimator import Estimator, create
+from synth.flow.segmentation import with_highlights
 
 
 class Tracking:
@@ -66,7 +66,6 @@ class Tracker:
         self.resets = 0  # frames whose flow from zero was the better one
         self.last: Solution | None = None  # of the last frame
         self.initial: Map | None = None  # (H, W, 2) px from which the next frame starts; None: zero
-        self.unsure: Mask = np.zeros_like(tissue)  # (H, W) left out of the mean confidence
         self._level = 1.0  # mean confidence of the last trusted frame
         self._around, self._tries = ~tissue & ~rest_blocked, 0
         self.widened = False  # whether the surroundings are tracked together with the tissue
@@ -105,16 +104,13 @@ class Tracker:
         flow, confidence = self.estimator.flow(self.rest, frame, domain, ~blocked, initial)
         confidence = confidence * self.tissue
         visible = self.usable & ~blocked
-        where, tissue = visible & ~self.unsure, int(np.count_nonzero(self.tissue))
-        if np.count_nonzero(where) < Tracking.free * tissue:
-            where = visible
-        inside = confidence[where] if where.any() else np.zeros(1, np.float32)
+        inside = confidence[visible] if visible.any() else np.zeros(1, np.float32)
         return Solution(
             flow,
             confidence,
             level=float(inside.mean(dtype=np.float64)),
             is_matched=float(np.mean(inside >= LOW_CONFIDENCE)) >= Tracking.matched,
-            is_visible=int(np.count_nonzero(visible)) / max(1, tissue) >= Tracking.free,
+            is_visible=float(visible.sum() / max(1, self.tissue.sum())) >= Tracking.free,
         )
 
     def needs_retry(self, found: Solution) -> bool:
@@ -149,7 +145,7 @@ def recover_flow(frames: Pixels, tool: Mask, tissue: Mask, backend: str | Estima
     for what, given, shape in (("tool", tool, frames.shape[:3]), ("tissue", tissue, frames.shape[1:3])):
         if np.shape(given) != shape or np.asarray(given).dtype != bool:
             raise UserError(f"{what}: expected an array {shape} of bool, got {np.shape(given)}")
-    return track(backend, frames, mask_detection.hidden(frames, tool), tissue)
+    return track(backend, frames, with_highlights(frames, tool), tissue)
 
 
 def track(backend: str | Estimator, frames: Pixels, blocked: Mask, tissue: Mask) -> Track:

@@ -79,7 +79,7 @@ class Tvl1:
         """`corrected`: a network corrects the flow and gives its confidence, which otherwise is the local
         correlation of the rest and the warped frame; see `synth.flow.correction`."""
         self.settings = settings
-        self.correction = correction.load() if corrected else None
+        self.correction = correction.load(correction.WEIGHTS) if corrected else None
         # The last rest frame, its mask and its pyramid, which are the same for all frames of a video.
         self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
 
@@ -141,7 +141,7 @@ def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor,
     """Normalised picture and mask of each level, fine to coarse; pixel x is (x - 1/2)/2 on the next level."""
     levels = []
     while True:
-        levels.append((image.normalise(grey, usable), (usable > 0.5).to(grey.dtype)))
+        levels.append((image.normalise(grey, usable), usable * (usable > 0.1)))
         if min(grey.shape[-2:]) < 2 * s.coarsest_px:
             return levels
         pooled = image.halved(torch.cat([grey * usable, usable], 1))

@@ -66,9 +66,8 @@ class TissueSearch:
 
     def add(self, frame: FrameMotion) -> None:
         """Adds a frame."""
-        if frame.is_rest and frame.proposal is not None:
-            found = frame.proposal.within(self._rest.tissue)
-            self._tool = found.tool | found.known
+        if frame.is_rest:
+            self._tool = frame.hidden
         elif frame.trusted:
             known = frame.confidence > Limits.sure
             self._square += known * np.square(frame.flow).sum(axis=-1)

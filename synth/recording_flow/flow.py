@@ -1,4 +1,4 @@
-"""A stage of a video: flow from the rest frame, with the masks that it selects, here or in another process.
+"""A stage of a video: flow from the rest frame, here or in another process.
 
 The other process works on the next frame while forces of the current one are computed. Threads are no
 alternative: flow makes thousands of short calls per frame and would wait for the interpreter after each (two
@@ -21,7 +21,7 @@ from multiprocessing import get_context, parent_process
 from synth.arrays import Mask, Pixels
 from synth.flow.confidence import add_deviation
 from synth.flow.estimator import Estimator
-from synth.flow.mask_selection import Proposal, SelectingTracker
+from synth.flow.track import Tracker
 from synth.recording_flow.frame_motion import FrameMotion
 
 
@@ -30,23 +30,22 @@ class LocalFlow:
 
     ahead = 0  # number of frames that may be submitted before the first result is awaited
 
-    def begin(self, backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
-        """Starts with the rest frame; arguments and errors as for `SelectingTracker`."""
-        self._tracker = SelectingTracker(backend, rest, proposal, tissue)
+    def begin(self, backend: str | Estimator, rest: Pixels, masked: Mask, tissue: Mask) -> None:
+        """Starts with the rest frame; arguments and errors as for `Tracker`."""
+        self._tracker = Tracker(backend, rest, masked, tissue)
 
-    def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
-        """Computes the motion of a frame (h, w, 3); errors as for `SelectingTracker.step`."""
+    def submit(self, rgb: Pixels, masked: Mask) -> Future[FrameMotion]:
+        """Computes the motion of a frame (h, w, 3); arguments and errors as for `Tracker.step`."""
         cpu, wall, tracker = time.process_time(), time.perf_counter(), self._tracker
-        flow, confidence = tracker.step(rgb, proposal)
+        resets = tracker.resets
+        flow, confidence = tracker.step(rgb, masked)
         done: Future[FrameMotion] = Future()
         done.set_result(
             FrameMotion(
                 flow,
                 confidence,
                 tracker.trusted,
-                tracker.reinitialised,
-                masked=tracker.blocked if tracker.blocked.any() else None,
-                rest_masked=tracker.rest_blocked if tracker.rest_blocked.any() else None,
+                tracker.trusted and tracker.resets > resets,
                 cpu_s=time.process_time() - cpu,
                 wall_s=time.perf_counter() - wall,
             )
@@ -70,13 +69,13 @@ class FlowProcess(LocalFlow):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def begin(self, backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
+    def begin(self, backend: str | Estimator, rest: Pixels, masked: Mask, tissue: Mask) -> None:
         """See `LocalFlow`."""
-        self._pool.submit(_begin, backend, rest, proposal, tissue).result()
+        self._pool.submit(_begin, backend, rest, masked, tissue).result()
 
-    def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
+    def submit(self, rgb: Pixels, masked: Mask) -> Future[FrameMotion]:
         """See `LocalFlow`."""
-        return self._pool.submit(_step, rgb, proposal)
+        return self._pool.submit(_step, rgb, masked)
 
     def close(self) -> None:
         """Ends the process after its current frame."""
@@ -109,12 +108,12 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _begin(backend: str | Estimator, rest: Pixels, proposal: Proposal, tissue: Mask) -> None:
-    _flow.begin(backend, rest, proposal, tissue)
+def _begin(backend: str | Estimator, rest: Pixels, masked: Mask, tissue: Mask) -> None:
+    _flow.begin(backend, rest, masked, tissue)
 
 
-def _step(rgb: Pixels, proposal: Proposal) -> FrameMotion:
-    frame = _flow.submit(rgb, proposal).result()
+def _step(rgb: Pixels, masked: Mask) -> FrameMotion:
+    frame = _flow.submit(rgb, masked).result()
     return replace(frame, peak_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 
 
@@ -124,13 +123,12 @@ def with_flow(frame: FrameMotion, found: FrameMotion) -> FrameMotion:
     if frame.camera is not None:
         confidence = add_deviation(confidence, frame.camera.deviation_px)
     return replace(
-        found,
+        frame,
+        flow=found.flow,
         confidence=confidence,
         trusted=found.trusted and frame.trusted,
-        index=frame.index,
-        time_s=frame.time_s,
-        rgb=frame.rgb,
-        camera=frame.camera,
-        proposal=frame.proposal,
-        masking_s=frame.masking_s,
+        reinitialised=found.reinitialised,
+        cpu_s=found.cpu_s,
+        wall_s=found.wall_s,
+        peak_bytes=found.peak_bytes,
     )

@@ -42,21 +42,20 @@ class ForegroundSearch:
         self._is_stated, self._has_masks = is_stated, has_masks
         self._surface: tuple[Map, float] | None = None
         self._found: dict[str, list[tuple[float, str, Mask]]] = {}
-        self._masked = ~tissue  # in any frame: masks are often selected only once something moves
+        self._masked = ~tissue  # in any frame
         self._width_px = 0.0  # of the widest tool at rest
+        self._hidden = np.zeros_like(tissue)  # in the rest frame
         # Where the tissue is not stated, what is in front of it from the start may be its surroundings.
         self._surroundings = np.zeros_like(tissue)
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
         """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
-        masked = ~self._tissue
-        for known in (frame.masked, frame.rest_masked, frame.confidence == 0 if frame.is_rest else None):
-            masked = masked if known is None else masked | known
-        # A tool whose mask is not used, because it does no harm, is no foreign object either.
-        tool = np.zeros_like(masked) if frame.proposal is None else frame.proposal.tool
-        masked = masked | tool
+        if frame.is_rest:
+            self._hidden = frame.hidden
+        masked = ~self._tissue | frame.hidden | self._hidden
         self._masked |= masked
-        self._find_wide(tool, frame)
+        if not self._has_masks:
+            self._find_wide(np.zeros_like(masked) if frame.tool is None else frame.tool, frame)
         free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from synth.arrays import Map, Mask, Pixels
-from synth.flow.mask_selection import Proposal
 from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import Similarity
 from synth.recording_flow.finding import Finding
@@ -32,17 +31,17 @@ class RestFrame:
 class FrameMotion:
     """One frame and the motion of the tissue to it from the rest frame, on the pixels of the rest frame.
 
-    Each stage of a `VideoPass` fills in its part: picture, camera motion, mask proposals, flow and motion in
-    three dimensions; the last one subtracts pulsation.
+    Each stage of a `VideoPass` fills in its part: picture, camera motion, masks, flow and motion in three
+    dimensions; the last one subtracts pulsation.
     """
 
     flow: Map  # (h, w, 2) px
     confidence: Map  # (h, w) in 0..1
     trusted: bool = True  # whether the frame could be tracked
-    reinitialised: bool = False  # tracked only after a start from zero or with other masks
+    reinitialised: bool = False  # tracked only after a start from zero
     is_rest: bool = False  # whether this is the rest frame
-    masked: Mask | None = None  # (h, w) mask of the picture; None: empty
-    rest_masked: Mask | None = None  # (h, w) mask of the rest frame used for it; None: empty
+    masked: Mask | None = None  # (h, w) where the picture shows no tissue; None: nowhere
+    tool: Mask | None = None  # (h, w) the instruments among it; None: none
     camera: Similarity | None = None  # camera motion, which is removed from the flow; None: none
     motion: Moved | None = None  # in three dimensions; None: monocular
     index: int = 0  # number in the video
@@ -50,7 +49,6 @@ class FrameMotion:
     # (h, w, 3) the downsampled picture without camera motion.
     rgb: Pixels = field(default_factory=lambda: np.zeros((0, 0, 3), np.uint8))
     right: Pixels | None = None  # (h, w, 3) the right camera's picture, likewise; None: no such camera
-    proposal: Proposal | None = None  # masks proposed for the picture; None: not yet
     cpu_s: float = 0.0  # of the flow
     wall_s: float = 0.0  # of the flow
     masking_s: float = 0.0  # wall time of downsampling, masking and the estimate of camera motion
@@ -71,7 +69,7 @@ class TrackingSummary:
     reinitialised: int = 0
     masked: float = 0.0  # sum over frames of the masked share of the tissue
     masked_count: Map | None = None  # (h, w) number of frames in which a pixel is masked
-    rest_masked: Mask | None = None  # (h, w) last mask of the rest frame
+    rest_masked: Mask | None = None  # (h, w) mask of the rest frame; None: empty
 
     def add(self, frame: FrameMotion, tissue: Mask) -> None:
         """Adds a frame other than the rest frame."""
@@ -80,7 +78,6 @@ class TrackingSummary:
         self.frames += 1
         self.lost += not frame.trusted
         self.reinitialised += frame.reinitialised
-        self.rest_masked = frame.rest_masked
         if frame.masked is not None:
             self.masked += np.count_nonzero(frame.masked & tissue) / np.count_nonzero(tissue)
             self.masked_count += frame.masked

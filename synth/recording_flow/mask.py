@@ -1,4 +1,4 @@
-"""A stage of a video: mask proposals for instruments and highlights of each frame."""
+"""A stage of a video: masks of instruments, highlights and other foreground, detected or given."""
 
 from __future__ import annotations
 
@@ -8,44 +8,41 @@ from dataclasses import replace
 import numpy as np
 
 from synth.arrays import Mask, Pixels
-from synth.flow import mask_detection
-from synth.flow.mask_selection import Proposal
+from synth.flow.segmentation import segment
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.picture_faults import find_fault
 from synth.video.read import shrink_mask
 
+_MOST = 0.4  # share of the tissue: more of it is taken for tissue that looks like instruments
 
-class ProposeMasks:
-    """Proposes masks, from pictures or from given masks; flow selects among them."""
+
+class MaskFrame:
+    """Masks what hides the tissue."""
 
     def __init__(self, rest: RestFrame, kind: str, tool: Callable[[int, Size], Mask | None] | None) -> None:
         """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected."""
         self._rest, self._kind, self._tool = rest, kind, tool
 
     def process(self, frame: FrameMotion) -> FrameMotion:
-        """The frame with proposals; it is not trusted if its picture shows nothing that could be tracked."""
+        """The frame with its masks; it is not trusted if its picture shows nothing that could be tracked."""
         trusted = frame.trusted and not find_fault(frame.rgb, self._rest.tissue)
-        return replace(frame, proposal=self._propose(frame), trusted=trusted)
-
-    def _propose(self, frame: FrameMotion) -> Proposal:
-        glare = tool = known = nothing = np.zeros(frame.rgb.shape[:2], bool)
+        masked = tool = np.zeros(frame.rgb.shape[:2], bool)
         if self._kind != "none":
-            glare = mask_detection.glare(frame.rgb)
+            found = segment(self._rest.rgb, frame.rgb)
             if self._tool is None:
-                tool = mask_detection.tool(frame.rgb)
-            elif (given := self._tool(frame.index, self._rest.size)) is not None:
-                known = shrink_mask(given, self._rest.shrink, 0)
+                if (found.hidden & self._rest.tissue).sum() <= _MOST * self._rest.tissue.sum():
+                    masked, tool = found.hidden, found.instrument > 0.5
+            else:
+                given = self._tool(frame.index, self._rest.size)
+                tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
+                if frame.camera is not None:
+                    tool = frame.camera.undo(tool.astype(np.uint8) * 255) > 127
+                masked = tool | found.shines
         if frame.camera is not None:
-            if known.any():
-                known = frame.camera.undo(known.astype(np.uint8) * 255) > 127
-            known = known | frame.camera.outside(known.shape)
-        if self._kind == "auto":
-            return Proposal(glare, tool, known)
-        return Proposal(nothing, nothing, glare | tool | known)
+            masked = masked | frame.camera.outside(masked.shape)
+        return replace(frame, masked=masked, tool=tool, trusted=trusted)
 
 
-def mask_right(rgb: Pixels, kind: str, left: Mask) -> Mask:
-    """Mask (H, W) of tool and highlights in the right picture; `auto`: none if the left picture has none."""
-    if kind == "none" or (kind == "auto" and not left.any()):
-        return np.zeros(rgb.shape[:2], bool)
-    return mask_detection.blocked(rgb)
+def mask_right(rest: Pixels, rgb: Pixels, kind: str) -> Mask:
+    """Mask (H, W) of what hides the tissue in a picture of the right camera, given its rest picture."""
+    return np.zeros(rgb.shape[:2], bool) if kind == "none" else segment(rest, rgb).hidden

@@ -33,7 +33,7 @@ from synth.recording_flow.flow import LocalFlow, with_flow
 from synth.recording_flow.foreground import ForegroundSearch
 from synth.recording_flow.frame_motion import FrameMotion, Size, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
-from synth.recording_flow.mask import ProposeMasks
+from synth.recording_flow.mask import MaskFrame
 from synth.recording_flow.pulse import PulseEstimate, PulseSearch
 from synth.recording_flow.register_camera import RegisterCamera, RegisterOnTissue
 from synth.recording_flow.stereo import DepthCamera, RightCamera, RightVideo
@@ -136,8 +136,9 @@ class VideoPass:
         self.peak_bytes = 0  # memory of the flow process
         self.found: PulseSearch | None = None  # by `search`
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
-        self._mask = ProposeMasks(rest, settings.masks, footage.tool)
+        self._mask = MaskFrame(rest, settings.masks, footage.tool)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
+        self.summary.rest_masked = self._first.hidden if self._first.hidden.any() else None
         path, pulse = (None, None) if known is None else (known.camera, known.pulse)
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
         self.stereo: RightCamera | DepthCamera | None = None
@@ -190,8 +191,7 @@ class VideoPass:
                 yield self._finish(self.decoder.process(picture))
                 continue
             frame = self._prepare(picture, self._register)
-            assert frame.proposal is not None
-            waiting.append((frame, self._flow.submit(frame.rgb, frame.proposal)))
+            waiting.append((frame, self._flow.submit(frame.rgb, frame.hidden)))
             if len(waiting) > self._flow.ahead:
                 yield self._finish(self._with_flow(*waiting.popleft()))
         for one in waiting:
@@ -199,14 +199,13 @@ class VideoPass:
 
     def _begin(self) -> FrameMotion:
         """Starts the flow; returns the rest frame, with confidence where it shows tissue."""
-        first, proposal = self._first, self._first.proposal
-        assert proposal is not None
+        first = self._first
         if self.rest.fault:
             return first
-        self._flow.begin(self._backend, first.rgb, proposal, self.rest.tissue)
+        self._flow.begin(self._backend, first.rgb, first.hidden, self.rest.tissue)
         if self._pace is not None:  # so that compilation does not add to the stream's latency
-            self._flow.submit(first.rgb, proposal).result()
-        return replace(first, confidence=(self.rest.tissue & ~proposal.known).astype(np.float32))
+            self._flow.submit(first.rgb, first.hidden).result()
+        return replace(first, confidence=(self.rest.tissue & ~first.hidden).astype(np.float32))
 
     def _prepare(self, picture: Picture, register: RegisterCamera) -> FrameMotion:
         """A frame after the stages before flow."""

@@ -19,11 +19,9 @@ class RegisterCamera:
     """
 
     def __init__(self, rest: RestFrame, first: FrameMotion, path: CameraPath | None) -> None:
-        """`first`: the rest frame with its mask proposals; `path`: from a first pass."""
+        """`first`: the rest frame with its masks; `path`: from a first pass."""
         self._rest, self._path = rest, path
-        assert first.proposal is not None
-        blocked = first.proposal.either | first.proposal.known
-        self._tracker = CameraTracker(rest.rgb, rest.tissue, blocked)
+        self._tracker = CameraTracker(rest.rgb, rest.tissue, first.hidden)
         self.is_blind = self._tracker.is_blind
         self._course: Course = []  # along the path
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
-from synth.flow import image, mask_detection
+from synth.flow import image
 from synth.flow.stereo.depth_camera import DepthTracker
 from synth.flow.stereo.rest import match
 from synth.flow.stereo.rig import Intrinsics, StereoRig
@@ -81,15 +81,16 @@ class RightCamera:
         masked = frame.hidden
         if self.stereo is None or self._camera is None:
             self._pair = frame.rgb, right
-            hidden = mask_right(right, self._kind, masked)
+            self._first = right
+            hidden = mask_right(right, right, self._kind)
             self.stereo = self._begin(frame.rgb, right, masked, hidden)
-            self._camera = CameraTracker(right, self.stereo.right_tissue(), mask_detection.blocked(right))
+            self._camera = CameraTracker(right, self.stereo.right_tissue(), hidden)
             return replace(frame, right=right, motion=Moved.nothing(tissue.shape))
         # Aligning both cameras' surroundings to rest removes motion of the rig relative to the tissue.
         view = self._camera.find(right, frame.time_s) or frame.camera
         right = right if view is None else view.undo(right)
         self._pair = frame.rgb, right
-        hidden = mask_right(right, self._kind, masked)
+        hidden = mask_right(self._first, right, self._kind)
         if view is not None:
             hidden |= view.outside(tissue.shape)
         moved = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)

@@ -21,6 +21,8 @@ from synth.system.jit import compiled
 _RAYS = 32  # per lamp
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 _HIDDEN_MM = 1e-3  # a surface that is nearer to the lamp than a point by more than this shades it
+_CELL = 3.0  # side of the cells of points, in mean distances between points
+_HAIR_MM = 1e-6  # tolerance of the bounds
 _NEAR_MM = 1.0  # from a lamp's plane: triangles that are nearer, or behind it, are left out
 
 
@@ -88,7 +90,8 @@ def _add_light(
 def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) -> Array:
     """Bits (N,) of the rays from points on a window (S, 2) to points (N, 3) that faces stop, lamp axes.
 
-    Points are sorted into cells of a plane across the lamp's axis, onto which each window's point projects.
+    All is projected from the window's middle onto a plane across the lamp's axis, where points are sorted
+    into cells. There a ray to a point at depth z is, at depth d, within radius (1/d - 1/z) of the point.
     """
     count, start_x, start_y = len(points), start[:, 0].copy(), start[:, 1].copy()
     every = (np.uint64(1) << np.uint64(len(start))) - np.uint64(1)
@@ -97,33 +100,45 @@ def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) ->
     if not ahead.any():
         return bits
     plane = points[ahead, 2].mean()
-    radius = np.sqrt((start * start).sum(axis=1).max())
+    radius = plane * np.sqrt((start * start).sum(axis=1).max()) * 1.0001
     x, y = points[:, 0] * plane / points[:, 2], points[:, 1] * plane / points[:, 2]
-    pad = radius * np.abs(1 - plane / points[ahead, 2]).max() * 1.0001 + 1e-9
     left, top = x[ahead].min(), y[ahead].min()
     wide, high = x[ahead].max() - left, y[ahead].max() - top
-    cell = max(np.sqrt(wide * high / count), max(wide, high) / 2000, 1e-9)
+    cell = max(_CELL * np.sqrt(wide * high / count), max(wide, high) / 2000, 1e-9)
     columns, rows = int(wide / cell) + 1, int(high / cell) + 1
     number = np.full(count, -1)
+    deepest = np.full(columns * rows, _NEAR_MM)
     for i in range(count):
         if ahead[i]:
             number[i] = int((y[i] - top) / cell) * columns + int((x[i] - left) / cell)
+            deepest[number[i]] = max(deepest[number[i]], points[i, 2])
     order, first = _sorted(number, columns * rows)
+    last = deepest.max()
     for f in range(len(faces)):
         a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-        if not min(a[2], b[2], c[2]) > _NEAR_MM:
+        nearest = min(a[2], b[2], c[2])
+        if not _NEAR_MM < nearest < last:
             continue
+        wider = radius * (1 / nearest - 1 / last) + _HAIR_MM
         sa, sb, sc = plane / a[2], plane / b[2], plane / c[2]
-        wider = pad + radius * max(abs(1 - sa), abs(1 - sb), abs(1 - sc))
-        x0, x1 = min(a[0] * sa, b[0] * sb, c[0] * sc) - wider, max(a[0] * sa, b[0] * sb, c[0] * sc) + wider
-        y0, y1 = min(a[1] * sa, b[1] * sb, c[1] * sc) - wider, max(a[1] * sa, b[1] * sb, c[1] * sc) + wider
-        if x1 < left or y1 < top or x0 > left + wide or y0 > top + high:
+        x0, x1 = min(a[0] * sa, b[0] * sb, c[0] * sc), max(a[0] * sa, b[0] * sb, c[0] * sc)
+        y0, y1 = min(a[1] * sa, b[1] * sb, c[1] * sc), max(a[1] * sa, b[1] * sb, c[1] * sc)
+        if x1 < left - wider or y1 < top - wider or x0 > left + wide + wider or y0 > top + high + wider:
             continue
-        u0, u1 = int(max(x0 - left, 0) / cell), int(min(x1 - left, wide) / cell)
-        for v in range(int(max(y0 - top, 0) / cell), int(min(y1 - top, high) / cell) + 1):
-            for k in range(first[v * columns + u0], first[v * columns + u1 + 1]):
-                if bits[order[k]] != every:
-                    bits[order[k]] |= _stopped(start_x, start_y, points[order[k]], a, b, c)
+        u0, u1 = int(max(x0 - wider - left, 0) / cell), int(min(x1 + wider - left, wide) / cell)
+        for v in range(int(max(y0 - wider - top, 0) / cell), int(min(y1 + wider - top, high) / cell) + 1):
+            for u in range(u0, u1 + 1):
+                n = v * columns + u
+                reach = radius * (1 / nearest - 1 / deepest[n]) + _HAIR_MM
+                x2, y2 = left + u * cell - reach, top + v * cell - reach
+                away = x1 < x2 or x0 > x2 + cell + 2 * reach or y1 < y2 or y0 > y2 + cell + 2 * reach
+                if away or deepest[n] <= nearest:
+                    continue
+                for i in order[first[n] : first[n + 1]]:
+                    reach = radius * (1 / nearest - 1 / points[i, 2]) + _HAIR_MM
+                    across = x0 - reach <= x[i] <= x1 + reach and y0 - reach <= y[i] <= y1 + reach
+                    if across and points[i, 2] > nearest and bits[i] != every:
+                        bits[i] |= _stopped(start_x, start_y, points[i], a, b, c)
     return bits
 
 

@@ -13,8 +13,9 @@ from synth.arrays import Mask, Pixels
 from synth.dataset.store import Writer
 from synth.errors import UserError
 from synth.fields import FIELDS, MOST_INSTRUMENTS
-from synth.flow import mask_detection, track
+from synth.flow import track
 from synth.flow.estimator import create
+from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import rig
 from synth.flow.stereo import track as stereo
 from synth.flow.track import Track
@@ -175,7 +176,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
     scene, writer, job = task.scene, task.writer, task.scene.job
     lens = scene.renderer.right
     assert lens is not None
-    blocked = mask_detection.hidden(*left), mask_detection.hidden(*right)
+    blocked = with_highlights(*left), with_highlights(*right)
     with task.watch.stage("stereo"):
         pair = rig.StereoRig(
             rig.Intrinsics(scene.view.K, scene.view.distortion),

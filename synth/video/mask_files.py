@@ -14,11 +14,10 @@ from synth.video.file_numbers import find_stills, match_numbers, number_files
 from synth.video.read import read_mask
 
 MASKS = {
-    "auto": "detected highlights and instrument, where masking them helps",
-    "both": "all detected highlights and the detected instrument",
+    "auto": "instruments and other objects, detected unless masks are given; detected highlights",
     "none": "nothing",
 }
-"""What is masked; given instrument masks are used in all cases but `none`."""
+"""What is masked."""
 
 
 @dataclass(frozen=True)

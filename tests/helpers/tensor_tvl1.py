@@ -99,8 +99,7 @@ def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
     y = torch.arange(height, dtype=now.dtype)[:, None]
     at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)
     picture = F.grid_sample(now, at, mode="bicubic", padding_mode="border", align_corners=False)
-    visible = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
-    return picture, (visible > 0.9).to(now.dtype)
+    return picture, image.warp(now, usable, flow)[1]
 
 
 def derivative(field: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from synth.system.config_file import places
 
 BUDGET = {
     "synth, learn and bench": (36_500, 36_500),
-    "evidence": (8_470, 8_500),
+    "evidence": (8_500, 8_500),
     "tests": (14_500, 14_500),
     "job keys": (95, 96),
     "training keys": (23, 24),

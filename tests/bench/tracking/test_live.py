@@ -21,8 +21,7 @@ from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
 from learn.training.threads import set_threads
-from synth.arrays import Pixels
-from synth.flow.mask_selection import Proposal
+from synth.arrays import Mask, Pixels
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess, LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
@@ -72,12 +71,12 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
         ahead = 1
         submitted = -1  # one submission precedes the start of the stream
 
-        def submit(self, rgb: Pixels, proposal: Proposal) -> Future[FrameMotion]:
+        def submit(self, rgb: Pixels, masked: Mask) -> Future[FrameMotion]:
             self.submitted += 1
             if self.submitted:
                 log.append(f"in {self.submitted}")
             slow = Slow()
-            slow.set_result(super().submit(rgb, proposal).result())
+            slow.set_result(super().submit(rgb, masked).result())
             return slow
 
     clock = Mock(spare_s=lambda time_s: 0.04)

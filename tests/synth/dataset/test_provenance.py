@@ -11,7 +11,7 @@ from synth.dataset import provenance
 
 def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> None:
     files = dict.fromkeys(("engine/run.py", "flow/README.md"), False)
-    files |= dict.fromkeys(("flow/tvl1.py", "flow/toolnet.pt", "fem/mesh/lattice.py"), True)
+    files |= dict.fromkeys(("flow/tvl1.py", "flow/segmentation.pt", "fem/mesh/lattice.py"), True)
     for name in files:
         file = tmp_path / "synth" / name
         file.parent.mkdir(parents=True, exist_ok=True)

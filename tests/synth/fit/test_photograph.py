@@ -12,8 +12,7 @@ from PIL import Image
 from synth.errors import UserError
 from synth.fit import fitting
 from synth.fit.fitting import fit_colours
-from synth.fit.photograph import Compression, Photograph, measure, read_photograph
-from synth.flow.mask_detection import cortex
+from synth.fit.photograph import Compression, Photograph, find_cortex, measure, read_photograph
 from synth.render.camera.camera_sensor import processed
 from synth.render.camera.colour_processing import CAMERAS, encoded
 
@@ -47,14 +46,14 @@ def written(path: Path, rgb: np.ndarray, **how: object) -> Path:
 
 
 def test_the_opening_is_detected_without_the_instrument() -> None:
-    with_tool, truth = cortex(scene(), 0.08), opening()
+    with_tool, truth = find_cortex(scene(), 0.08), opening()
     rod = np.zeros(truth.shape, np.uint8)
     cv2.line(rod, (640, 480), (360, 270), 1, 20)
     rod = (rod > 0) & truth
     assert (with_tool & rod).sum() < 0.1 * rod.sum()
     assert (with_tool & ~truth).sum() < 0.03 * truth.sum()
     assert (with_tool & truth).sum() > 0.6 * (truth & ~rod).sum()
-    assert (cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
+    assert (find_cortex(scene(tool=False), 0.08) & truth).sum() > 0.8 * truth.sum()
 
 
 def test_the_compression_of_a_jpeg_is_read_and_reproduced() -> None:

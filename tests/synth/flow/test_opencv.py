@@ -1,6 +1,5 @@
-"""OpenCV's estimators against translations, detection of masks, and estimators of plug-ins."""
+"""OpenCV's estimators against translations, and estimators of plug-ins."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +7,9 @@ import numpy as np
 import pytest
 import tiny_package
 
-from evidence.flow.scenes import Recipe, cortex, pairs
+from evidence.flow.scenes import cortex
 from synth.errors import UserError
-from synth.flow import estimator, mask_detection, toolnet, track
+from synth.flow import estimator, track
 from synth.job.schema import Job
 from synth.plugins import ESTIMATORS
 
@@ -25,37 +24,6 @@ def test_translation(name: str, bound_px: float) -> None:
     assert np.linalg.norm(flow - [5.0, 3.0], axis=-1)[inner].mean() < bound_px
     assert confidence[inner].min() > 0.9
     assert flow.dtype == np.float32
-
-
-def test_glare_is_found() -> None:
-    """A bright, soft spot on tissue is glare; pale tissue and a global change of brightness are not."""
-    tissue = np.broadcast_to(np.array([200, 150, 120], np.uint8), (120, 160, 3)).copy()
-    for gain in (0.7, 1.0, 1.15):
-        assert not mask_detection.glare(np.clip(gain * tissue.astype(float), 0, 255).astype(np.uint8)).any()
-    y, x = np.mgrid[:120, :160]
-    spot = np.exp(-((x - 70) ** 2 + (y - 50) ** 2) / (2 * 4.0**2))[..., None]
-    wet = np.clip(tissue + 200 * spot, 0, 255).astype(np.uint8)
-    found = mask_detection.glare(wet)
-    assert found[50, 70]
-    assert found[spot[..., 0] > 0.3].all()
-    assert found.mean() < 0.03
-
-
-def test_tool_is_found_without_weights() -> None:
-    (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
-    found, tool = mask_detection.grey_bodies(pair.now), ~pair.now_usable  # without highlights
-    assert np.count_nonzero(found & tool) / np.count_nonzero(found | tool) > 0.6
-    assert not mask_detection.grey_bodies(pair.rest).any()
-    blocked = mask_detection.blocked(pair.now)
-    assert blocked[tool].mean() > 0.8
-    assert blocked.mean() < 0.2
-
-
-def test_bundled_weights_are_small_and_those_of_their_card() -> None:
-    card = json.loads(toolnet.WEIGHTS.with_suffix(".json").read_text())
-    assert toolnet.WEIGHTS.stat().st_size <= 2_000_000
-    net = toolnet.load()
-    assert sum(p.numel() for p in net.parameters()) == card["parameters"]
 
 
 _PLUGIN = """

@@ -149,6 +149,13 @@ def test_means_equal_those_of_pytorch(shape: tuple[int, int]) -> None:
         torch.testing.assert_close(image.box(field, radius), expected, rtol=1e-5, atol=1e-6)
 
 
+def test_a_soft_mask_keeps_its_weight_and_loses_what_is_at_its_edge() -> None:
+    usable = torch.full((1, 1, 6, 8), 0.3)
+    usable[..., 4:] = 0
+    visible = image.warp(usable, usable, torch.full((1, 2, 6, 8), 0.5))[1][0, 0]
+    torch.testing.assert_close(visible[1, :5], torch.tensor([0.3, 0.3, 0.3, 0, 0]))
+
+
 def test_a_diverged_flow_samples_at_the_border() -> None:
     now = torch.arange(20.0).view(1, 1, 4, 5)
     flow = torch.full((1, 2, 4, 5), 1e9)

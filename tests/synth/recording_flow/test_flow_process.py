@@ -13,7 +13,6 @@ from fake_recording import texture
 
 from learn.training.threads import set_threads
 from synth.errors import UserError
-from synth.flow.mask_selection import Proposal
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess
 from synth.recording_flow.passes import VideoPass
@@ -23,11 +22,11 @@ from synth.video.read import Picture
 @pytest.mark.slow
 def test_errors_and_the_end_of_the_process_are_reported() -> None:
     rest = texture(64, 80)
-    moved, free = np.roll(rest, 2, axis=1), Proposal(*np.zeros((3, 64, 80), bool))
+    moved, free = np.roll(rest, 2, axis=1), np.zeros((64, 80), bool)
     with closing(FlowProcess(set_threads)) as elsewhere:
         with pytest.raises(UserError, match="no estimator"):
-            elsewhere.begin("nonesuch", rest, free, ~free.known)
-        elsewhere.begin("dis", rest, free, ~free.known)
+            elsewhere.begin("nonesuch", rest, free, ~free)
+        elsewhere.begin("dis", rest, free, ~free)
         with pytest.raises(UserError, match="does not fit"):
             elsewhere.submit(moved[:-1], free).result()
         worker = elsewhere._pool.submit(os.getpid).result()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from synth.flow.mask_selection import Proposal
 from synth.recording_flow.foreground import ForegroundSearch, fit_surface, flow_jump
 from synth.recording_flow.frame_motion import FrameMotion
 
@@ -47,12 +46,12 @@ def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(pea
 
 @pytest.mark.parametrize(("half_width", "reported"), [(8, False), (24, True)])
 def test_a_detected_instrument_is_no_foreign_object_but_a_hand_is(half_width: int, reported: bool) -> None:
-    tool, none = (np.abs(Y - 60) < half_width) & (X < 90), np.zeros(SHAPE, bool)
-    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
+    tool = (np.abs(Y - 60) < half_width) & (X < 90)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=False)
     for k in range(4):
-        sure = np.where(tool & (k > 0), 0.1, 1).astype(np.float32)  # hidden, but its mask is not used
-        proposal = Proposal(none, tool & (k > 0), none)
-        frame = FrameMotion(k * load(2.0), sure, is_rest=k == 0, index=k, proposal=proposal)
+        sure = np.where(tool & (k > 0), 0.1, 1).astype(np.float32)
+        masks = {"masked": tool & (k > 0), "tool": tool & (k > 0)}
+        frame = FrameMotion(k * load(2.0), sure, is_rest=k == 0, index=k, **masks)
         search.add(frame, (300 - 6.0 * (tool & (k > 0))).astype(np.float32))
     assert bool(search.findings) is reported
 

@@ -1,0 +1,221 @@
+"""Trains the segmentation on domain-randomised renders, and on objects drawn over these and photographs."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from evidence.flow import paste
+from evidence.flow.correction_training import _motion, _texture
+from evidence.flow.foreign_scenes import photographs_of
+from evidence.flow.scenes import jpeg, noise_field
+from synth.arrays import Map, Pixels
+from synth.flow import segmentation
+from synth.flow.segmentation import CLASSES
+
+_SIZE = 224, 160  # px of examples, width and height
+_PHOTOGRAPH = 384  # px, side of photographs
+_BATCH, _RATE = 12, 4e-3
+_PASTED, _PLAIN, _REST = 0.55, 0.35, 0.4  # chances: of drawn objects, of no render, of objects at rest
+_FAR = 0.3  # weight of what is neither tissue nor instrument
+_SHADED = 0.5  # share of the light taken at which a pixel is all shadow
+Example = tuple[Pixels, Pixels, Map, Map]  # frame, rest (H, W, 3) uint8; classes, weights (H, W, 3)
+
+
+def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random.Generator) -> Example:
+    """A frame, its rest frame, and the classes to be found."""
+    if rng.random() < _PLAIN:
+        rest, now, weight = _warped(photographs, rng)
+    else:
+        rest, now, weight = _rendered(sequences[int(rng.integers(len(sequences)))], rng)
+    if rng.random() < _PASTED or (now.instrument.max() == 0 and rng.random() < 0.5):
+        other = _square(photographs[int(rng.integers(len(photographs)))], rng)
+        for _ in range(int(rng.choice([1, 1, 2, 3]))):
+            draw = paste.draw_object if rng.random() < 0.25 else paste.draw_instrument
+            thing = draw(rng, now.picture, other)
+            now = paste.paste(now, thing, np.zeros(2), rng)
+            if rng.random() < _REST:
+                rest = paste.paste(rest, thing, rng.normal(0, 0.15, 2) * (rng.random() < 0.7), rng)
+    if rng.random() < 0.3:
+        seed, moved = rng.integers(2**31), int(rng.random() < 0.5)  # often highlights stay
+        both = (now, moved), (rest, 0)
+        now, rest = (paste.add_highlights(a, np.random.default_rng(seed + b)) for a, b in both)
+    found = np.stack([getattr(now, name) for name in CLASSES], -1)
+    found[..., 1] = np.clip(found[..., 1] / _SHADED, 0, 1)
+    return *_developed(now.picture, rest.picture, rng), found, weight
+
+
+def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
+    """Layers of rest and a later frame of a sequence, by a random camera, turned and cut; and weights."""
+    right, t = "_right" * bool(rng.random() < 0.5), int(rng.integers(len(one["rgb"])))
+    start = 0 if rng.random() < 0.8 else int(rng.integers(len(one["rgb"])))
+    tool, nothing = one["tool" + right][t], np.zeros(one["tissue"].shape, np.float32)
+    shaded = not right and "shadow" in one
+    shadow = one["shadow"][t] / np.float32(255) if shaded else nothing
+    glare = nothing if right else one["glare"][t].astype(np.float32)
+    # The right picture's tissue is not stored: that of the left is near enough for a weight.
+    near = np.where(one["tissue"] | tool, 1.0, _FAR).astype(np.float32)
+    planes = [one["rgb" + right][t], one["rgb" + right][start], np.dstack([tool, shadow, glare, near])]
+    turn = _turn(one["tissue"].shape, rng)
+    mode = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
+    now, rest, flat = (cv2.warpAffine(np.asarray(p, np.float32), turn, _SIZE, **mode) for p in planes)
+    weight = np.repeat(flat[..., 3:], len(CLASSES), -1)
+    weight[..., 1] *= shaded
+    weight[..., 2] *= not right
+    layer = paste.Layer(now, flat[..., 0], flat[..., 1], flat[..., 2])
+    return paste.Layer.of(rest), layer, weight
+
+
+def _turn(shape: tuple[int, ...], rng: np.random.Generator) -> Map:
+    """A random similarity (2, 3), perhaps mirrored, from a picture's middle to that of `_SIZE`."""
+    height, width = shape
+    zoom = _SIZE[0] / width * np.exp(rng.uniform(np.log(0.8), np.log(1.7)))
+    turn = rng.choice([0, 0.5, 1, 1.5]) * np.pi + rng.normal(0, 0.3)
+    matrix = zoom * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    matrix[:, 0] *= rng.choice([-1, 1])
+    middle = np.array([width, height]) / 2 + rng.uniform(-0.15, 0.15, 2) * width
+    return np.column_stack([matrix, np.array(_SIZE) / 2 - matrix @ middle])
+
+
+def _warped(photographs: Sequence[Map], rng: np.random.Generator) -> tuple[Any, Any, Map]:
+    """A photograph or drawn texture as tissue, at rest and moved."""
+    if rng.random() < 0.5:
+        still = _square(photographs[int(rng.integers(len(photographs)))], rng)
+    else:
+        still = cv2.resize(_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA)
+    size = max(_SIZE)
+    flow = cv2.resize(_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
+    y, x = np.mgrid[: _SIZE[1], : _SIZE[0]].astype(np.float32)
+    x, y = x - flow[..., 0], y - flow[..., 1]
+    moved = cv2.remap(still, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return paste.Layer.of(still), paste.Layer.of(moved), np.ones((*_SIZE[::-1], len(CLASSES)), np.float32)
+
+
+def _square(photograph: Map, rng: np.random.Generator) -> Map:
+    """A part of a photograph (N, N, 3), turned, as large as an example, with random colours."""
+    turn = _turn(photograph.shape[:2], rng)
+    part = cv2.warpAffine(photograph, turn, _SIZE, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    mix = np.eye(3) + rng.normal(0, 0.25, (3, 3))
+    return np.asarray(np.clip(part @ mix.T * rng.uniform(0.5, 1.2), 0, 255), np.float32)
+
+
+def _developed(now: Map, rest: Map, rng: np.random.Generator) -> list[Any]:
+    """Both pictures by one camera whose light changes a little."""
+    gain, gamma, white = rng.uniform(0.6, 1.3), np.exp(rng.normal(0, 0.2)), np.exp(rng.normal(0, 0.12, 3))
+    blur, noise = rng.choice([0, 0, 0.6, 1.2]), rng.choice([0.3, 1, 2, 5])
+    quality = int(rng.choice([0, 0, 90, 70, 45]))
+    grey, drift = rng.random() < 0.08, rng.random() < 0.3
+    coarse = 1.0 if rng.random() < 0.7 else rng.uniform(1, 3)
+    made = []
+    for k, picture in enumerate((now, rest)):
+        light: Any = np.float32(gain)
+        if drift and k == 0:
+            uneven = rng.uniform(0, 0.15) * noise_field(_SIZE[::-1], 250, rng)
+            light = light * (1 + uneven[..., None] + np.float32(rng.normal(0, 0.05)))
+        if coarse > 1:
+            size = round(_SIZE[0] / coarse), round(_SIZE[1] / coarse)
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+            light = light if np.ndim(light) == 0 else cv2.resize(light, size)[..., None]
+        level = np.clip(picture / np.float32(255), 0, 1.1) ** np.float32(gamma)
+        level = 255 * np.clip(light * np.float32(white) * level, 0, 1)
+        if blur:
+            level = cv2.GaussianBlur(level, (0, 0), float(blur))
+        if grey:
+            level = np.repeat(level.mean(-1, keepdims=True), 3, -1)
+        level += np.float32(noise) * rng.standard_normal(level.shape, np.float32)
+        taken = jpeg(np.clip(level, 0, 255).astype(np.uint8), quality)
+        made.append(taken if coarse == 1 else cv2.resize(taken, _SIZE, interpolation=cv2.INTER_CUBIC))
+    return made
+
+
+def batch(examples: Sequence[Example]) -> tuple[Tensor, Tensor, Tensor]:
+    """Network input, classes and weights (B, C, H, W)."""
+    inputs = torch.cat([segmentation.prepare(now, rest) for now, rest, *_ in examples])
+    planes = (torch.from_numpy(np.stack([one[k] for one in examples])) for k in (2, 3))
+    return inputs, *(plane.permute(0, 3, 1, 2) for plane in planes)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, eq=False)
+class _Batches(Dataset[Any]):
+    """Batch number k of a training, the same whenever it is drawn."""
+
+    sequences: Sequence[Any]
+    photographs: Sequence[Map]
+    seed: int
+    numbers: range
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, k: int) -> tuple[Tensor, Tensor, Tensor]:
+        rng = np.random.default_rng([self.seed, self.numbers[k]])
+        return batch([example(self.sequences, self.photographs, rng) for _ in range(_BATCH)])
+
+
+def train(
+    sequences: Sequence[Any], steps: int, seed: int, checkpoint: Path
+) -> tuple[segmentation.SegmentationNet, dict[str, Any]]:
+    """A network trained for some steps, and its data in numbers; it continues from a checkpoint."""
+    cv2.setNumThreads(0)  # its threads would not survive the fork of the process that draws batches
+    torch.manual_seed(seed)
+    net = segmentation.SegmentationNet()
+    average = copy.deepcopy(net)
+    optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps, pct_start=0.1)
+    parts: dict[str, Any] = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
+    begun = 0
+    if checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=False)
+        begun = state["step"]
+        for name, part in parts.items():
+            part.load_state_dict(state[name])
+    began, recent = time.time(), []
+    net.train()
+    drawn = _Batches(sequences, photographs_of("tuning", _PHOTOGRAPH), seed, range(begun, steps))
+    for step, (inputs, classes, weights) in enumerate(DataLoader(drawn, None, num_workers=1), begun):
+        loss = _loss(net(inputs), classes, weights)
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
+        optimiser.step()
+        schedule.step()
+        _follow(average, net, max(0.001, 1 / (step + 1)))
+        recent.append(float(loss.detach()))
+        if (step + 1) % 100 == 0:
+            print(
+                f"step {step + 1} of {steps}: loss {np.mean(recent[-100:]):.4f}, {time.time() - began:.0f} s",
+                flush=True,
+            )
+            states = {name: part.state_dict() for name, part in parts.items()}
+            torch.save({"step": step + 1} | states, checkpoint.with_suffix(".part"))
+            checkpoint.with_suffix(".part").rename(checkpoint)
+    frames = 2 * sum(len(one["rgb"]) for one in sequences)
+    return average.eval(), {"frames": frames, "steps": steps}
+
+
+def _follow(average: torch.nn.Module, net: torch.nn.Module, share: float) -> None:
+    """Moves the mean of weights and of batch statistics by a share towards those of a network."""
+    with torch.no_grad():
+        for mean, now in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(now, share)
+
+
+def _loss(logits: Tensor, classes: Tensor, weights: Tensor) -> Tensor:
+    """Cross-entropy plus one minus the soft Dice overlap of each class."""
+    found = torch.sigmoid(logits)
+    both = (weights * found * classes).sum((0, 2, 3))
+    either = (weights * (found + classes)).sum((0, 2, 3))
+    entropy = F.binary_cross_entropy_with_logits(logits, classes, weights)
+    return 2 * entropy + (1 - (2 * both + 50) / (either + 50)).mean()

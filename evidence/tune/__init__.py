@@ -1,1 +1,0 @@
-"""Tuning measured: whether fresh sequences stay within the budget."""

@@ -1,0 +1,123 @@
+"""Weights of all learned parts below the force, from nothing: segmentation, correction of flow and of depth.
+
+    make weights
+
+Every sequence, example and checkpoint is a file in a folder: an interrupted run continues. Cards state the
+generator, the data, the seed and the hash of the weights that were used below.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from evidence import training
+from evidence.flow import correction_training, segmentation_training
+from evidence.study import Study
+from synth.dataset import provenance
+from synth.errors import UserError
+from synth.flow import correction, segmentation
+from synth.flow.stereo import depth_correction
+from synth.job import reader
+from synth.sequence.simulation import simulate
+from synth.system import checked_file
+
+_FIRST = {"randomized": 3000, "mission": 2000}  # of their sequences: others train forces
+_BASELINES_MM = 24, 24, 24, 14, 34
+_STORED = "rgb", "rgb_right", "tool", "tool_right", "glare", "flow", "visible", "motion", "shadow"
+
+
+def measure(
+    folder: Path,
+    randomized: int = 75,
+    mission: int = 60,
+    drawn: int = 600,
+    steps: int = 14000,
+    minutes: float = 40.0,
+    seed: int = 0,
+) -> None:
+    """Renders sequences of two jobs, trains in turn, and writes weights and cards to `made` in the folder.
+
+    They are not put next to the modules: whether they are better than those there is to be measured first.
+
+    `drawn`: drawn pairs for the corrections; `steps`: of the segmentation; `minutes`: CPU time of each
+    correction. What a folder has is made again only where settings or weights below differ.
+    """
+    counts = {"randomized": randomized, "mission": mission}
+    sequences = [file for job, n in counts.items() for file in _render(job, n, folder / "sequences")]
+    about = {"generator": _generator(folder), "sequences": counts, "seed": seed}
+    below: dict[str, str] = {}
+    for part in (segmentation, correction, depth_correction):
+        name, depth = part.WEIGHTS.stem, part is depth_correction
+        settings = {"drawn": drawn, "minutes": minutes} if part is not segmentation else {"steps": steps}
+        card = {**about, **settings, "below": dict(below)}
+        key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
+        made = folder / f"{name}-{key}.pt"
+        if not made.exists():
+            net: torch.nn.Module
+            if part is segmentation:
+                frames, checkpoint = [dict(np.load(file)) for file in sequences], made.with_suffix(".ckpt")
+                net, data = segmentation_training.train(frames, steps, seed, checkpoint)
+            else:
+                examples = folder / f"examples-{key}"
+                net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
+            training.export(net, made, card | data)
+        weights = folder / "made" / part.WEIGHTS.name
+        weights.parent.mkdir(exist_ok=True)
+        for suffix in (".pt", ".json"):
+            shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
+        vars(part).update(WEIGHTS=weights)  # the next part learns from what is recovered with these
+        below[name] = hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]
+
+
+def _generator(folder: Path) -> str:
+    """Fingerprint of the generator that began the folder of sequences."""
+    file = folder / "generator.txt"
+    if not file.exists():
+        file.write_text(provenance.fingerprint())
+    return file.read_text()
+
+
+def _render(job: str, count: int, folder: Path) -> Iterator[Path]:
+    """Files of sequences of a job, those missing rendered; one that the job refuses is left out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for index in range(_FIRST[job], _FIRST[job] + count):
+        file, refused = folder / f"{job}-{index}.npz", folder / f"{job}-{index}.refused"
+        if not file.exists() and not refused.exists():
+            try:
+                arrays = _rendered(job, index)
+            except UserError as error:
+                refused.write_text(str(error))
+                continue
+            np.savez_compressed(folder / "part.npz", allow_pickle=False, **arrays)
+            (folder / "part.npz").rename(file)
+            print(file.stem, flush=True)
+        if file.exists():
+            yield file
+
+
+def _rendered(job: str, index: int) -> dict[str, Any]:
+    """Pictures, masks and truth of both cameras, and their calibration."""
+    baseline_mm = float(np.random.default_rng([55, index]).choice(_BASELINES_MM))
+    keys = [f"render.stereo_mm={baseline_mm}", "store.extra=[shadow]", f"sequences={index + 1}"]
+    scene = simulate(reader.load_job(job, keys), index)
+    shots = list(scene.frames())
+    found = {name: np.stack([getattr(shot, name) for shot in shots]) for name in _STORED}
+    found |= {name: found[name].astype(np.float16) for name in ("flow", "motion")}
+    found["shadow"] = np.rint(255 * np.clip(found["shadow"], 0, 1)).astype(np.uint8)
+    size = np.linalg.norm(np.stack([shot.traction for shot in shots]), axis=-1)
+    pressed = size > 0.05 * np.maximum(size.max((1, 2), keepdims=True), 1e-6)
+    left, right = scene.view, scene.renderer.right
+    assert right is not None
+    lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
+    return found | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+
+
+STUDY = Study(measure, steps=())

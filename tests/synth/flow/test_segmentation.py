@@ -1,0 +1,67 @@
+"""Segmentation of instruments, highlights and foreground on pictures that it was not trained on."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evidence.flow.scenes import Recipe, pairs
+from synth.flow import segmentation
+from synth.flow.segmentation import segment, with_highlights
+
+Picture = NDArray[np.uint8]
+
+
+def test_bundled_weights_are_small_and_those_of_their_card() -> None:
+    card = json.loads(segmentation.WEIGHTS.with_suffix(".json").read_text())
+    assert segmentation.WEIGHTS.stat().st_size <= 1_500_000
+    assert (
+        sum(one.numel() for one in segmentation.load(segmentation.WEIGHTS).parameters()) == card["parameters"]
+    )
+
+
+def tissue(height: int, width: int) -> Picture:
+    """Pink tissue with a mottle and a dark vessel."""
+    rng = np.random.default_rng(4)
+    mottle = cv2.GaussianBlur(rng.normal(0, 1, (height, width)), (0, 0), 3)
+    picture = np.array([200.0, 140, 120]) + 60 * mottle[..., None] * [1, 0.9, 0.7]
+    cv2.line(picture, (0, height // 3), (width, height // 2), (120, 40, 50), height // 60, cv2.LINE_AA)
+    sensed = cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0, 1.5, picture.shape)
+    return np.clip(sensed, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size", [(240, 320), (190, 333), (480, 640)])
+@pytest.mark.parametrize("grey", [60, 130, 200])
+def test_a_rod_is_found_whole_and_bare_tissue_is_not_masked(size: tuple[int, int], grey: int) -> None:
+    height, width = size
+    rest = tissue(height, width)
+    rod = np.zeros(size, np.uint8)
+    cv2.line(rod, (width, height // 8), (width // 2, height // 2), 255, width // 16, cv2.LINE_AA)
+    share = cv2.GaussianBlur(rod / 255, (0, 0), width / 500)[..., None]
+    frame = np.clip(rest * (1 - share) + share * grey, 0, 255).astype(np.uint8)
+    found, true = segment(rest, frame).instrument > 0.5, share[..., 0] > 0.5
+    assert found.shape == size
+    assert np.count_nonzero(found & true) > 0.5 * np.count_nonzero(found | true)
+    assert segment(rest, rest).hidden.mean() < 0.01
+
+
+def test_highlights_join_given_instruments() -> None:
+    rest = tissue(120, 160)
+    y, x = np.mgrid[:120, :160]
+    spot = np.exp(-((x - 70) ** 2 + (y - 50) ** 2) / (2 * 4.0**2))[..., None]
+    wet = np.clip(rest + 250 * spot, 0, 255).astype(np.uint8)
+    tool = np.zeros((2, 120, 160), bool)
+    tool[1, :, :20] = True
+    found = with_highlights(np.stack([rest, wet]), tool)
+    assert found[1, 50, 70]
+    assert found[1, :, :20].all()
+    assert found[1, :, 100:].mean() < 0.01
+
+
+def test_a_forceps_is_found_on_warped_cortex() -> None:
+    (pair,) = pairs(Recipe(highlights=0.0), 1, 2)
+    found, tool = segment(pair.rest, pair.now).hidden, ~pair.now_usable
+    assert found[tool].mean() > 0.8
+    assert found[~tool].mean() < 0.1
