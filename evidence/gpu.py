@@ -1,7 +1,4 @@
-"""Checks and timings of everything that an NVIDIA GPU changes, each step in a process of its own.
-
-The last step makes labels and trains the paper's network on them: 256², 20,000 frames, 50 epochs.
-"""
+"""Checks and timings of everything that an NVIDIA GPU changes, each step in a process of its own."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -50,9 +50,11 @@ def measure(
     `drawn`: drawn pairs for the corrections; `steps`: of the segmentation; `minutes`: CPU time of each
     correction. What a folder has is made again only where settings or weights below differ.
     """
-    counts = {"randomized": randomized, "mission": mission}
-    sequences = [file for job, n in counts.items() for file in _render(job, n, folder / "sequences")]
-    about = {"generator": _generator(folder), "sequences": counts, "seed": seed}
+    generator, counts = _generator(folder), {"randomized": randomized, "mission": mission}
+    files = {job: list(_render(job, count, folder / "sequences")) for job, count in counts.items()}
+    sequences = [file for some in files.values() for file in some]
+    about = {"generator": generator, "seed": seed}
+    about["sequences"] = {job: len(some) for job, some in files.items()}
     below: dict[str, str] = {}
     for part in (segmentation, correction, depth_correction):
         name, depth = part.WEIGHTS.stem, part is depth_correction
@@ -73,12 +75,13 @@ def measure(
         weights.parent.mkdir(exist_ok=True)
         for suffix in (".pt", ".json"):
             shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
-        vars(part).update(WEIGHTS=weights)  # the next part learns from what is recovered with these
+        vars(part).update(WEIGHTS=made)  # the next part learns from what is recovered with these
         below[name] = hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]
 
 
 def _generator(folder: Path) -> str:
     """Fingerprint of the generator that began the folder of sequences."""
+    folder.mkdir(parents=True, exist_ok=True)
     file = folder / "generator.txt"
     if not file.exists():
         file.write_text(provenance.fingerprint())

@@ -75,7 +75,7 @@ class RightPictures:
             change, other = (_change(*(cv2.GaussianBlur(one, (0, 0), 3) for one in pair)) for pair in pairs)
             self._frozen += other < _SAME * change
         self._last = left, right, self._video.rest.tissue & ~masked
-        tool = masked if frame.tool is None else frame.tool
+        tool = frame.instruments
         if tool.sum() > max(_LEAST_TOOL, self._largest):
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 

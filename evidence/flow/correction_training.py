@@ -1,6 +1,6 @@
 """Trains the networks of the corrections of flow and of depth on rendered and on closed-form motion.
 
-About a third each are rendered sequences, as rendered and once more as from another camera (gain, colour,
+With the defaults half are rendered sequences, as rendered and once more as from another camera (gain, colour,
 contrast, noise, blur, JPEG; if monocular also another size, and some frames that cannot be tracked); warped
 cortex under an instrument; and drawn textures in motion, which need no correction. Examples are stored: an
 interrupted run continues. Depth is corrected after flow, hence trained after it.
@@ -59,25 +59,27 @@ def train(
     `sequences`: files of `evidence.weights`; `drawn`: number of drawn pairs; warped ones are a quarter of it.
     """
     examples.mkdir(parents=True, exist_ok=True)
-    describe, before = (depth_example, "depth_") if depth else (example, "")
+    describe, repeats = (depth_example, 1) if depth else (example, 3)  # a drawn pair is a single frame
     made: dict[str, Any] = {}
     for file in sequences:
         for again in range(2):
             made[f"{file.stem}_{again}"] = lambda file=file, again=again: _varied(
                 _load(file), np.random.default_rng([*file.stem.encode(), again]), again, depth
             )
+    rendered = set(made)
     made |= {f"g{i:04d}": lambda i=i: (_drawn_depth if depth else _drawn)(i) for i in range(drawn)}
     made |= {f"p{i:04d}": lambda i=i: _warped(i) for i in range(0 if depth else drawn // 4)}
-    found = []
+    found, frames = [], 0
     for name, make in made.items():
-        file = examples / f"{before}{name}.npz"
+        file = examples / f"{name}.npz"
         if not file.exists():
             np.savez(examples / "part.npz", allow_pickle=False, **describe(make()))
             (examples / "part.npz").rename(file)
-        found += (1 if name[0] in "rm" or depth else 3) * [dict(np.load(file))]  # a frame each: thrice
+        one = dict(np.load(file))
+        found += (1 if name in rendered else repeats) * [one]
+        frames += len(one["x"])
     net, steps = fit(found, depth, minutes, seed)
-    counts = {"examples": len(made), "frames": sum(len(one["x"]) for one in found)}
-    return net, counts | {"cpu_minutes": minutes, "steps": steps}
+    return net, {"examples": len(made), "frames": frames, "steps": steps}
 
 
 def _load(file: Path) -> Frames:
@@ -103,13 +105,13 @@ def _warped(index: int) -> Frames:
 
 
 def _drawn(index: int) -> Frames:
-    """A pair of noise, ellipses or cortex, with or without a bar as instrument, moving or still.
+    """A pair of noise, ellipses, cortex or a photograph, perhaps with a bar as instrument, moving or still.
 
     Without these pairs the correction made flow worse on photographs, where it needs no correction.
     """
     rng = np.random.default_rng([4321, index])
     size = int(rng.choice([160, 192, 224]))
-    texture, flow = _texture(2 * size, rng), _motion(size, rng)
+    texture, flow = draw_texture(2 * size, rng), draw_motion(size, rng)
     noise, quality = rng.choice([0.3, 1, 2, 4]), int(rng.choice([0, 0, 0, 92, 75]))
     before, after = (resampled(texture, places) for places in (pixels(size, size), inverse(flow)))
     if rng.random() < 0.4:
@@ -131,7 +133,7 @@ def _drawn_depth(index: int) -> Frames:
     """Stereo pairs of drawn textures on a slope, with lateral motion and independent motion in depth."""
     rng = np.random.default_rng([8642, index])
     size = int(rng.choice([160, 192, 224]))
-    texture, flow = _texture(2 * size, rng), _motion(size, rng)
+    texture, flow = draw_texture(2 * size, rng), draw_motion(size, rng)
     away, baseline, wide = rng.uniform(150, 400), rng.uniform(8, 40), np.exp(rng.uniform(2.3, 4.1))
     focal, at = size * away / wide, pixels(size, size) - size / 2
     rest = away * (1 + (at @ rng.normal(0, 0.2, 2)) / focal)
@@ -175,7 +177,7 @@ def _pair(rgb: list[Any], hidden: Any, flow: Any, there: Any, covered: Any, tiss
     }
 
 
-def _texture(size: int, rng: np.random.Generator) -> Any:
+def draw_texture(size: int, rng: np.random.Generator) -> Any:
     kind, square = rng.integers(4), (size, size)
     if kind == 0:
         periods = np.exp(rng.uniform(np.log(4), np.log(60), rng.integers(1, 4)))
@@ -205,7 +207,7 @@ def _texture(size: int, rng: np.random.Generator) -> Any:
     return np.float32(np.clip(wide @ tint.T * rng.uniform(0.5, 1.2), 0, 255))
 
 
-def _motion(size: int, rng: np.random.Generator) -> Any:
+def draw_motion(size: int, rng: np.random.Generator) -> Any:
     """Displacement (H, W, 2) px of a pull, a smooth field, an affine motion, or none."""
     kind = rng.integers(4)
     if kind == 0:

@@ -2,7 +2,7 @@
 
 Photographs included in scikit-image, and drawn phantoms, are warped by an analytic field; tools, lamps,
 highlights, endoscopes, compression and camera faults are drawn over them. Nothing is shared with
-`synth.render` or with the training scenes of the tool network.
+`synth.render`. Photographs of the half `tuning` also train the segmentation and the correction of flow.
 """
 
 from __future__ import annotations

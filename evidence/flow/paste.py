@@ -91,7 +91,7 @@ def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
     return _finish(parts, rng, picture, other)
 
 
-def paste(layer: Layer, thing: Thing, shift: Floats, rng: np.random.Generator) -> Layer:
+def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:
     """A layer with an object moved by `shift` (2,) picture widths, and its shadows."""
     body = _cover(thing, shift, layer.instrument.shape)
     picture, shadow = layer.picture, layer.shadow

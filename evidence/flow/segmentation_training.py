@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from evidence.flow import paste
-from evidence.flow.correction_training import _motion, _texture
+from evidence.flow.correction_training import draw_motion, draw_texture
 from evidence.flow.foreign_scenes import photographs_of
 from evidence.flow.scenes import jpeg, noise_field
 from synth.arrays import Map, Pixels
@@ -44,9 +44,9 @@ def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random
         for _ in range(int(rng.choice([1, 1, 2, 3]))):
             draw = paste.draw_object if rng.random() < 0.25 else paste.draw_instrument
             thing = draw(rng, now.picture, other)
-            now = paste.paste(now, thing, np.zeros(2), rng)
+            now = paste.paste(now, thing, np.zeros(2))
             if rng.random() < _REST:
-                rest = paste.paste(rest, thing, rng.normal(0, 0.15, 2) * (rng.random() < 0.7), rng)
+                rest = paste.paste(rest, thing, rng.normal(0, 0.15, 2) * (rng.random() < 0.7))
     if rng.random() < 0.3:
         seed, moved = rng.integers(2**31), int(rng.random() < 0.5)  # often highlights stay
         both = (now, moved), (rest, 0)
@@ -61,8 +61,7 @@ def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
     right, t = "_right" * bool(rng.random() < 0.5), int(rng.integers(len(one["rgb"])))
     start = 0 if rng.random() < 0.8 else int(rng.integers(len(one["rgb"])))
     tool, nothing = one["tool" + right][t], np.zeros(one["tissue"].shape, np.float32)
-    shaded = not right and "shadow" in one
-    shadow = one["shadow"][t] / np.float32(255) if shaded else nothing
+    shadow = nothing if right else one["shadow"][t] / np.float32(255)
     glare = nothing if right else one["glare"][t].astype(np.float32)
     # The right picture's tissue is not stored: that of the left is near enough for a weight.
     near = np.where(one["tissue"] | tool, 1.0, _FAR).astype(np.float32)
@@ -71,8 +70,7 @@ def _rendered(one: Any, rng: np.random.Generator) -> tuple[Any, Any, Map]:
     mode = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REFLECT_101}
     now, rest, flat = (cv2.warpAffine(np.asarray(p, np.float32), turn, _SIZE, **mode) for p in planes)
     weight = np.repeat(flat[..., 3:], len(CLASSES), -1)
-    weight[..., 1] *= shaded
-    weight[..., 2] *= not right
+    weight[..., 1:3] *= not right
     layer = paste.Layer(now, flat[..., 0], flat[..., 1], flat[..., 2])
     return paste.Layer.of(rest), layer, weight
 
@@ -93,9 +91,9 @@ def _warped(photographs: Sequence[Map], rng: np.random.Generator) -> tuple[Any, 
     if rng.random() < 0.5:
         still = _square(photographs[int(rng.integers(len(photographs)))], rng)
     else:
-        still = cv2.resize(_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA)
+        still = cv2.resize(draw_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA)
     size = max(_SIZE)
-    flow = cv2.resize(_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
+    flow = cv2.resize(draw_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
     y, x = np.mgrid[: _SIZE[1], : _SIZE[0]].astype(np.float32)
     x, y = x - flow[..., 0], y - flow[..., 1]
     moved = cv2.remap(still, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)

@@ -38,11 +38,11 @@ def agreement(pictures: image.Level, warped: Tensor, visible: Tensor) -> Tensor:
     """Local correlation (B, 1, H, W) in 0..1 of the rest frame with the warped frame; 0 where either is
     masked or blank.
 
-    `pictures`: the finest level; `warped`, `visible`: (B, 1, H, W), see `image.warp`.
+    `pictures`: a level; `warped`, `visible`: (B, 1, H, W), see `image.warp`.
     """
     mask = pictures.rest_usable * visible
-    first, second = pictures.rest * mask, warped * mask
-    sums = torch.cat([mask, first * second, first * first, second * second], 1)
+    first, second = pictures.rest, warped
+    sums = torch.cat([mask, mask * first * second, mask * first * first, mask * second * second], 1)
     around = image.window(sums, _WINDOW)
     product, power, power_now = (around[:, 1:] / around[:, :1].clamp_min(1e-4)).unbind(1)
     agreement = product / torch.sqrt((power + _NOISE) * (power_now + _NOISE))

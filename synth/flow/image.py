@@ -124,8 +124,9 @@ def fill(field: Tensor, usable: Tensor) -> Tensor:
 
 
 def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and how usable the
-    pixels read are, 0 where one of them is not or is outside."""
+    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and the largest
+    weight of the four pixels around: 0 where the interpolated weight is at most 0.9 of it, as at a masked
+    pixel or the border."""
     out = np.empty((2, 1, 1, *now.shape[-2:]), np.float32)
     one, known, by = (field.contiguous().numpy() for field in (now[0, 0], usable[0, 0], flow[0]))
     kernels.warp_into(one, known, by, out[0, 0, 0], out[1, 0, 0])

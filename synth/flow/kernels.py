@@ -9,7 +9,7 @@ from synth.system.jit import vectorised
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _EIGHT, _TWELFTH = np.float32(8), np.float32(1 / 12)
-_VISIBLE = np.float32(0.9)  # share of the sampled pixels that must be usable
+_VISIBLE = np.float32(0.9)  # least interpolated weight of the pixels read, relative to the largest
 _CUBIC = np.float32(-0.75)  # free parameter of bicubic interpolation, as in PyTorch and OpenCV
 
 
@@ -46,7 +46,7 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> No
             first, second = known[j, i] + fx * (known[j, i + 1] - known[j, i]), known[j + 1, i]
             some = first + fy * (second + fx * (known[j + 1, i + 1] - second) - first)
             most = max(max(known[j, i], known[j, i + 1]), max(known[j + 1, i], known[j + 1, i + 1]))
-            visible[y, x] = min(some + (_ONE - _VISIBLE), most) if some > _VISIBLE * most else _ZERO
+            visible[y, x] = most if some > _VISIBLE * most else _ZERO
 
 
 @vectorised

@@ -75,6 +75,11 @@ class Segmentation:
     highlight: Map
 
     @property
+    def objects(self) -> Mask:
+        """(H, W) instruments and other objects."""
+        return np.asarray(self.instrument > _HIDDEN)
+
+    @property
     def hidden(self) -> Mask:
         """(H, W) where an object or a highlight hides the tissue, and a pixel around."""
         return _grown(np.maximum(self.instrument, self.highlight) > _HIDDEN)

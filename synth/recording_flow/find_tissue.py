@@ -67,7 +67,7 @@ class TissueSearch:
     def add(self, frame: FrameMotion) -> None:
         """Adds a frame."""
         if frame.is_rest:
-            self._tool = frame.hidden
+            self._hidden_at_rest = frame.hidden
         elif frame.trusted:
             known = frame.confidence > Limits.sure
             self._square += known * np.square(frame.flow).sum(axis=-1)
@@ -80,7 +80,7 @@ class TissueSearch:
         """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
         whole = self._rest.tissue
         near, wide = (max(1, round(share * len(whole))) for share in (Limits.near, Limits.wide))
-        hidden = self._tool | (self._hidden > (1 - Limits.visible) * self._frames)
+        hidden = self._hidden_at_rest | (self._hidden > (1 - Limits.visible) * self._frames)
         visible = whole & (self._count > Limits.visible * self._frames)
         visible &= ~_morph(hidden, cv2.MORPH_DILATE, near)
         motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))

@@ -55,7 +55,7 @@ class ForegroundSearch:
         masked = ~self._tissue | frame.hidden | self._hidden
         self._masked |= masked
         if not self._has_masks:
-            self._find_wide(np.zeros_like(masked) if frame.tool is None else frame.tool, frame)
+            self._find_wide(frame.instruments, frame)
         free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)

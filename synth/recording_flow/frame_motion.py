@@ -41,7 +41,7 @@ class FrameMotion:
     reinitialised: bool = False  # tracked only after a start from zero
     is_rest: bool = False  # whether this is the rest frame
     masked: Mask | None = None  # (h, w) where the picture shows no tissue; None: nowhere
-    tool: Mask | None = None  # (h, w) the instruments among it; None: none
+    tool: Mask | None = None  # (h, w) instruments and other objects; None: none
     camera: Similarity | None = None  # camera motion, which is removed from the flow; None: none
     motion: Moved | None = None  # in three dimensions; None: monocular
     index: int = 0  # number in the video
@@ -58,6 +58,11 @@ class FrameMotion:
     def hidden(self) -> Mask:
         """(h, w) mask of the picture, also if it is empty."""
         return np.zeros(self.confidence.shape, bool) if self.masked is None else self.masked
+
+    @property
+    def instruments(self) -> Mask:
+        """(h, w) the instruments in the picture, also if there are none."""
+        return np.zeros(self.confidence.shape, bool) if self.tool is None else self.tool
 
 
 @dataclass(eq=False)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from synth.arrays import Mask, Pixels
-from synth.flow.segmentation import segment
+from synth.flow.segmentation import Segmentation, segment
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, Size
 from synth.recording_flow.picture_faults import find_fault
 from synth.video.read import shrink_mask
@@ -30,8 +30,7 @@ class MaskFrame:
         if self._kind != "none":
             found = segment(self._rest.rgb, frame.rgb)
             if self._tool is None:
-                if (found.hidden & self._rest.tissue).sum() <= _MOST * self._rest.tissue.sum():
-                    masked, tool = found.hidden, found.instrument > 0.5
+                masked, tool = _plausible(found, self._rest.tissue), found.objects
             else:
                 given = self._tool(frame.index, self._rest.size)
                 tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
@@ -43,6 +42,12 @@ class MaskFrame:
         return replace(frame, masked=masked, tool=tool, trusted=trusted)
 
 
-def mask_right(rest: Pixels, rgb: Pixels, kind: str) -> Mask:
+def mask_right(rest: Pixels, rgb: Pixels, kind: str, tissue: Mask) -> Mask:
     """Mask (H, W) of what hides the tissue in a picture of the right camera, given its rest picture."""
-    return np.zeros(rgb.shape[:2], bool) if kind == "none" else segment(rest, rgb).hidden
+    return np.zeros(tissue.shape, bool) if kind == "none" else _plausible(segment(rest, rgb), tissue)
+
+
+def _plausible(found: Segmentation, tissue: Mask) -> Mask:
+    """What is hidden; the highlights alone if so much of the tissue is that it is taken for instruments."""
+    hidden = found.hidden
+    return hidden if (hidden & tissue).sum() <= _MOST * tissue.sum() else found.shines

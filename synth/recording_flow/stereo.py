@@ -60,6 +60,7 @@ class RightCamera:
         self._camera: CameraTracker | None = None  # motion of the right camera
         self._noise: list[float] = []
         self._pair: tuple[Pixels, Pixels] | None = None  # of the last tracked frame
+        self._first: Pixels  # right picture at rest
 
     @property
     def quality(self) -> StereoQuality | None:
@@ -80,9 +81,8 @@ class RightCamera:
         tissue = self._rest.tissue
         masked = frame.hidden
         if self.stereo is None or self._camera is None:
-            self._pair = frame.rgb, right
-            self._first = right
-            hidden = mask_right(right, right, self._kind)
+            self._pair, self._first = (frame.rgb, right), right
+            hidden = mask_right(right, right, self._kind, np.ones_like(tissue))
             self.stereo = self._begin(frame.rgb, right, masked, hidden)
             self._camera = CameraTracker(right, self.stereo.right_tissue(), hidden)
             return replace(frame, right=right, motion=Moved.nothing(tissue.shape))
@@ -90,7 +90,7 @@ class RightCamera:
         view = self._camera.find(right, frame.time_s) or frame.camera
         right = right if view is None else view.undo(right)
         self._pair = frame.rgb, right
-        hidden = mask_right(self._first, right, self._kind)
+        hidden = mask_right(self._first, right, self._kind, self.stereo.right_tissue())
         if view is not None:
             hidden |= view.outside(tissue.shape)
         moved = self.stereo.step(frame.rgb, right, masked, hidden, frame.flow, frame.confidence)

@@ -99,7 +99,12 @@ def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
     y = torch.arange(height, dtype=now.dtype)[:, None]
     at = torch.stack([(2 * (x + flow[:, 0]) + 1) / width - 1, (2 * (y + flow[:, 1]) + 1) / height - 1], -1)
     picture = F.grid_sample(now, at, mode="bicubic", padding_mode="border", align_corners=False)
-    return picture, image.warp(now, usable, flow)[1]
+    share = F.grid_sample(usable, at, mode="bilinear", padding_mode="zeros", align_corners=False)
+    most = F.max_pool2d(F.pad(usable, (1, 1, 1, 1)), 2, 1)  # of four pixels
+    column = (x + flow[:, 0]).floor().long().clamp(-1, width - 1) + 1
+    row = (y + flow[:, 1]).floor().long().clamp(-1, height - 1) + 1
+    most = torch.stack([one[:, i, j] for one, i, j in zip(most, row, column, strict=True)])
+    return picture, torch.where(share > 0.9 * most, most, torch.zeros_like(most))
 
 
 def derivative(field: Tensor) -> Tensor:
