@@ -1,4 +1,4 @@
-"""Measurements of learning: size of disturbances, scores of controls, cached runs."""
+"""Measurements of learning: scores of controls, cached runs, coarser grids."""
 
 from dataclasses import replace as replace_field
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evidence.datasets import coarser
-from evidence.learn import runs, stability
+from evidence.learn import runs
 from evidence.learn.runs import Run
 from learn.data.clips import Clip, target
 from learn.data.grid import Grid
@@ -47,24 +47,6 @@ def test_a_run_is_cached_by_settings_and_data(
     scores = [score(c, one.astype(np.float32), card) for c, one in zip(clips, truth, strict=True)]
     found = EvaluationReport(scores).summary()
     assert (found["map_rmse"], found["map_r2_pooled"]) == (0, 1)
-
-
-@pytest.mark.parametrize("patch", [0.0, 3.0])
-def test_noise_has_its_size_and_spares_the_rest_frame(clips: list[Clip], patch: float) -> None:
-    noisy = stability.noisy(clips[0], 0.02, patch, GRID, np.random.default_rng(0))
-    added = noisy.displacement["ideal"] - clips[0].displacement["ideal"]
-    assert not added[0].any()
-    inside = added[1:, :, clips[0].mask > 0]
-    assert inside.std() == pytest.approx(0.02, rel=0.1 if patch == 0 else 0.4)
-
-
-def test_a_wrong_scale_multiplies_lengths_about_the_centre(clips: list[Clip]) -> None:
-    zoomed = stability.scaled(clips[2], 1.25)
-    assert zoomed.mask.sum() == pytest.approx(clips[2].mask.sum() * 1.25**2, rel=0.1)
-    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], zoomed)]
-    assert largest[1] == pytest.approx(1.25 * largest[0], rel=0.1)
-    same = stability.scaled(clips[2], 1.0)
-    np.testing.assert_allclose(same.displacement["ideal"], clips[2].displacement["ideal"], atol=1e-6)
 
 
 def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
