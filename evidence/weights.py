@@ -56,8 +56,9 @@ def measure(
     about = {"generator": generator, "seed": seed}
     about["sequences"] = {job: len(some) for job, some in files.items()}
     below: dict[str, str] = {}
-    for part in (segmentation, correction, depth_correction):
-        name, depth = part.WEIGHTS.stem, part is depth_correction
+    parts = {"segmentation": segmentation, "correction": correction, "depth_correction": depth_correction}
+    for name, part in parts.items():
+        depth = part is depth_correction
         settings = {"drawn": drawn, "minutes": minutes} if part is not segmentation else {"steps": steps}
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
@@ -71,7 +72,7 @@ def measure(
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
             training.export(net, made, card | data)
-        weights = folder / "made" / part.WEIGHTS.name
+        weights = folder / "made" / f"{name}.pt"
         weights.parent.mkdir(exist_ok=True)
         for suffix in (".pt", ".json"):
             shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))

@@ -12,7 +12,7 @@ from PIL import Image, JpegImagePlugin
 
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
-from synth.flow.segmentation import SIDE, segment
+from synth.flow.segmentation import segment
 from synth.job.schema import RenderSection, SensorSection
 from synth.render.camera import video_link
 from synth.system import checked_file
@@ -23,7 +23,10 @@ _BITRATES = (0.25, 0.5, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.
 _SAMPLING = ("4:4:4", "4:2:2", "4:2:0")
 _BANDS_PX = ((0.7, 1.4), (2.8, 5.6))
 _BLOCK, _SMOOTHEST = 16, 0.2  # px; noise is measured where such blocks are smoothest
-_GROWN_PX = 1, 3  # around highlights, for colour and for sharpness; in larger pictures more
+_GROWN_PX = 2, 4  # around highlights, for colour and for sharpness
+_CLIPPED = 240.0  # grey levels: two channels above it have no texture left
+_ABOVE = 45.0  # grey levels of a highlight above the local median
+_SHRINK = 4  # factor of downsampling for the local median
 _OUTLINE_PX = 240  # longer side of the downsampled picture in which the cortex is segmented
 _MIDDLE = 0.6  # squared radius of the initial ellipse of cortex, in half sides of the picture
 _BLACK, _BLOODY = 60, 0.42  # grey levels; ratio of green to red (sRGB)
@@ -120,9 +123,8 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     1996). `sharpness`: contrast of the finest octave relative to two octaves coarser, without noise. `rgb`:
     (H, W, 3) sRGB; `usable`: (H, W) tissue; `reach`: width relative to the photograph's.
     """
-    wet, coarse = segment(rgb, rgb).shines.astype(np.uint8), max(1.0, max(rgb.shape) / SIDE)
-    wide = (2 * round(coarse * by) + 1 for by in _GROWN_PX)
-    tissue, clear = (usable & (cv2.dilate(wet, np.ones((by, by))) == 0) for by in wide)
+    wet = find_highlights(rgb).astype(np.uint8)
+    tissue, clear = (usable & (cv2.dilate(wet, np.ones((2 * by + 1,) * 2)) == 0) for by in _GROWN_PX)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     block = cv2.blur(np.abs(cv2.filter2D(grey, -1, _LAPLACIAN)), (_BLOCK, _BLOCK))
     full = cv2.erode(tissue.astype(np.uint8), np.ones((_BLOCK, _BLOCK))) > 0
@@ -140,6 +142,21 @@ def measure(rgb: Pixels, usable: Mask, reach: float = 1.0) -> dict[str, float]:
     slopes, *_ = np.linalg.lstsq(np.column_stack([away, np.ones(len(at)), at / len(at)]), light)
     sharpness = float(np.sqrt(energy[0] / energy[1]))
     return {"noise": float(noise), "sharpness": sharpness, "vignette": -float(slopes[0])}
+
+
+def find_highlights(rgb: Pixels) -> Mask:
+    """Mask (H, W) of the specular highlights of a picture (H, W, 3) sRGB, at its own resolution.
+
+    They are much brighter than the local median in the darkest channel, because they have the colour of the
+    lamp and tissue lacks blue. The segmentation of `synth.flow` sees small pictures, too coarse for this.
+    """
+    darkest, second, _ = np.moveaxis(np.sort(rgb, axis=2), 2, 0)
+    height, width = darkest.shape
+    size = max(1, width // _SHRINK), max(1, height // _SHRINK)
+    small = cv2.resize(darkest, size, interpolation=cv2.INTER_AREA)
+    window = max(3, (max(height, width) // (4 * _SHRINK)) | 1)
+    median = cv2.resize(cv2.medianBlur(small, window), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((darkest > median + _ABOVE) | (second > _CLIPPED))
 
 
 def find_cortex(rgb: Pixels, mm_per_px: float) -> Mask:
