@@ -47,6 +47,14 @@ def fit(
     return load_model(model)
 
 
+def follow(average: torch.nn.Module, net: torch.nn.Module, share: float) -> None:
+    """Moves the mean of weights and of batch statistics by a share towards those of a network."""
+    with torch.no_grad():
+        for mean, now in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(now, share)
+
+
 def export(net: torch.nn.Module, weights: Path, card: Mapping[str, Any]) -> None:
     """Writes the weights of a network at half precision, and next to them its card as JSON."""
     weights.parent.mkdir(parents=True, exist_ok=True)

@@ -63,7 +63,7 @@ def measure(
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
         made = folder / f"{name}-{key}.pt"
-        if not made.exists():
+        if not made.with_suffix(".json").exists():  # written last
             net: torch.nn.Module
             if part is segmentation:
                 frames, checkpoint = [dict(np.load(file)) for file in sequences], made.with_suffix(".ckpt")

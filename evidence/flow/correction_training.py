@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evidence import training
 from evidence.flow import scenes as drawn_scenes
 from evidence.flow.foreign_scenes import photographs_of
 from evidence.flow.scenes import (
@@ -376,9 +377,7 @@ def fit(
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimiser.step()
         steps += 1
-        with torch.no_grad():
-            for mean, now in zip(average.parameters(), net.parameters(), strict=True):
-                mean.lerp_(now, max(0.002, 9 / (steps + 10)))
+        training.follow(average, net, max(0.002, 9 / (steps + 10)))
     return average.eval(), steps
 
 

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from evidence import training
 from evidence.flow import paste
 from evidence.flow.correction_training import draw_motion, draw_texture
 from evidence.flow.foreign_scenes import photographs_of
@@ -188,7 +189,7 @@ def train(
         torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
         optimiser.step()
         schedule.step()
-        _follow(average, net, max(0.001, 1 / (step + 1)))
+        training.follow(average, net, max(0.001, 1 / (step + 1)))
         recent.append(float(loss.detach()))
         if (step + 1) % 100 == 0:
             print(
@@ -200,14 +201,6 @@ def train(
             checkpoint.with_suffix(".part").rename(checkpoint)
     frames = 2 * sum(len(one["rgb"]) for one in sequences)
     return average.eval(), {"frames": frames, "steps": steps}
-
-
-def _follow(average: torch.nn.Module, net: torch.nn.Module, share: float) -> None:
-    """Moves the mean of weights and of batch statistics by a share towards those of a network."""
-    with torch.no_grad():
-        for mean, now in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
-            if mean.is_floating_point():
-                mean.lerp_(now, share)
 
 
 def _loss(logits: Tensor, classes: Tensor, weights: Tensor) -> Tensor:

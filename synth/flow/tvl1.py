@@ -56,7 +56,7 @@ class TVL1Settings:
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
     bending_px: float = (
-        8.0  # on the finest level smoothness is of the flow less its mean over this; 0: of all
+        8.0  # finest level: smoothness is of the flow less its mean over this; 0: of all of it
     )
     steady_px: float = 0.1  # the final flow is smoothed where that changes it by less: noise, not a step
     steep: float = 0.1  # gradient of the initial flow at which lambda doubles [px/px]
