@@ -7,17 +7,30 @@ import cv2
 import numpy as np
 
 from evidence.flow.scenes import Pair
-from synth.arrays import Array, Map
+from synth.arrays import Array, Map, Mask
 from synth.flow.estimator import Estimator
 from synth.flow.segmentation import segment
 
 Errors = dict[str, float]
+_JACCARD_PX = 2, 4, 8, 16, 32
 _SIGMA = 1.0  # px: divergence is compared after this Gaussian, on both sides
 
 
 def epe(flow: Map, truth: Map) -> Map:
     """Endpoint error, (H, W) px (Baker et al., IJCV 2011)."""
     return np.asarray(np.linalg.norm(flow - truth, axis=-1), np.float32)
+
+
+def average_jaccard(error: Map, found: Mask, visible: Mask) -> float:
+    """Average Jaccard of tracked points (C. Doersch et al., TAP-Vid, NeurIPS 2022) at STIR's thresholds.
+
+    `error`: endpoint error [px] of any shape; `found`, `visible`: whether points are tracked and visible.
+    """
+    shares = []
+    for threshold in _JACCARD_PX:
+        right = found & visible & (error < threshold)
+        shares.append(right.sum() / max(1, np.count_nonzero(visible) + np.count_nonzero(found & ~right)))
+    return float(np.mean(shares))
 
 
 def divergence(flow: Map) -> Map:

@@ -37,7 +37,7 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     ours = {
         "warps 2": replace(s, warps=2),
         "cold (default)": s,
-        "warps 8": replace(s, warps=8),
+        "warps 6, steps 16": replace(s, warps=6, steps=16, coarse_warps=6),
         "no gradient": replace(s, gradient=0.0),
         "no median": replace(s, median=False),
         "Huber 0.03": replace(s, huber=0.03),
@@ -46,7 +46,7 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
         "one lambda": replace(s, noise=0.0, steep=0.0),
         "no membrane": replace(s, hidden_huber=0.0),
     }
-    warm = {"warm 3 warps": replace(s, warps=3), "warm (default)": s}
+    warm = {"warm 2 warps": replace(s, warps=2), "warm (default)": s}
     theirs = {f"lambda {w:g}, {n} warps": OpenCvTvl1(w, n) for w in (0.06, 0.1, 0.2) for n in (2, 3, 6)}
     return [
         *(("tvl1", label, Tvl1(setting), None) for label, setting in ours.items()),

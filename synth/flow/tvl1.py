@@ -51,8 +51,8 @@ class TVL1Settings:
     hidden_huber: float = 0.3  # added to h where nothing is visible: the flow has no steps there
     epsilon: float = 0.01  # residuals below it count quadratically [local std]
     coarsest_px: int = 12  # shorter side of the coarsest level, about
-    warps: int = 6  # linearisations per level
-    steps: int = 16  # primal-dual steps per warp
+    warps: int = 4  # linearisations per level
+    steps: int = 24  # primal-dual steps per warp
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
     bending_px: float = (
@@ -64,7 +64,7 @@ class TVL1Settings:
     large_motion_weight: float = 2.5  # lambda of the first stage: smoothness would hold large motion back
     small_motion_weight: float = 1.0  # lambda of its alternative, used unless the first agrees clearly better
     coarse_tau: float = 1.0  # primal step of the first stage: small, because coarse levels may diverge
-    coarse_warps: int = 6  # linearisations per level of the first stage, which omits the finest level
+    coarse_warps: int = 4  # linearisations per level of the first stage, which omits the finest level
 
     def first_stage(self, weight: float) -> TVL1Settings:
         """Settings of the first stage of a cold start."""

@@ -163,11 +163,11 @@ def test_a_diverged_flow_samples_at_the_border() -> None:
     assert torch.isfinite(tvl1.solve([level], flow, TVL1Settings(warps=1, median=False))).all()
 
 
-def _described(mirrored: bool) -> np.ndarray:
-    """Features of a texture that moved by (0.4, -0.25) px, with a flow of (0, 0)."""
+def _described(mirrored: bool, x: float = 0.4, y: float = -0.25) -> np.ndarray:
+    """Features of a texture that moved by (x, y) px, with a flow of (0, 0)."""
     rng = np.random.default_rng(3)
     coloured = np.stack([128 + 30 * noise_field((104, 88), 12, rng) for _ in range(3)], -1)
-    shift = np.float32([[1, 0, 0.4], [0, 1, -0.25]])
+    shift = np.float32([[1, 0, x], [0, 1, y]])
     moved = cv2.warpAffine(coloured, shift, (88, 104), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     pictures = np.clip([coloured, moved], 0, 255).astype(np.uint8)
     rest, now = np.ascontiguousarray(pictures[:, :, :: -1 if mirrored else 1])
@@ -185,6 +185,23 @@ def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -
     signs = np.ones((correction.CHANNELS, 1, 1))
     signs[[x for x, _ in correction.VECTORS]] = -1
     np.testing.assert_allclose(signs * mirrored[..., ::-1], features, atol=0.02)
+
+
+def test_a_sure_correction_is_ignored_where_pictures_agree_and_used_where_nothing_is_visible(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wrong = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
+    monkeypatch.setattr(correction, "predict", lambda net, features: wrong)
+    features, still = _described(mirrored=False, x=0, y=0), np.zeros((104, 88, 2), np.float32)
+    net = correction.CorrectionNet()
+    flow, deviation = correction.correct(net, features, still)
+    assert np.abs(flow).max() < 0.02
+    hidden = features.copy()
+    hidden[correction.FEATURES.index("visible in both")] = 0
+    flow, _ = correction.correct(net, hidden, still)
+    variance = np.exp(-5)
+    np.testing.assert_allclose(flow, 0.5 * 0.25 / (0.25 + variance), rtol=1e-4)
+    np.testing.assert_allclose(deviation, np.sqrt(variance), rtol=0.02)
 
 
 def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None:
