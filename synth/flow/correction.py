@@ -47,7 +47,7 @@ _MULTIPLE = 8  # cells: the levels of the network need multiples of it on both s
 _WIDTHS = 20, 32, 48
 _LEAST = 0.02  # added to squared gradients per pixel, so that steps of windows without contrast vanish
 _FARTHEST_PX = 2.0  # limit of a linearised step
-_CORRELATED = 20.0  # pixels for one independent residual: chosen between waves (10) and rendered scenes (100)
+_CORRELATED = 5.0  # pixels for one independent residual: from 3 to 20, no set of pictures is made worse
 _LEAST_RESIDUAL = 1e-3  # mean square, in squared local deviations
 _OFFSET = np.float32(8)  # grey levels added before ratios are taken: the black of a sensor is not zero
 _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
@@ -99,9 +99,8 @@ def load(path: Path, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
 def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
     """The corrected flow (H, W, 2) px, and the standard deviation (H, W) px of a component.
 
-    What the network adds is shrunk where it isn't sure (Wiener), and counts as a prior: the posterior mean
-    with the remaining step of Lucas and Kanade is added, so that textured tissue is left as the pictures
-    show it. The network's deviation stays.
+    What the network adds is shrunk where it isn't sure (Wiener), and where the pictures determine the flow
+    better than the network does: textured tissue needs no correction.
 
     `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px.
     """
@@ -113,25 +112,23 @@ def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
     signal = (missing * missing).mean(axis=0)
     share = signal / (signal + variance)
     deviation = np.sqrt(variance + ((1 - share) ** 2) * signal)
-    step, information = _measured(features)
-    data = variance * information / (1 + variance * information)
-    added = (1 - data) * share * missing + data * step
-    planes = np.concatenate([added, deviation[None]]).transpose(1, 2, 0)
+    added = share * missing / (1 + variance * _information(features))
+    planes = np.dstack([*added, deviation])
     wide = cv2.resize(planes, (CELL * planes.shape[1], CELL * planes.shape[0]))[:height, :width]
     return flow + wide[..., :2], wide[..., 2]
 
 
-def _measured(features: Map) -> tuple[Map, Map]:
-    """Lucas and Kanade's step (2, h, w) px over the larger window, and its information (h, w) [1/px^2].
+def _information(features: Map) -> Map:
+    """Inverse of the Cramér-Rao bound [1/px^2] of a displacement over the larger window, (h, w).
 
-    The information is that of the direction with the least contrast, 1 / (Cramér-Rao bound): the sum of
-    squared gradients over the residual's mean square, which light and shading correlate between pixels.
+    For the direction with the least contrast: the sum of squared gradients over the residual's mean square,
+    which light and shading correlate between pixels.
     """
-    side, first = _WINDOWS[-1], FEATURES.index(f"grey {_WINDOWS[-1]} x")
-    contrast = _LEAST * np.exp(2 * features[first + 2])  # `_steps` gives half a logarithm
+    side = _WINDOWS[-1]
+    contrast = _LEAST * np.exp(2 * features[FEATURES.index(f"grey {side} known")])  # see `_steps`
     residual = cv2.blur(np.maximum(features[FEATURES.index("residual")], _LEAST_RESIDUAL), (side, side))
     count = (CELL * side) ** 2 / _CORRELATED * features[FEATURES.index("visible in both")]
-    return features[first : first + 2], contrast * count / residual
+    return np.asarray(contrast * count / residual)
 
 
 def predict(net: CorrectionNet, features: Map) -> Map:
