@@ -39,7 +39,7 @@ def measure(
     randomized: int = 75,
     mission: int = 60,
     drawn: int = 600,
-    steps: int = 14000,
+    steps: int = 29000,
     minutes: float = 40.0,
     seed: int = 0,
 ) -> None:

@@ -6,6 +6,7 @@ import copy
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from synth.flow.segmentation import CLASSES
 _SIZE = 224, 160  # px of examples, width and height
 _PHOTOGRAPH = 384  # px, side of photographs
 _BATCH, _RATE = 12, 4e-3
+_NEW, _KEPT = 4, 48  # examples drawn anew for a batch, and the latest of which it is chosen: drawing is dear
 _PASTED, _PLAIN, _REST = 0.55, 0.35, 0.4  # chances: of drawn objects, of no render, of objects at rest
 _FAR = 0.3  # weight of what is neither tissue nor instrument
 _SHADED = 0.5  # share of the light taken at which a pixel is all shadow
@@ -158,8 +160,22 @@ class _Batches(Dataset[Any]):
         return len(self.numbers)
 
     def __getitem__(self, k: int) -> tuple[Tensor, Tensor, Tensor]:
-        rng = np.random.default_rng([self.seed, self.numbers[k]])
-        return batch([example(self.sequences, self.photographs, rng) for _ in range(_BATCH)])
+        number = self.numbers[k]
+        rng = np.random.default_rng([self.seed, number])
+        latest = _NEW * number + _NEW - rng.permutation(_KEPT)[:_BATCH]
+        return batch([_mirrored(self._example(max(0, int(one))), rng) for one in latest])
+
+    @lru_cache(_KEPT)  # noqa: B019 (it lives as long as the training)
+    def _example(self, number: int) -> Example:
+        rng = np.random.default_rng([self.seed, 1, number])
+        return example(self.sequences, self.photographs, rng)
+
+
+def _mirrored(one: Example, rng: np.random.Generator) -> Example:
+    """An example with its axes perhaps mirrored and its colour channels in another order."""
+    order, down, across = rng.permutation(3), *rng.choice([-1, 1], 2)
+    planes: list[Any] = [plane[::down, ::across] for plane in one]
+    return *(np.ascontiguousarray(p[..., order]) for p in planes[:2]), *(p.copy() for p in planes[2:])
 
 
 def train(
@@ -168,7 +184,7 @@ def train(
     """A network trained for some steps, and its data in numbers; it continues from a checkpoint."""
     cv2.setNumThreads(0)  # its threads would not survive the fork of the process that draws batches
     torch.manual_seed(seed)
-    net = segmentation.SegmentationNet()
+    net = segmentation.SegmentationNet().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps, pct_start=0.1)

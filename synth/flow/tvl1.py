@@ -53,6 +53,9 @@ class TVL1Settings:
     coarsest_px: int = 12  # shorter side of the coarsest level, about
     warps: int = 4  # linearisations per level
     steps: int = 24  # primal-dual steps per warp
+    settled_px: float = (
+        0.01  # root mean square change by a warp below which a level's other warps are omitted
+    )
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
     bending_px: float = (
@@ -199,6 +202,7 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
     mask, spare = np.empty((2, *rest.shape), np.float32)
     lambda_ = here = np.ascontiguousarray(np.broadcast_to(weight[0, 0].numpy(), rest.shape))
     state = new_state(*rest.shape)
+    mean: Map | np.float32
 
     def differentiate(planes: Map) -> None:
         """Writes d_x, d_y, d_xx, d_xy, d_yy of the first plane to the others."""
@@ -215,14 +219,19 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
             here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
-        whole, mean = torch.from_numpy(found)[None], None
+        last, mean = found, _ZERO
         if bending_px > 0:
-            found -= (mean := image.doubled(image.window(whole, bending_px), whole)[0].numpy())
+            whole = torch.from_numpy(last)[None]
+            mean = image.doubled(image.window(whole, bending_px), whole)[0].numpy()
+        found = last - mean
         linearise(before, after, mask, here, found, numbers, state)
         primal_dual(found, state, np.float32(s.tau), s.steps)
         if s.median:
             found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
-        found = found if mean is None else found + mean
+        found = found + mean
+        change = (found - last) * mask
+        if np.vdot(change, change) < s.settled_px**2 * mask.sum():
+            break
     return torch.from_numpy(found)[None]
 
 

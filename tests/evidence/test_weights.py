@@ -27,10 +27,7 @@ def test_weights_are_made_from_nothing_and_cards_name_those_below(
     first = hashlib.sha256((tmp_path / "work/made/segmentation.pt").read_bytes()).hexdigest()
     assert first.startswith(cards["depth_correction"]["below"]["segmentation"])
     assert set(cards["depth_correction"]["below"]) == {"segmentation", "correction"}
-    for module, name in (
-        (weights, "_rendered"),
-        (segmentation_training, "train"),
-        (correction_training, "train"),
-    ):
+    makers = (weights, "_rendered"), (segmentation_training, "train"), (correction_training, "train")
+    for module, name in makers:
         monkeypatch.setattr(module, name, Mock(side_effect=AssertionError("made again")))
     weights.measure(tmp_path / "work", **how)
