@@ -8,7 +8,7 @@ from synth.errors import UserError
 
 STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 """Of a sequence store, a dataset's `dataset.json`, a model's `config.json`, a recording's `score.json`."""
-MOTION = 3
+MOTION = 4
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
 MOTION_WEIGHTS = Path(__file__).with_name("flow")  # folder of the networks on which motion depends
@@ -17,7 +17,7 @@ FIRST = 2  # written by 0.2, the first release: nothing older is read
 
 @cache
 def motion_version() -> str:
-    """Version of recovered motion, `MOTION` and a digest of the weights below it: `3-0a1b2c3d`."""
+    """Version of recovered motion, `MOTION` and a digest of the weights below it: `4-0a1b2c3d`."""
     weights = b"".join(file.read_bytes() for file in sorted(MOTION_WEIGHTS.rglob("*.pt")))
     return f"{MOTION}-{hashlib.blake2b(weights, digest_size=4).hexdigest()}"
 

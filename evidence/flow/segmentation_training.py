@@ -29,7 +29,7 @@ from synth.flow.segmentation import CLASSES
 _SIZE = 224, 160  # px of examples, width and height
 _PHOTOGRAPH = 384  # px, side of photographs
 _BATCH, _RATE = 12, 4e-3
-_NEW, _KEPT = 4, 48  # examples drawn anew for a batch, and the latest of which it is chosen: drawing is dear
+_NEW, _LATEST = 4, 48  # new examples per batch; a batch is chosen from the latest, because drawing is slow
 _PASTED, _PLAIN, _REST = 0.55, 0.35, 0.4  # chances: of drawn objects, of no render, of objects at rest
 _FAR = 0.3  # weight of what is neither tissue nor instrument
 _SHADED = 0.5  # share of the light taken at which a pixel is all shadow
@@ -162,10 +162,10 @@ class _Batches(Dataset[Any]):
     def __getitem__(self, k: int) -> tuple[Tensor, Tensor, Tensor]:
         number = self.numbers[k]
         rng = np.random.default_rng([self.seed, number])
-        latest = _NEW * number + _NEW - rng.permutation(_KEPT)[:_BATCH]
-        return batch([_mirrored(self._example(max(0, int(one))), rng) for one in latest])
+        chosen = _NEW * number + rng.permutation(_LATEST)[:_BATCH]
+        return batch([_mirrored(self._example(int(one)), rng) for one in chosen])
 
-    @lru_cache(_KEPT)  # noqa: B019 (it lives as long as the training)
+    @lru_cache(2 * _LATEST)  # noqa: B019 (it lives as long as the training)
     def _example(self, number: int) -> Example:
         rng = np.random.default_rng([self.seed, 1, number])
         return example(self.sequences, self.photographs, rng)

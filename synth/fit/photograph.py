@@ -27,6 +27,7 @@ _GROWN_PX = 2, 4  # around highlights, for colour and for sharpness
 _CLIPPED = 240.0  # grey levels: two channels above it have no texture left
 _ABOVE = 45.0  # grey levels of a highlight above the local median
 _SHRINK = 4  # factor of downsampling for the local median
+_STEEL = 0.3  # probability of an instrument from which a pixel is left out: tissue left out costs little
 _OUTLINE_PX = 240  # longer side of the downsampled picture in which the cortex is segmented
 _MIDDLE = 0.6  # squared radius of the initial ellipse of cortex, in half sides of the picture
 _BLACK, _BLOODY = 60, 0.42  # grey levels; ratio of green to red (sRGB)
@@ -170,7 +171,7 @@ def find_cortex(rgb: Pixels, mm_per_px: float) -> Mask:
     red, green, blue = np.moveaxis(small.astype(np.float32), 2, 0)
     wide = (max(3, round(_VESSEL_MM / mm_per_px * scale)),) * 2
     bloody = cv2.blur((green < _BLOODY * red).astype(np.float32), wide) > 0.9
-    steel = cv2.resize(segment(rgb, rgb).instrument, small.shape[1::-1]) > 0.5
+    steel = cv2.resize(segment(rgb, rgb).instrument, small.shape[1::-1]) > _STEEL
     y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in small.shape[:2]), indexing="ij")
     label = np.where(x**2 + y**2 < _MIDDLE, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     label[(small.max(axis=2) < _BLACK) | (blue > 1.1 * red) | bloody | steel] = cv2.GC_BGD

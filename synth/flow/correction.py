@@ -120,13 +120,17 @@ def _information(features: Map) -> Map:
     """Inverse of the Cramér-Rao bound [1/px^2] of a displacement over the larger window, (h, w).
 
     For the direction with the least contrast: the sum of squared gradients over the residual's mean square.
-    Light and shading change whole cells, so that a cell counts as one observation. With half to three times
-    as many, no set of pictures is made worse.
+    Light and shading change whole cells, so that each cell counts as one observation. With half to three
+    times as many the mean error rises on no set of pictures.
     """
     side = _WINDOWS[-1]
-    contrast = _LEAST * np.expm1(2 * features[FEATURES.index(f"grey {side} known")])  # see `_steps`
-    residual = cv2.blur(np.maximum(features[FEATURES.index("residual")], _LEAST_RESIDUAL), (side, side))
-    return np.asarray(contrast * side**2 * features[FEATURES.index("visible in both")] / residual)
+    known, left, seen = (
+        features[FEATURES.index(name)] for name in (f"grey {side} known", "residual", "visible in both")
+    )
+    contrast = _LEAST * np.expm1(2 * known)  # see `_steps`
+    area = np.maximum(cv2.blur(seen, (side, side)), 1e-6)
+    residual = cv2.blur(seen * np.maximum(left, _LEAST_RESIDUAL), (side, side)) / area
+    return np.asarray(seen * contrast * side**2 * area / np.maximum(residual, _LEAST_RESIDUAL))
 
 
 def predict(net: CorrectionNet, features: Map) -> Map:

@@ -37,7 +37,7 @@ def name_backend(backend: str | Estimator) -> str:
 
 
 def name_motion(backend: str | Estimator) -> str:
-    """Estimator and version of motion that is recovered now, `tvl1 2-0a1b2c3d`, as models' cards hold it."""
+    """Estimator and version of motion that is recovered now, `tvl1 4-0a1b2c3d`, as models' cards hold it."""
     return f"{name_backend(backend)} {motion_version()}"
 
 

@@ -53,9 +53,7 @@ class TVL1Settings:
     coarsest_px: int = 12  # shorter side of the coarsest level, about
     warps: int = 4  # linearisations per level
     steps: int = 24  # primal-dual steps per warp
-    settled_px: float = (
-        0.01  # root mean square change by a warp below which a level's other warps are omitted
-    )
+    settled_px: float = 0.01  # RMS change of the visible by a warp that ends a level [px of the level]
     tau: float = 3.5  # primal step; the dual step is 1/(8 tau)
     median: bool = True  # 3x3 median after each warp (Wedel et al., An improved algorithm for TV-L1, 2009)
     bending_px: float = (
@@ -229,8 +227,8 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
         if s.median:
             found = np.stack([cv2.medianBlur(plane, 3) for plane in found])
         found = found + mean
-        change = (found - last) * mask
-        if np.vdot(change, change) < s.settled_px**2 * mask.sum():
+        change = found - last
+        if (mask * change**2).sum() < s.settled_px**2 * mask.sum():
             break
     return torch.from_numpy(found)[None]
 
