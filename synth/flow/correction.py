@@ -124,13 +124,13 @@ def _information(features: Map) -> Map:
     times as many the mean error rises on no set of pictures.
     """
     side = _WINDOWS[-1]
-    known, left, seen = (
+    known, left, visible = (
         features[FEATURES.index(name)] for name in (f"grey {side} known", "residual", "visible in both")
     )
     contrast = _LEAST * np.expm1(2 * known)  # see `_steps`
-    area = np.maximum(cv2.blur(seen, (side, side)), 1e-6)
-    residual = cv2.blur(seen * np.maximum(left, _LEAST_RESIDUAL), (side, side)) / area
-    return np.asarray(seen * contrast * side**2 * area / np.maximum(residual, _LEAST_RESIDUAL))
+    area = np.maximum(cv2.blur(visible, (side, side)), 1e-6)
+    residual = cv2.blur(visible * np.maximum(left, _LEAST_RESIDUAL), (side, side)) / area
+    return np.asarray(visible * contrast * side**2 * area / np.maximum(residual, _LEAST_RESIDUAL))
 
 
 def predict(net: CorrectionNet, features: Map) -> Map:
