@@ -32,14 +32,13 @@ def measure(out: Path = report.RESULTS / "gpu", only: str = "", limit_s: float =
 def steps(out: Path) -> Mapping[str, Sequence[str]]:
     """Steps in order: first correctness, then speed."""
     data, model, cuda = str(out / "data"), str(out / "model"), "cuda"
-    training = ("learn", "train", data, "-o", model, "--accelerator", cuda, "--input", "mixed")
     found = {
         "doctor": ("synth", "doctor"),
         "variants agree": ("pytest", "-q", "tests/synth/render/test_scene.py"),
         "networks": ("evidence", "learn.pareto", "--device", cuda, "--out", str(out / "learn")),
         "dataset": ("synth", "render", "demo", "-o", data, "render.variant=cuda_ad_rgb"),
         "verify": ("synth", "verify", data),
-        "training": training,
+        "training": ("learn", "train", data, "-o", model, "--accelerator", cuda, "--input", "mixed"),
     }
     return {name: ("-m", *words) for name, words in found.items()}
 

@@ -7,8 +7,7 @@ import numpy as np
 from learn.evaluation.statistics import interval
 from synth.arrays import Floats
 
-Values = Sequence[float | None] | Floats
-"""One of each sequence; None or NaN: left out."""
+Values = Sequence[float | None] | Floats  # one of each sequence; None or NaN: left out
 
 
 def mean_of(values: Values, seed: int = 0) -> list[float]:

@@ -8,10 +8,8 @@ from pathlib import Path
 from evidence import report
 from synth.errors import UserError
 
-PRETRAINED = {1: "mono", 2: "stereo"}
-"""Pretrained model by number of cameras."""
-FOLDERS = {1: "monocular", 2: "stereo"}
-"""Folder of the results by number of cameras."""
+PRETRAINED = {1: "mono", 2: "stereo"}  # model by number of cameras
+FOLDERS = {1: "monocular", 2: "stereo"}  # of the results, likewise
 _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers, which the page counts
 
 

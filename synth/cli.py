@@ -198,6 +198,8 @@ def render(
         print(f"{summary.already + summary.done} of {summary.total} sequences in {out}")
         for index, reason in summary.failed.items():
             print(f"  {index:06d} failed: {reason}", file=sys.stderr)
+        if summary.failed:
+            print(f"  their logs are in {Folder(out).logs}", file=sys.stderr)
     if not summary.already and read.card.authors == type(read.card)().authors:  # in the first run only
         licence = f"its licence is {read.card.licence}" if read.card.licence else "it has no licence"
         print(

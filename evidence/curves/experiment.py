@@ -32,15 +32,13 @@ Estimate = Callable[[Clip], Floats]  # clip → force (T, 3) mN, camera axes
 
 RIDGE = "ridge"
 NETWORKS = {"d2fnet-s": {"width": 16, "stem": 4, "levels": 3, "dropout": 0.0}}
-SOURCES = {1: "recovered", 2: "motion"}
-"""Displacement for fitting and testing, by number of cameras."""
+SOURCES = {1: "recovered", 2: "motion"}  # displacement for fitting and testing, by number of cameras
 GRID = Grid(64)
 _COMPONENTS = 200  # principal components of displacement
 _BASIS = 150  # sequences that they are found on
 _BATCH, _LEAST, _MOST = 16, 4, 80  # frames a batch, epochs
 SAME = "in distribution"  # tested sequences of the dataset that estimators are fitted on
-Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]
-"""By name: clips, and whether each lacks a membrane."""
+Tests = Mapping[str, tuple[Sequence[Clip], Sequence[bool]]]  # clips, and whether each lacks a membrane
 _PARTS = {"whole": "Error of the force", "along": "Its part along the line of sight"}
 _NAMES = {1: "monocular", 2: "stereo"}
 

@@ -6,7 +6,7 @@ they look like matters less than that they are of every shape, colour and sharpn
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -91,6 +91,22 @@ def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
     return _finish(parts, rng, picture, other)
 
 
+def draw_marking(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+    """A random line, grid or patch of the tissue that looks like an object but moves with the tissue."""
+    turn, wide = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(np.log(0.006), np.log(0.08))))
+    way, side = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    kind, middle = rng.choice(["line", "grid", "patch"]), rng.uniform(0, 1, 2) * [1, 0.75]
+    t = np.linspace(-1.5, 1.5, 40)[:, None] if rng.random() < 0.7 else np.linspace(-0.3, 0.2, 20)[:, None]
+    bend = rng.normal(0, 0.06) * np.sin(rng.uniform(2, 12) * t + rng.uniform(0, 6))
+    gap = rng.uniform(2, 8) * wide
+    steps = gap * np.arange(-min(15, 0.5 / gap), min(15, 0.5 / gap)) if kind == "grid" else np.zeros(1)
+    parts = [("line", middle + t * way + (bend + step) * side, wide) for step in steps]
+    if kind == "grid" and rng.random() < 0.5:
+        parts += [("line", middle + t * side + (bend + step) * way, wide) for step in steps]
+    thing = draw_object(rng, picture, other) if kind == "patch" else _finish(parts, rng, picture, other)
+    return replace(thing, shades=()) if rng.random() < 0.7 else thing
+
+
 def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:
     """A layer with an object moved by `shift` (2,) picture widths, and its shadows."""
     body = _cover(thing, shift, layer.instrument.shape)
@@ -119,8 +135,13 @@ def add_highlights(layer: Layer, rng: np.random.Generator) -> Layer:
     shape = layer.instrument.shape
     period = float(np.exp(rng.uniform(np.log(6), np.log(40))))
     wet = noise_field(shape, period, rng) + noise_field(shape, 70, rng)
-    level, edge = np.quantile(wet, 1 - rng.uniform(0.003, 0.06)), rng.uniform(0.08, 0.4)
-    strength = np.clip((wet - level) / edge + 0.5, 0, 1) * (1 - layer.instrument)
+    share, edge = np.exp(rng.uniform(np.log(0.0005), np.log(0.06))), np.exp(rng.uniform(np.log(0.08), 0.0))
+    strength = np.clip((wet - np.quantile(wet, 1 - share)) / edge + 0.5, 0, 1)
+    if rng.random() < 0.5:  # single round ones
+        across, centre = np.exp(rng.uniform(0.5, 2.3, (4, 1, 1))), rng.uniform(0, 1, (4, 2, 1, 1))
+        away = np.indices(shape) - centre * np.reshape(shape, (2, 1, 1))
+        strength = np.exp(-(away**2).sum(1) / (2 * across**2))[: rng.integers(1, 5)].max(0)
+    strength = strength * (1 - layer.instrument)
     white = rng.uniform(225, 275) * (1 + rng.normal(0, 0.03, 3))
     lit = layer.picture + strength[..., None] * np.maximum(white - layer.picture, 0)
     found = np.maximum(layer.highlight, np.clip(2 * strength, 0, 1))

@@ -17,16 +17,13 @@ from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
 from evidence import report
-from evidence.flow.scenes import inverse
-from evidence.scoring.cost import texture
+from evidence.flow.scenes import cortex, inverse
 from evidence.study import Study
 from synth.arrays import Floats
 from synth.recording_flow.decode import RecordingFlowSettings
 
-YOUNG_KPA = 3.0
-_CONTACT_MM = 4.0
-_RADIUS_MM = 12.0
-_FPS = 10.0
+YOUNG_KPA, _FPS = 3.0, 10.0
+_CONTACT_MM, _RADIUS_MM = 4.0, 12.0
 _TARGET = 1.3  # error after removal relative to that on still tissue
 _HEART, _BREATH = (0.4, 1.2), (0.25, 0.25)  # mm, Hz
 
@@ -105,7 +102,7 @@ def record(
     `pulse`: factor on the pulse, 0: still tissue; `remove`: whether meta.yaml requests its removal.
     """
     (folder / "frames").mkdir(parents=True)
-    rest = texture(size, size, rng)
+    rest = 255 * cortex(size, rng)
     y, x = np.mgrid[:size, :size].astype(np.float32)
     times, force = contact["time_s"], contact["force_mn"]
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size
@@ -143,26 +140,27 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     for (name,), own in report.grouped(tree["rows"], "method").items():
         mae = {w: np.array([row[f"{w}_mn"] for row in own]) for w in ("still", "pulse", "removed")}
         left, off = (mae[what] / mae["still"] for what in ("pulse", "removed"))
-        cells = {f"{what} [mN]": f"{values.mean():.2f}" for what, values in mae.items()}
-        times = {"pulse / still": f"{left.max():.2f}", "removed / still": f"{off.max():.2f}"}
-        rows.append({"method": name} | cells | times)
+        row = {"method": name} | {f"{what} [mN]": f"{values.mean():.2f}" for what, values in mae.items()}
+        rows.append(row | {"pulse / still": f"{left.max():.2f}", "removed / still": f"{off.max():.2f}"})
         worst = max(worst, float(off.max()))
         bars.append(report.Row(name, float(np.median(off)), (float(off.min()), float(off.max()))))
-    waves = [
-        f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz"
-        for row in tree["rows"]
-        for one in row.get("found", ())
-    ]
+    waves = [one for row in tree["rows"] for one in row.get("found", ())]
+    shown = ", ".join(f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz" for one in waves)
     on_still = sum(len(row.get("found_on_still", ())) for row in tree["rows"])
-    title = "Error with the pulse removed, relative to still tissue"
     return report.Page(
         "Pulse removal",
         tree,
-        [report.Chart(title, "error / error on still tissue", tuple(bars))],
+        [
+            report.Chart(
+                "Error with the pulse removed, relative to still tissue",
+                "error / error on still tissue",
+                tuple(bars),
+            )
+        ],
         (report.Section("", rows),),
         (
             f"**With the pulse removed, the error of a method is at most {worst:.2f} times its error on "
-            f"still tissue (target: {_TARGET:g}).** Detected, by recording: {', '.join(waves)}; on still "
+            f"still tissue (target: {_TARGET:g}).** Detected, by recording: {shown}; on still "
             f"tissue {on_still or 'nothing'}.",
             f"{tree['count']} recordings of {tree['seconds']:g} s, {tree['size']} px: FEM contacts of 15 to "
             f"40 mN on linear tissue. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz, breath {_BREATH[0]:g} mm "

@@ -27,8 +27,9 @@ CLASSES = "instrument", "shadow", "highlight"
 SIDE = 256  # px, longest side of the pictures in which classes are predicted: what it learnt is of one scale
 _BLOCK = 4  # px: the finest level holds blocks of as many pixels in its channels
 _MULTIPLE = 8 * _BLOCK  # px: the levels of the network need multiples of it on both sides
-_WIDTHS = 20, 40, 80, 112
-_HIDDEN = 0.5  # probability above which a pixel counts as hidden
+_WIDTHS = 32, 48, 80, 104
+_FOUND = 0.5  # probability above which a class is taken to be there
+_HIDING = 0.9  # and above which an instrument is taken to hide tissue, whose motion would be lost (design.md)
 
 
 class SegmentationNet(nn.Module):
@@ -77,17 +78,17 @@ class Segmentation:
     @property
     def objects(self) -> Mask:
         """(H, W) instruments and other objects."""
-        return np.asarray(self.instrument > _HIDDEN)
+        return np.asarray(self.instrument > _FOUND)
 
     @property
     def hidden(self) -> Mask:
         """(H, W) where an object or a highlight hides the tissue, and a pixel around."""
-        return _grown(np.maximum(self.instrument, self.highlight) > _HIDDEN)
+        return _grown((self.instrument > _HIDING) | (self.highlight > _FOUND))
 
     @property
     def shines(self) -> Mask:
         """(H, W) highlights and a pixel around."""
-        return _grown(self.highlight > _HIDDEN)
+        return _grown(self.highlight > _FOUND)
 
 
 def segment(rest: Pixels, frame: Pixels) -> Segmentation:

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from evidence.flow import foreign
+from evidence.flow import foreign, segmentation_training
 from evidence.flow.foreign_scenes import Recipe, recipes, video
 from evidence.flow.measure import divergence, errors
 from evidence.flow.scenes import CLEAN, Pair, inverse, pairs, pixels, pull_field
 from evidence.flow.scenes import Recipe as Pull
 from evidence.flow.stereo import figures
+from synth.flow import segmentation
 
 
 def known(flow: np.ndarray, hidden: np.ndarray, contact: np.ndarray) -> Pair:
@@ -69,11 +70,22 @@ def test_video_agrees_with_its_flow() -> None:
 
 @pytest.mark.slow
 def test_detected_masks_help_on_average_of_the_tuning_half() -> None:
-    """With few frames."""
-    rows = [foreign.judge(one, 160, 8) for one in recipes("tuning", 12)]
-    found = {row["what"]: row["measured"] for row in foreign.summarise(rows)}
+    rows = foreign.summarise([foreign.judge(one, 160, 8) for one in recipes("tuning", 12)])
+    found = {row["what"]: row["measured"] for row in rows}
     assert found["EPE / that without masks"] < 0.95
     assert found["largest share of unobstructed tissue masked"] < 0.2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frame, rest = rng.integers(0, 256, (2, 160, 224, 3), np.uint8)
+    bright = np.float32(frame.sum(-1, keepdims=True) > 400).repeat(3, -1)
+    one = segmentation_training.packed((frame, rest, bright, 1 - bright))[None]
+    inputs, classes, weights = segmentation_training.batch(one, rng)
+    assert np.allclose(np.sort(inputs.ravel()), np.sort(segmentation.prepare(frame, rest).ravel()), atol=1e-5)
+    light = inputs[0, :3].sum(0)
+    assert light[classes[0, 0] == 1].min() > light[weights[0, 0] == 1].max()
 
 
 def test_errors_bias_and_z_scores_of_stereo_are_those_put_in() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from synth.dataset import store
 
 
-def edit_attributes(path: Path, *, reseal: bool = True, **changes: Any) -> None:
+def edit_attributes(path: Path, reseal: bool = True, **changes: Any) -> None:
     """Changes attributes of a sealed store; with `reseal` its hashes are valid if they can be computed."""
     metadata = json.loads((path / "zarr.json").read_text())
     attrs = metadata["attributes"]

@@ -87,6 +87,13 @@ def test_what_had_nothing_to_check_is_not_counted_as_good(tmp_path: Path) -> Non
     assert all(name in report.as_dict()["verdict"] for name in empty)
 
 
+def test_a_dataset_without_a_finished_sequence_is_not_good(tmp_path: Path) -> None:
+    with claim(tmp_path / "out", JOB.model_copy(update={"sequences": 1})) as folder:
+        folder.mark_failed({"index": 0, "reason": "refused"})
+        index.write_index(folder)
+    assert failing(tmp_path / "out") == {"readable"}
+
+
 def no_number(root: Path) -> None:
     zarr.open_group(str(root / "000001.zarr"), mode="r+")["force"][2, 1] = np.nan
 
@@ -133,10 +140,7 @@ def broken_chunk(root: Path) -> None:
         (leaking_split, {"splits", "dataset"}),
         (edited_axes, {"schema"}),
         (unnamed_version, {"dataset"}),
-        (
-            lambda root: foreign.edit_attributes(root / "000000.zarr", reseal=False, young_kpa=2.0),
-            {"seal", "dataset"},
-        ),
+        (lambda root: foreign.edit_attributes(root / "000000.zarr", False, young_kpa=2), {"seal", "dataset"}),
         (swapped_sequences, {"seal", "dataset"}),
         (replaced_value, {"checksum"}),
         (broken_chunk, {"readable"}),

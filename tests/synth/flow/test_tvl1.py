@@ -82,21 +82,6 @@ def test_tracker_recovers_after_blank_frames() -> None:
         assert trust[shot.hidden].mean() < 0.05
 
 
-@pytest.mark.slow
-def test_flow_from_rest_to_now_does_not_drift() -> None:
-    """After three pulls and releases the error is that of the first."""
-    rng = np.random.default_rng(12)
-    stage = Stage.set(Recipe(size=96, pull=4.0, tool=0.0, noise=3.0), rng)
-    rest = stage.rest(rng)
-    tracker = track.Tracker("tvl1", rest[0], rest[1], np.ones((96, 96), bool))
-    errors = []
-    for t in range(1, 37):
-        shot = stage.against(rest, 0.5 - 0.5 * np.cos(2 * np.pi * t / 12), rng)
-        flow, _ = tracker.step(shot.now, ~shot.now_usable)
-        errors.append(_error(flow, shot.flow).mean())
-    assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
-
-
 class _FixedConfidence:
     """An estimator of given confidence, with and without the surroundings."""
 
