@@ -98,12 +98,7 @@ def parts(clips: Sequence[Clip], unseen: Sequence[Clip]) -> tuple[Split, tuple[i
 
 
 def errors(
-    kind: str,
-    clips: Sequence[Clip],
-    split: Split,
-    settings: TrainingSettings,
-    tests: Tests,
-    work: Path,
+    kind: str, clips: Sequence[Clip], split: Split, settings: TrainingSettings, tests: Tests, work: Path
 ) -> Errors:
     """Errors in every test of a network trained as one of `KINDS` on fit and select of `split`, cached."""
     settings = changed(settings, input=_INPUTS[kind])

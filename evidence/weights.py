@@ -21,6 +21,7 @@ import torch
 from evidence import training
 from evidence.flow import correction_training, segmentation_training
 from evidence.study import Study
+from learn.training.threads import choose_device
 from synth.dataset import provenance
 from synth.errors import UserError
 from synth.flow import correction, segmentation
@@ -52,6 +53,7 @@ def measure(
     the `device` "cuda"; `minutes`: CPU time of each correction. What a folder has is made again only where
     settings or weights below differ.
     """
+    device = choose_device(device).type
     generator, counts = _generator(folder), {"randomized": randomized, "mission": mission}
     files = {job: list(_render(job, count, folder / "sequences")) for job, count in counts.items()}
     sequences = [file for some in files.values() for file in some]

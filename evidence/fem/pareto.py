@@ -41,11 +41,7 @@ def measure(load: float = 0.3, refined: int = 8000, contacts: int = 2) -> Row:
     on, apart = fem_case.patch(), multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, apart, max_tasks_per_child=1) as pool:
         costs = list(pool.map(sequence, ("linear", "neo-hookean")))
-    return {
-        "rows": discretisation(on, refined, contacts, load),
-        "laws": law_table(on),
-        "sequence": costs,
-    }
+    return {"rows": discretisation(on, refined, contacts, load), "laws": law_table(on), "sequence": costs}
 
 
 def discretisation(on: fem_case.Patch, refined: int, contacts: int, load: float) -> list[Row]:

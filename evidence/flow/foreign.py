@@ -21,11 +21,7 @@ Table = Mapping[str, Array]
 
 
 def measure(
-    half: str = "reporting",
-    count: int = 48,
-    first: int = 48,
-    size: int = 160,
-    frames: int = 14,
+    half: str = "reporting", count: int = 48, first: int = 48, size: int = 160, frames: int = 14
 ) -> dict[str, Any]:
     """Errors on `count` videos of a half after its `first` ones; settings were tuned on the half `tuning`."""
     rows = [judge(one, size, frames) for one in recipes(half, count, first)]
@@ -89,10 +85,7 @@ _FIGURES: dict[str, tuple[str, Callable[[Table], float]]] = {
         lambda t: float((t["covered"] <= 0.03).mean()),
     ),
     "largest share of unobstructed tissue masked": ("≤ 0.2", lambda t: float(t["covered"].max())),
-    "EPE / that without masks": (
-        "≤ 1.05",
-        lambda t: float(t["auto"].mean() / t["none"].mean()),
-    ),
+    "EPE / that without masks": ("≤ 1.05", lambda t: float(t["auto"].mean() / t["none"].mean())),
     "frames lost: precision": ("≥ 0.8", lambda t: _ratio(t["hits"], t["flagged"])),
     "frames lost: recall": ("≥ 0.9", lambda t: _ratio(t["hits"], t["lost"])),
     "EPE mean, detected masks [px]": ("", lambda t: float(t["auto"].mean())),

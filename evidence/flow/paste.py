@@ -133,11 +133,12 @@ def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:
 def add_highlights(layer: Layer, rng: np.random.Generator) -> Layer:
     """A layer with white spots, as of a wet surface."""
     shape = layer.instrument.shape
-    period = float(np.exp(rng.uniform(np.log(6), np.log(40))))
-    wet = noise_field(shape, period, rng) + noise_field(shape, 70, rng)
-    share, edge = np.exp(rng.uniform(np.log(0.0005), np.log(0.06))), np.exp(rng.uniform(np.log(0.08), 0.0))
-    strength = np.clip((wet - np.quantile(wet, 1 - share)) / edge + 0.5, 0, 1)
-    if rng.random() < 0.5:  # single round ones
+    if rng.random() < 0.5:
+        period = float(np.exp(rng.uniform(np.log(6), np.log(40))))
+        wet = noise_field(shape, period, rng) + noise_field(shape, 70, rng)
+        share, edge = np.exp(rng.uniform(np.log(0.0005), np.log(0.06))), np.exp(rng.uniform(np.log(0.08), 0))
+        strength = np.clip((wet - np.quantile(wet, 1 - share)) / edge + 0.5, 0, 1)
+    else:  # single round ones
         across, centre = np.exp(rng.uniform(0.5, 2.3, (4, 1, 1))), rng.uniform(0, 1, (4, 2, 1, 1))
         away = np.indices(shape) - centre * np.reshape(shape, (2, 1, 1))
         strength = np.exp(-(away**2).sum(1) / (2 * across**2))[: rng.integers(1, 5)].max(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import os
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,19 +150,19 @@ def _developed(now: Map, rest: Map, rng: np.random.Generator) -> list[Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn(Dataset[Any]):
-    """New examples of step k, the same whenever they are drawn."""
+    """New examples by their number, the same whenever they are drawn."""
 
     sequences: Sequence[Any]
     photographs: Sequence[Map]
     seed: int
     new: int
-    steps: range
+    numbers: range
 
     def __len__(self) -> int:
-        return len(self.steps)
+        return len(self.numbers)
 
     def __getitem__(self, k: int) -> Tensor:
-        rng = np.random.default_rng([self.seed, self.steps[k]])
+        rng = np.random.default_rng([self.seed, self.numbers[k]])
         drawn = [example(self.sequences, self.photographs, rng) for _ in range(self.new)]
         return torch.stack([packed(one) for one in drawn])
 
@@ -173,7 +174,10 @@ def packed(one: Example) -> Tensor:
 
 
 def batch(examples: Tensor, rng: np.random.Generator) -> tuple[Tensor, ...]:
-    """Network input, classes and weights of packed examples, mirrored and with colours in another order."""
+    """Network input (B, 6, H, W), classes and weights (B, 3, H, W) of 0..1 of packed examples (B, 12, H, W).
+
+    They are mirrored and their colours are exchanged, alike in groups of four to save calls.
+    """
     parts = []
     for some in torch.split(examples, 4):
         axes = [axis for axis in (-2, -1) if rng.random() < 0.5]
@@ -192,36 +196,38 @@ def train(
 ) -> tuple[segmentation.SegmentationNet, dict[str, Any]]:
     """A network trained for some steps, and its data in numbers; it continues from a checkpoint.
 
-    `device`: `cuda` learns eight times as many examples in a step.
+    `device`: cpu, or cuda, which learns eight times as many examples in a step, with 9 GB of GPU memory.
     """
     cv2.setNumThreads(0)  # its threads would not survive the fork of the processes that draw
     torch.manual_seed(seed)
-    (new, count, latest), rng = _PACE[device], np.random.default_rng(seed)
+    new, count, latest = _PACE[device]
     workers = 1 if device == "cpu" else max(1, len(os.sched_getaffinity(0)) - 1)
     net = segmentation.SegmentationNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps, pct_start=0.1)
     parts: dict[str, Any] = {"net": net, "average": average, "optimiser": optimiser, "schedule": schedule}
-    begun, recent, began = 0, [], time.time()
+    begun, recent, began = 0, deque[Tensor](maxlen=100), time.time()
     if checkpoint.exists():
         state = torch.load(checkpoint, weights_only=False)
         begun = state["step"]
         for name, part in parts.items():
             part.load_state_dict(state[name])
     ahead = -(-4 * count // new)  # the first step has some choice
-    numbers = range(max(0, begun + ahead - latest // new), steps + ahead)
+    numbers = range(max(0, begun + ahead - latest // new - 1), steps + ahead)
     source = _Drawn(sequences, photographs_of("tuning", _PHOTOGRAPH), seed, new, numbers)
     pool = torch.empty(latest, 12, *_SIZE[::-1], dtype=torch.uint8, device=device)
     net.train()
-    for number, drawn in zip(numbers, DataLoader(source, None, num_workers=workers), strict=True):
+    # All processes share the memory of the sequences.
+    loader = DataLoader(source, None, num_workers=workers, multiprocessing_context="fork")
+    for number, drawn in zip(numbers, loader, strict=True):
         places = torch.arange(number * new, (number + 1) * new) % latest
         pool[places.to(device)] = drawn.to(device)
         step = number - ahead
         if step < begun:
             continue
-        chosen = rng.choice(min((number - numbers[0] + 1) * new, latest), count, replace=False)
-        chosen = (numbers[0] * new + chosen) % latest
+        rng = np.random.default_rng([seed, number, 1])  # so that a resumed run is the same
+        chosen = rng.choice(min((number + 1) * new, latest), count, replace=False)
         inputs, classes, weights = batch(pool[torch.from_numpy(chosen).to(device)], rng)
         with torch.autocast(device, torch.bfloat16, enabled=device != "cpu"):
             logits = net(inputs.contiguous(memory_format=torch.channels_last))
@@ -234,7 +240,7 @@ def train(
         training.follow(average, net, max(0.001, 1 / (step + 1)))
         recent.append(loss.detach())
         if (step + 1) % 100 == 0:
-            mean = float(torch.stack(recent[-100:]).mean())
+            mean = float(torch.stack([*recent]).mean())
             print(f"step {step + 1} of {steps}: loss {mean:.4f}, {time.time() - began:.0f} s", flush=True)
             states = {name: part.state_dict() for name, part in parts.items()}
             torch.save({"step": step + 1} | states, checkpoint.with_suffix(".part"))

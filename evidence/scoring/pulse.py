@@ -17,7 +17,8 @@ from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
 from evidence import report
-from evidence.flow.scenes import cortex, inverse
+from evidence.flow.scenes import inverse
+from evidence.scoring.cost import texture
 from evidence.study import Study
 from synth.arrays import Floats
 from synth.recording_flow.decode import RecordingFlowSettings
@@ -102,7 +103,7 @@ def record(
     `pulse`: factor on the pulse, 0: still tissue; `remove`: whether meta.yaml requests its removal.
     """
     (folder / "frames").mkdir(parents=True)
-    rest = 255 * cortex(size, rng)
+    rest = texture(size, size, rng)
     y, x = np.mgrid[:size, :size].astype(np.float32)
     times, force = contact["time_s"], contact["force_mn"]
     inside = np.hypot(x - (size - 1) / 2, y - (size - 1) / 2) < 0.46 * size

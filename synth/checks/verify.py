@@ -214,7 +214,7 @@ def _dataset(
     except UserError:
         same = True  # the mesh or photograph may be missing
     yield "dataset", "dataset.json", same, "the job was edited after rendering"
-    yield "readable", "dataset", bool(sealed), "no sequence was finished"
+    yield "dataset", "dataset", bool(sealed), "no sequence was finished"
     missing = sorted(set(range(job.sequences)) - set(sealed) - set(folder.failures()))
     yield "dataset", "dataset", not missing, f"{len(missing)} sequences are missing, first {missing[:1]}"
     surplus = [key for key in sealed if key >= job.sequences]

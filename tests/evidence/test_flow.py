@@ -76,9 +76,8 @@ def test_detected_masks_help_on_average_of_the_tuning_half() -> None:
     assert found["largest share of unobstructed tissue masked"] < 0.2
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes() -> None:
+    rng = np.random.default_rng(2)  # which mirrors
     frame, rest = rng.integers(0, 256, (2, 160, 224, 3), np.uint8)
     bright = np.float32(frame.sum(-1, keepdims=True) > 400).repeat(3, -1)
     one = segmentation_training.packed((frame, rest, bright, 1 - bright))[None]

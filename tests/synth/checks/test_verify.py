@@ -91,7 +91,7 @@ def test_a_dataset_without_a_finished_sequence_is_not_good(tmp_path: Path) -> No
     with claim(tmp_path / "out", JOB.model_copy(update={"sequences": 1})) as folder:
         folder.mark_failed({"index": 0, "reason": "refused"})
         index.write_index(folder)
-    assert failing(tmp_path / "out") == {"readable"}
+    assert failing(tmp_path / "out") == {"dataset"}
 
 
 def no_number(root: Path) -> None:

@@ -12,6 +12,7 @@ from synth.flow import segmentation
 from synth.flow.segmentation import segment, with_highlights
 
 Picture = NDArray[np.uint8]
+ON_VESSEL = pytest.mark.xfail(strict=True, reason="it is taken for an instrument, and those are given")
 
 
 def test_bundled_weights_are_small_and_those_of_their_card() -> None:
@@ -46,13 +47,12 @@ def test_a_rod_is_found_whole_and_bare_tissue_is_not_masked(size: tuple[int, int
     assert segment(rest, rest).hidden.mean() < 0.01
 
 
-@pytest.mark.parametrize("at", [(30, 100), (80, 40), (90, 120)])
+@pytest.mark.parametrize("at", [(30, 100), (80, 40), (90, 120), pytest.param((50, 70), marks=ON_VESSEL)])
 def test_highlights_join_given_instruments(at: tuple[int, int]) -> None:
     rest = tissue(120, 160)
     away = np.square(np.indices((120, 160)) - np.reshape(at, (2, 1, 1))).sum(0)
     wet = np.clip(rest + 250 * np.exp(-away / (2 * 4.0**2))[..., None], 0, 255).astype(np.uint8)
-    tool = np.zeros((2, 120, 160), bool)
-    tool[1, :, :20] = True
+    tool = np.stack([rest[..., 0] < 0, np.indices((120, 160))[1] < 20])
     found = with_highlights(np.stack([rest, wet]), tool)
     assert found[1][at]
     assert found[1, :, :20].all()

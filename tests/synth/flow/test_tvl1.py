@@ -82,6 +82,15 @@ def test_tracker_recovers_after_blank_frames() -> None:
         assert trust[shot.hidden].mean() < 0.05
 
 
+@pytest.mark.slow
+def test_flow_from_rest_to_now_does_not_drift() -> None:
+    stage = Stage.set(Recipe(size=96, pull=4.0, tool=0.0, noise=3.0), rng := np.random.default_rng(12))
+    tracker = track.Tracker("tvl1", *(rest := stage.rest(rng))[:2], np.ones((96, 96), bool))
+    shots = [stage.against(rest, 0.5 - 0.5 * np.cos(np.pi * t / 6), rng) for t in range(1, 37)]
+    errors = [_error(tracker.step(one.now, ~one.now_usable)[0], one.flow).mean() for one in shots]
+    assert np.mean(errors[24:]) < 1.3 * np.mean(errors[:12])
+
+
 class _FixedConfidence:
     """An estimator of given confidence, with and without the surroundings."""
 
@@ -109,8 +118,7 @@ def test_surroundings_are_tracked_where_tissue_alone_has_low_confidence(alone: f
 
 
 @pytest.mark.parametrize(
-    ("shape", "settings"),
-    [((96, 128), TVL1Settings()), ((75, 101), TVL1Settings(noise=0.0, median=False))],
+    ("shape", "settings"), [((96, 128), TVL1Settings()), ((75, 101), TVL1Settings(noise=0.0, median=False))]
 )
 def test_flow_equals_that_of_the_tensor_code(
     shape: tuple[int, int], settings: TVL1Settings, monkeypatch: pytest.MonkeyPatch
