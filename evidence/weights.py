@@ -63,11 +63,9 @@ def measure(
     parts = {"segmentation": segmentation, "correction": correction, "depth_correction": depth_correction}
     for name, part in parts.items():
         depth = part is depth_correction
-        settings = (
-            {"drawn": drawn, "minutes": minutes}
-            if part is not segmentation
-            else {"steps": steps, "device": device}
-        )
+        settings: dict[str, Any] = {"drawn": drawn, "minutes": minutes}
+        if part is segmentation:
+            settings = {"steps": steps, "device": device}
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
         made = folder / f"{name}-{key}.pt"

@@ -33,8 +33,10 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
     ours = {
         "warps 2": replace(s, warps=2),
         "cold (default)": s,
+        "warps 6, steps 16": replace(s, warps=6, steps=16, coarse_warps=6),
         "no gradient": replace(s, gradient=0.0),
         "no median": replace(s, median=False),
+        "Huber 0.03": replace(s, huber=0.03),
         "lambda / 3": replace(s, weight=s.weight / 3),
         "lambda x 3": replace(s, weight=3 * s.weight),
         "one lambda": replace(s, noise=0.0, steep=0.0),

@@ -93,18 +93,26 @@ def draw_object(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
 
 def draw_marking(rng: np.random.Generator, picture: Map, other: Map) -> Thing:
     """A random line, grid or patch of the tissue that looks like an object but moves with the tissue."""
+    kind = rng.choice(["line", "grid", "patch"])
+    thing = (
+        draw_object(rng, picture, other) if kind == "patch" else _lines(kind == "grid", rng, picture, other)
+    )
+    return replace(thing, shades=()) if rng.random() < 0.7 else thing
+
+
+def _lines(grid: bool, rng: np.random.Generator, picture: Map, other: Map) -> Thing:
+    """A random winding line across the picture, or many side by side and perhaps as many across them."""
     turn, wide = rng.uniform(0, 2 * np.pi), float(np.exp(rng.uniform(np.log(0.006), np.log(0.08))))
     way, side = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    kind, middle = rng.choice(["line", "grid", "patch"]), rng.uniform(0, 1, 2) * [1, 0.75]
+    middle = rng.uniform(0, 1, 2) * [1, 0.75]
     t = np.linspace(-1.5, 1.5, 40)[:, None] if rng.random() < 0.7 else np.linspace(-0.3, 0.2, 20)[:, None]
     bend = rng.normal(0, 0.06) * np.sin(rng.uniform(2, 12) * t + rng.uniform(0, 6))
     gap = rng.uniform(2, 8) * wide
-    steps = gap * np.arange(-min(15, 0.5 / gap), min(15, 0.5 / gap)) if kind == "grid" else np.zeros(1)
+    steps = gap * np.arange(-min(15, 0.5 / gap), min(15, 0.5 / gap)) if grid else np.zeros(1)
     parts = [("line", middle + t * way + (bend + step) * side, wide) for step in steps]
-    if kind == "grid" and rng.random() < 0.5:
+    if grid and rng.random() < 0.5:
         parts += [("line", middle + t * side + (bend + step) * way, wide) for step in steps]
-    thing = draw_object(rng, picture, other) if kind == "patch" else _finish(parts, rng, picture, other)
-    return replace(thing, shades=()) if rng.random() < 0.7 else thing
+    return _finish(parts, rng, picture, other)
 
 
 def paste(layer: Layer, thing: Thing, shift: Floats) -> Layer:

@@ -45,7 +45,7 @@ def example(sequences: Sequence[Any], photographs: Sequence[Map], rng: np.random
     else:
         rest, now, weight = _rendered(sequences[int(rng.integers(len(sequences)))], rng)
     if rng.random() < _PASTED or (now.instrument.max() == 0 and rng.random() < 0.5):
-        other = _square(photographs[int(rng.integers(len(photographs)))], rng)
+        other = _square(photographs, rng)
         for _ in range(int(rng.choice([1, 1, 2, 3]))):
             draw = paste.draw_object if rng.random() < 0.25 else paste.draw_instrument
             thing = draw(rng, now.picture, other)
@@ -94,14 +94,12 @@ def _turn(shape: tuple[int, ...], rng: np.random.Generator) -> Map:
 def _warped(photographs: Sequence[Map], rng: np.random.Generator) -> tuple[Any, Any, Map]:
     """A photograph or drawn texture as tissue, at rest and moved."""
     if rng.random() < 0.5:
-        still = _square(photographs[int(rng.integers(len(photographs)))], rng)
+        still = _square(photographs, rng)
     else:
         still = cv2.resize(draw_texture(_SIZE[0], rng), _SIZE, interpolation=cv2.INTER_AREA)
     if rng.random() < _MARKED:
         for _ in range(int(rng.integers(1, 4))):
-            thing = paste.draw_marking(
-                rng, still, _square(photographs[int(rng.integers(len(photographs)))], rng)
-            )
+            thing = paste.draw_marking(rng, still, _square(photographs, rng))
             still = paste.paste(paste.Layer.of(still), thing, np.zeros(2)).picture
     size = max(_SIZE)
     flow = cv2.resize(draw_motion(size // 2, rng), _SIZE) * np.float32(2) * (rng.random() < 0.8)
@@ -111,8 +109,9 @@ def _warped(photographs: Sequence[Map], rng: np.random.Generator) -> tuple[Any, 
     return paste.Layer.of(still), paste.Layer.of(moved), np.ones((*_SIZE[::-1], len(CLASSES)), np.float32)
 
 
-def _square(photograph: Map, rng: np.random.Generator) -> Map:
-    """A part of a photograph (N, N, 3), turned, as large as an example, with random colours."""
+def _square(photographs: Sequence[Map], rng: np.random.Generator) -> Map:
+    """A part of one of the photographs (N, N, 3), turned, as large as an example, with random colours."""
+    photograph = photographs[int(rng.integers(len(photographs)))]
     turn = _turn(photograph.shape[:2], rng)
     part = cv2.warpAffine(photograph, turn, _SIZE, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     mix = np.eye(3) + rng.normal(0, 0.25, (3, 3))

@@ -148,16 +148,11 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     waves = [one for row in tree["rows"] for one in row.get("found", ())]
     shown = ", ".join(f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz" for one in waves)
     on_still = sum(len(row.get("found_on_still", ())) for row in tree["rows"])
+    title = "Error with the pulse removed, relative to still tissue"
     return report.Page(
         "Pulse removal",
         tree,
-        [
-            report.Chart(
-                "Error with the pulse removed, relative to still tissue",
-                "error / error on still tissue",
-                tuple(bars),
-            )
-        ],
+        [report.Chart(title, "error / error on still tissue", tuple(bars))],
         (report.Section("", rows),),
         (
             f"**With the pulse removed, the error of a method is at most {worst:.2f} times its error on "
