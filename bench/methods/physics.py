@@ -36,7 +36,6 @@ class TissueConstants:
     membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
     unlike: float = 60.0  # nats a frame by which a tissue is excluded; membranes were found 47 below the best
-    thin_mm: float = 5.0  # on another mesh bare tissue is taken for a membrane of up to this (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
     cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
@@ -60,9 +59,8 @@ class TissueWeights:
 
     tissues: tuple[TissueKind, ...]
     weight: Floats  # of each tissue, with sum 1
-    own_mm: Floats  # (C,) size of the tissue's own motion
+    own_mm: Floats  # (C, 6, M) modes of the tissue's own motion, see `own_motion`
     assumed: bool  # whether that is a bound on what is not known, so that it may be 0
-    membrane: float  # probability of a membrane that is not thin, over all candidate tissues
 
 
 class Physics:
@@ -77,9 +75,9 @@ class Physics:
         self._frames: list[Observation] = []
         self._contact_free = 0
         self._weighed_mm = 0.0  # motion at the last weighting
-        first, still = candidate_tissues(scene)[:1], np.zeros(components)
+        first, still = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
-        self._weights = TissueWeights(first, np.ones(1), still, False, TISSUES.intact)
+        self._weights = TissueWeights(first, np.ones(1), still, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """See `Method`."""
@@ -115,7 +113,8 @@ class Physics:
             frames = [self._frames[k] for k in tracked]
             quiet, factor = quietest_frames(np.array(self._times)[tracked], frames)
             own_mm = factor * posterior.own_motion(basis, [frames[k] for k in quiet])
-            own_mm = np.minimum(own_mm, TISSUES.living_mm)
+            size = np.linalg.norm(own_mm, axis=2, keepdims=True)
+            own_mm = own_mm * np.minimum(1, TISSUES.living_mm / np.maximum(size, 1e-9))
         assumed = not contact_free.any() and bool(own_mm.any())
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
         self._contact_free = int(contact_free.sum())
@@ -126,7 +125,7 @@ class Physics:
         """What the video shows about the tissue."""
         if self._scene is None:
             return []
-        sizes = ", ".join(f"{one:.2g}" for one in self._weights.own_mm)
+        sizes = ", ".join(f"{one:.2g}" for one in np.linalg.norm(self._weights.own_mm[:, 0], axis=1))
         own = f"the tissue's own motion is {sizes} mm along x, y, z"
         if not self._contact_free:
             given = "(sensor.free_s, or pulse.free_s where clocks are found by correlation)"
@@ -229,9 +228,8 @@ def weigh_tissues(
     least = max(score[:known]) - TISSUES.unlike * TISSUES.temper * max(len(strongest), 1)
     used.add(max((k for k in range(known) if score[k] >= least), key=lambda k: tissues[k].membrane))
     order = sorted(used, key=lambda k: -weight[k])
-    covered = float(weight @ [one.membrane > TISSUES.thin_mm for one in tissues])
     weight = weight[order] / weight[order].sum()
-    return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed, covered)
+    return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed)
 
 
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:
@@ -274,14 +272,6 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
     if scene.membrane != "unknown":
         return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
-    young = scene.young_kpa or UNKNOWN_YOUNG_KPA
-    bare, covered = max(1 - weights.membrane, 1e-3), max(weights.membrane, 1e-3)
-    if covered <= bare:
-        least = f"no evidence for a membrane above {TISSUES.thin_mm * young:.2g} {unit}"
-        return f"{least}, odds {bare / covered:.3g} : 1 against; {rest}"
-    stiff = np.array([one.membrane for one in weights.tissues])
-    thick, about = stiff > TISSUES.thin_mm, ""
-    if thick.any():
-        mean_mm = float(np.average(stiff[thick], weights=weights.weight[thick]))
-        about = f" of about {mean_mm * young:.2g} {unit}"
-    return f"evidence for a membrane{about}, odds {covered / bare:.3g} : 1; {rest}"
+    stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
+    shown = "motion does not show whether there is a membrane (meta.yaml's `membrane`): intervals hold both"
+    return f"{shown}; the estimate is of a membrane of {stiff:.2g} {unit}, {rest}"

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.linalg import block_diag, cho_factor, cho_solve, eigh
 from scipy.special import logsumexp
 
 from bench.methods import compliance
@@ -47,6 +47,7 @@ class ModelConstants:
     misfit: float = 0.1  # model error, as a share of the local displacement
     around_mm: float = 1.5  # range of "local": with each point alone coverage is 80%, not 90% (design.md)
     unmet: float = 2.0  # inflates the tissue's own motion: short spans miss parts of a cycle (science.md)
+    independent: float = 0.1  # share of the tissue's own motion in which its polynomials are uncorrelated
     least_mm: float = 0.005  # lower limit of flow's deviation
     draws: int = 128  # of hypotheses in a posterior
 
@@ -144,26 +145,36 @@ def polynomials(points: Floats) -> Floats:
 
 
 def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
-    """Size of the tissue's own motion, (C,) mm: a moment estimate from the polynomials' coefficients in
-    frames without contact, 0 without frames."""
+    """Modes of the tissue's own motion as coefficients of the polynomials, (C, 6, M) mm of unit deviation:
+    a moment estimate from frames without contact, M = 0 without frames.
+
+    Their correlations matter: breathing lifts and bends the surface as one, a contact bends it alone.
+    """
     components = len(basis.motion) // len(basis.known.points)
-    found = np.zeros(components)
     terms = polynomials(basis.known.points)
-    for axis in range(components if contact_free else 0):
-        excess = []
-        for frame in contact_free:
+    excess = []
+    for frame in contact_free:
+        fitted, error = list[Floats](), list[Floats]()
+        for axis in range(components):
             weight = 1 / (MODEL.correlated * (frame.deviation[axis] ** 2 + MODEL.least_mm**2))
             gram = terms.T @ (terms * weight[:, None])
             if np.linalg.cond(gram) < 1e8:
-                inverse = np.linalg.inv(gram)
-                fitted = inverse @ (terms.T @ (weight * frame.moved[axis]))
-                excess.append(fitted**2 - np.diag(inverse))
-        found[axis] = MODEL.unmet * np.sqrt(max(float(np.mean(excess)), 0.0)) if excess else 0.0
-    return found
+                error.append(np.linalg.inv(gram))
+                fitted.append(error[-1] @ (terms.T @ (weight * frame.moved[axis])))
+        if len(fitted) == components:
+            both = np.concatenate(fitted)
+            excess.append(np.outer(both, both) - block_diag(*error))
+    if not excess:
+        return np.zeros((components, terms.shape[1], 0))
+    mean = np.mean(excess, axis=0)
+    mean = (1 - MODEL.independent) * mean + MODEL.independent * np.diag(np.diag(mean))
+    values, vectors = eigh(mean)
+    modes = MODEL.unmet * vectors[:, values > 0] * np.sqrt(values[values > 0])
+    return np.asarray(modes.reshape(components, terms.shape[1], -1), np.float64)
 
 
 def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
-    """The posterior of a frame's loads, with the tissue's own motion of size (C,) mm."""
+    """The posterior of a frame's loads; `own_mm`: the tissue's own motion, see `own_motion`."""
     rank, count = len(basis.size), basis.contacts.shape[1]
     sizes = np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))
     levels, score = _weigh(basis, frame, own_mm, sizes)
@@ -206,9 +217,9 @@ def _weigh(
     local = basis.around @ np.square(frame.moved).mean(axis=0)
     noise = MODEL.correlated * (frame.deviation**2 + MODEL.least_mm**2 + MODEL.misfit**2 * local)
     weight = 1 / noise.ravel()
-    own = np.repeat(np.square(own_mm), 6)
-    columns = np.append(np.arange(rank), rank + np.flatnonzero(own > 0))
-    motion = basis.motion[:, columns]
+    modes = own_mm.reshape(basis.motion.shape[1] - rank, -1)
+    modes = modes[:, modes.any(axis=0)]
+    motion = np.hstack([basis.motion[:, :rank], basis.motion[:, rank:] @ modes])
     weighed = motion * weight[:, None]
     gram, right = motion.T @ weighed, weighed.T @ moved
     known = weight > 0
@@ -217,7 +228,7 @@ def _weigh(
     flat = basis.contacts.reshape(rank, -1)
     levels, evidence = list[_Level](), list[Floats]()
     for spread in MODEL.smooth:
-        prior = np.concatenate([np.square(spread * basis.size), own[own > 0]])
+        prior = np.concatenate([np.square(spread * basis.size), np.ones(modes.shape[1])])
         factor = cho_factor(gram + np.diag(1 / prior), lower=True)
         mean = cho_solve(factor, right)
         log_det = 2 * np.log(np.diag(factor[0])).sum() + np.log(prior).sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -16,6 +16,7 @@ from bench.recording.folder import Recording
 from bench.recording.footage import as_footage
 from bench.recording.right_pictures import RightPictures, StereoQuality
 from bench.sensor.alignment import align_sensor
+from bench.tracking.contact_free import ContactFreeSearch
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
@@ -23,6 +24,7 @@ from synth.recording_flow.decode import RecordingFlowSettings
 from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
+from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.passes import VideoPass, passes
 from synth.recording_flow.pulse import SurfaceMotion
 from synth.system.stopwatch import Stopwatch
@@ -107,20 +109,25 @@ def track_recording(
         scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
+        free = ContactFreeSearch(video.rest.tissue)
         for frame in video.frames():
             each(frame)
             pictures.add(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
+                free.add(frame, frame.time_s)
                 if (span := about.sensor.turn_s) and frame.trusted and span[0] <= frame.time_s <= span[1]:
                     turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    forces.finish(recording)  # of the last pass
+    assumed_s = forces.finish(recording, free.find())  # of the last pass
     out = forces.out
     out.stereo, out.turning = pictures.quality, turning if turning.time_s else None
     out.scale_mm_per_px = scale_mm_per_px
     _describe(out, video, recording, methods, pictured)
+    if assumed_s:
+        spans = ", ".join(f"{a:.3g}–{b:.3g}" for a, b in assumed_s)
+        out.notes.append(f"no contact is assumed in {spans} s, where no instrument is over the tissue")
     out.timings |= watch.report()  # of all passes
     return out
 
@@ -209,11 +216,13 @@ class _Forces:
         if wanted:
             self._snap(position, frame, density)
 
-    def finish(self, recording: Recording) -> None:
-        """Computes results that need all frames, with contact-free spans on the clock of the video."""
+    def finish(self, recording: Recording, found_s: Sequence[Span]) -> Sequence[Span]:
+        """Computes results that need all frames; returns the contact-free spans, on the video's clock, that
+        are assumed: `found_s` unless some are stated."""
         about = recording.meta
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
-        spans = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
+        stated = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
+        spans = stated or found_s
         times = np.array(self.out.time_s)
         inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
         contact_free = np.array(self.out.trusted, bool) & inside
@@ -239,6 +248,7 @@ class _Forces:
                     frame.setdefault(name, frame[method.parts[0]])
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
+        return () if stated else found_s
 
     def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""

@@ -51,16 +51,12 @@ FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
 @pytest.mark.parametrize(
     ("named", "call"),
     [
-        ("tiyn", lambda: synth.simulate("tiyn")),
         ("rate_hz", lambda: bench.Settings(rate_hz=0)),
         ("shrink", lambda: bench.Settings(shrink=-1)),
         ("scale", lambda: check_scale(0.0)),
-        ("scale", lambda: check_scale("x")),  # type: ignore[arg-type]
-        ("job", lambda: synth.simulate(None)),  # type: ignore[arg-type]
         ("flwo", lambda: synth.recover_flow(GREY, GREY[..., 0] > 0, GREY[0, ..., 0] < 0, "flwo")),
         ("frames", lambda: synth.recover_flow(GREY / 255, GREY[..., 0] > 0, GREY[0, ..., 0] < 0)),  # type: ignore[arg-type]
         ("tool", lambda: synth.recover_flow(GREY, GREY[0, ..., 0] > 0, GREY[0, ..., 0] < 0)),
-        ("model", lambda: learn.predict_force("mono", FLOW, TISSUE, 0.1)),  # type: ignore[arg-type]
         ("young_kpa", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE, 0.1, math.nan)),
         ("flow", lambda: learn.predict_force(learn.load_model("mono"), FLOW * math.nan, TISSUE, 0.1)),
         ("tissue", lambda: learn.predict_force(learn.load_model("mono"), FLOW, TISSUE[0], 0.1)),

@@ -10,11 +10,13 @@ from fake_recording import Bump, Maker
 
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording.folder import open_recording
+from bench.tracking.contact_free import ContactFreeSearch
 from bench.tracking.tracking import picture_masks, track_recording
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.video.read import read_mask
 from tests.synth.recording_flow.test_camera_motion import OPENING
 from tests.synth.recording_flow.test_find_tissue import RIM, SETTINGS, video
+from tests.synth.recording_flow.test_foreground import ROD, X, Y, load
 
 _SIZE = (96, 128)
 
@@ -79,3 +81,14 @@ def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
     assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
     assert ("missing", "tissue") in [(one.severity, one.cause) for one in found.findings]
     assert picture_masks(found) is not None  # shows its outline
+
+
+@pytest.mark.parametrize("shown", [range(6, 14), range(9, 14), range(20), range(0)])
+def test_no_contact_is_where_an_instrument_is_away_and_motion_is_smooth(shown: range) -> None:
+    """It presses in frames 6 to 13 of a breath; in three of these cases its mask shows less, or more."""
+    search = ContactFreeSearch(np.ones(ROD.shape, bool))
+    for k in range(20):
+        breath = np.float32(np.sin(k)) * np.dstack([1 + X / 80, X * Y / 4000])
+        moved = breath + load(2.0 * (k in range(6, 14)))
+        search.add(FrameMotion(moved, np.ones(ROD.shape, np.float32), tool=ROD & (k in shown)), k / 10)
+    assert list(search.find()) == ([(0.0, 0.5), (1.4, 1.9)] if shown == range(6, 14) else [])

@@ -12,7 +12,6 @@ from synth.system.gpu import Gpu, obstacle
         (Gpu(1, "550.54.14", (9, 0), optix=True), True),
         (Gpu(1, "550.54.14", (9, 0), optix=False), False),  # a container without the graphics capability
         (Gpu(1, "525.147.05", (8, 6), optix=True), False),
-        (Gpu(2, "535.104.05", (7, 5), optix=True), True),
         (Gpu(1, "565.57.01", (8, 9), optix=True), False),
         (Gpu(1, "570.133.20", (12, 0), optix=True), True),
         (Gpu(1, "550.54.14", (7, 0), optix=True), False),

@@ -1,0 +1,60 @@
+"""Spans of a video without contact, found from its masks: no instrument is over the tissue."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import binary_opening
+
+from synth.arrays import Mask
+from synth.recording_flow.frame_motion import FrameMotion
+from synth.recording_flow.harmonic_fit import Span
+
+
+class Limits:
+    """Constants of the search, chosen by hand on nine recordings by felupe and Cycles and on `mission`."""
+
+    absent: float = 0.001  # largest share of the tissue that instruments cover: false masks
+    present: float = 0.005  # least share in the tenth of the frames that show most of an instrument
+    run: int = 3  # least frames of a span: in fewer an instrument may be missed
+    frames: int = 4  # least frames with an instrument, and without one
+    still: float = 0.5  # uneven motion relative to that with an instrument: above, one was not recognised
+    step_px: int = 4  # between pixels that are compared
+
+
+class ContactFreeSearch:
+    """Gathers a video's frames, in which spans without contact are then found."""
+
+    def __init__(self, tissue: Mask) -> None:
+        """`tissue`: (h, w) of the rest frame."""
+        self._tissue = tissue
+        grid = np.mgrid[tuple(slice(0, size, Limits.step_px) for size in tissue.shape)]
+        y, x = (axis / size - 0.5 for axis, size in zip(grid, tissue.shape, strict=True))
+        self._smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+        self._time_s, self._covered, self._uneven = list[float](), list[float](), list[float]()
+
+    def add(self, frame: FrameMotion, time_s: float) -> None:
+        """Adds a frame at its time [s]; one that is not trusted counts as one with an instrument."""
+        some = slice(None, None, Limits.step_px), slice(None, None, Limits.step_px)
+        weight = np.sqrt((frame.confidence * self._tissue)[some])[..., None]
+        design, moved = (weight * one for one in (self._smooth, frame.flow[some]))
+        design, moved = design.reshape(-1, 6), moved.reshape(-1, 2)
+        left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        self._time_s.append(time_s)
+        covered = np.count_nonzero(frame.instruments & self._tissue) / np.count_nonzero(self._tissue)
+        self._covered.append(covered if frame.trusted else np.inf)
+        self._uneven.append(float(np.sqrt(np.square(left).sum() / max(np.square(weight).sum(), 1e-9))))
+
+    def find(self) -> tuple[Span, ...]:
+        """First and last time [s] of each; none unless an instrument comes and goes and the tissue moves
+        unevenly only where there is one."""
+        covered, uneven, time_s = (np.array(one) for one in (self._covered, self._uneven, self._time_s))
+        free = binary_opening(covered <= Limits.absent, np.ones(Limits.run))
+        shown = np.isfinite(covered) & (covered > Limits.absent)
+        if min(free.sum(), shown.sum()) < Limits.frames:
+            return ()
+        if np.quantile(covered[np.isfinite(covered)], 0.9) < Limits.present:
+            return ()
+        if uneven[free].max() > Limits.still * np.quantile(uneven[shown], 0.9):
+            return ()
+        ends = np.flatnonzero(np.diff(np.pad(free.astype(int), 1)))
+        return tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in ends.reshape(-1, 2))
