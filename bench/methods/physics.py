@@ -112,9 +112,10 @@ class Physics:
             tracked = np.flatnonzero(self._trusted)
             frames = [self._frames[k] for k in tracked]
             quiet, factor = quietest_frames(np.array(self._times)[tracked], frames)
-            own_mm = factor * posterior.own_motion(basis, [frames[k] for k in quiet])
-            size = np.linalg.norm(own_mm, axis=2, keepdims=True)
-            own_mm = own_mm * np.minimum(1, TISSUES.living_mm / np.maximum(size, 1e-9))
+            bound = factor * posterior.own_motion(basis, [frames[k] for k in quiet])
+            size = np.minimum(np.sqrt(np.square(bound).sum(axis=2).mean(axis=1)), TISSUES.living_mm)
+            # A bound: contacts may be in it, so that its correlations are not those of the tissue alone.
+            own_mm = np.diag(np.repeat(size, bound.shape[1])).reshape(*bound.shape[:2], -1)
         assumed = not contact_free.any() and bool(own_mm.any())
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
         self._contact_free = int(contact_free.sum())
@@ -125,7 +126,9 @@ class Physics:
         """What the video shows about the tissue."""
         if self._scene is None:
             return []
-        sizes = ", ".join(f"{one:.2g}" for one in np.linalg.norm(self._weights.own_mm[:, 0], axis=1))
+        basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
+        moved = posterior.polynomials(basis.known.points) @ self._weights.own_mm  # (C, P, M)
+        sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
         own = f"the tissue's own motion is {sizes} mm along x, y, z"
         if not self._contact_free:
             given = "(sensor.free_s, or pulse.free_s where clocks are found by correlation)"
@@ -273,5 +276,6 @@ def describe(weights: TissueWeights, scene: MethodContext) -> str:
         return f"membrane {scene.membrane}, as stated; {rest}"
     unit = "mm times E" if scene.young_kpa is None else "mN/mm"
     stiff = weights.tissues[0].membrane * (scene.young_kpa or UNKNOWN_YOUNG_KPA)
-    shown = "motion does not show whether there is a membrane (meta.yaml's `membrane`): intervals hold both"
-    return f"{shown}; the estimate is of a membrane of {stiff:.2g} {unit}, {rest}"
+    likely = f"likeliest is one of {stiff:.2g} {unit}" if stiff else "likeliest is none"
+    shown = "motion does not reliably show whether there is a membrane (meta.yaml's `membrane`)"
+    return f"{shown}: intervals hold both, {likely}; {rest}"

@@ -47,7 +47,7 @@ class ModelConstants:
     misfit: float = 0.1  # model error, as a share of the local displacement
     around_mm: float = 1.5  # range of "local": with each point alone coverage is 80%, not 90% (design.md)
     unmet: float = 2.0  # inflates the tissue's own motion: short spans miss parts of a cycle (science.md)
-    independent: float = 0.1  # share of the tissue's own motion in which its polynomials are uncorrelated
+    independent: float = 0.1  # share of the covariance of the tissue's own motion without correlations
     least_mm: float = 0.005  # lower limit of flow's deviation
     draws: int = 128  # of hypotheses in a posterior
 
@@ -145,10 +145,11 @@ def polynomials(points: Floats) -> Floats:
 
 
 def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
-    """Modes of the tissue's own motion as coefficients of the polynomials, (C, 6, M) mm of unit deviation:
-    a moment estimate from frames without contact, M = 0 without frames.
+    """Modes of the tissue's own motion in coefficients of the polynomials, (C, 6, M) mm, with amplitudes of
+    unit deviation: a moment estimate from frames without contact that show all components.
 
-    Their correlations matter: breathing lifts and bends the surface as one, a contact bends it alone.
+    Their correlations matter: breathing lifts and bends the surface as one, a contact bends it alone. Modes
+    within the noise are included: without them intervals are too narrow.
     """
     components = len(basis.motion) // len(basis.known.points)
     terms = polynomials(basis.known.points)
@@ -166,8 +167,8 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
             excess.append(np.outer(both, both) - block_diag(*error))
     if not excess:
         return np.zeros((components, terms.shape[1], 0))
-    mean = np.mean(excess, axis=0)
-    mean = (1 - MODEL.independent) * mean + MODEL.independent * np.diag(np.diag(mean))
+    mean = (1 - MODEL.independent) * np.mean(excess, axis=0)
+    mean += MODEL.independent / (1 - MODEL.independent) * np.diag(np.maximum(np.diag(mean), 0))
     values, vectors = eigh(mean)
     modes = MODEL.unmet * vectors[:, values > 0] * np.sqrt(values[values > 0])
     return np.asarray(modes.reshape(components, terms.shape[1], -1), np.float64)

@@ -17,6 +17,7 @@ class Limits:
     present: float = 0.005  # least share in the tenth of the frames that show most of an instrument
     run: int = 3  # least frames of a span: in fewer an instrument may be missed
     frames: int = 4  # least frames with an instrument, and without one
+    least_s: float = 2.0  # least length of all spans: breath hardly shows in less
     still: float = 0.5  # uneven motion relative to that with an instrument: above, one was not recognised
     step_px: int = 4  # between pixels that are compared
 
@@ -33,7 +34,7 @@ class ContactFreeSearch:
         self._time_s, self._covered, self._uneven = list[float](), list[float](), list[float]()
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
-        """Adds a frame at its time [s]; one that is not trusted counts as one with an instrument."""
+        """Adds a frame at its time [s]; one that is not trusted is in no span."""
         some = slice(None, None, Limits.step_px), slice(None, None, Limits.step_px)
         weight = np.sqrt((frame.confidence * self._tissue)[some])[..., None]
         design, moved = (weight * one for one in (self._smooth, frame.flow[some]))
@@ -56,5 +57,6 @@ class ContactFreeSearch:
             return ()
         if uneven[free].max() > Limits.still * np.quantile(uneven[shown], 0.9):
             return ()
-        ends = np.flatnonzero(np.diff(np.pad(free.astype(int), 1)))
-        return tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in ends.reshape(-1, 2))
+        ends = np.flatnonzero(np.diff(np.pad(free.astype(int), 1))).reshape(-1, 2)
+        spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in ends)
+        return spans if sum(b - a for a, b in spans) >= Limits.least_s else ()

@@ -126,7 +126,7 @@ def track_recording(
     out.scale_mm_per_px = scale_mm_per_px
     _describe(out, video, recording, methods, pictured)
     if assumed_s:
-        spans = ", ".join(f"{a:.3g}–{b:.3g}" for a, b in assumed_s)
+        spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in assumed_s)
         out.notes.append(f"no contact is assumed in {spans} s, where no instrument is over the tissue")
     out.timings |= watch.report()  # of all passes
     return out
@@ -222,18 +222,20 @@ class _Forces:
         about = recording.meta
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         stated = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
-        spans = stated or found_s
-        times = np.array(self.out.time_s)
-        inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
-        contact_free = np.array(self.out.trusted, bool) & inside
+        times, trusted = np.array(self.out.time_s), np.array(self.out.trusted, bool)
+
+        def within(spans: Sequence[Span]) -> Mask:
+            inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
+            return np.asarray(trusted & inside)
+
+        contact_free = within(stated or found_s)
         for name, method in self.methods.items():
             if isinstance(method, Revising):
                 with self.watch.stage(name):
                     for frame, estimate in zip(self.estimates, method.revise(contact_free), strict=True):
                         frame[name] = estimate
-        trusted = np.array(self.out.trusted, bool)
         tracked = [self.estimates[k] for k in np.flatnonzero(trusted)]
-        known_mn = np.where(contact_free, 0.0, np.nan)
+        known_mn = np.where(within(stated), 0.0, np.nan)
         if about.press_s is not None and about.young_kpa is not None:
             pressed = align_sensor(recording, times, np.where(trusted, self.out.speed, np.nan), None).size_mn
             inside = (times >= about.press_s[0]) & (times <= about.press_s[1])

@@ -98,10 +98,11 @@ class TissueSearch:
         if not is_bounded or is_alike:
             if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
                 return whole, _state("it moves as tissue that fills the picture")
-            text = "too little moves to find its rim"
             if is_alike:
-                return whole, _state(f"{text}: its colour fills the picture", "warning")
-            return whole & _hull(moves), _state(f"{text}: what moves is taken for it", "warning")
+                text = "neither motion nor colour shows a rim: the whole picture is assumed"
+                return whole, _state(text, "warning")
+            text = "too little moves to find its rim: what moves is taken for it"
+            return whole & _hull(moves), _state(text, "warning")
         guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
         # From either guess tissue may be lost that instruments cut off: the rounder result is right.
         guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))

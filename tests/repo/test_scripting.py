@@ -52,7 +52,6 @@ FLOW, TISSUE = np.zeros((2, 40, 40, 2), np.float32), np.ones((40, 40), bool)
     ("named", "call"),
     [
         ("rate_hz", lambda: bench.Settings(rate_hz=0)),
-        ("shrink", lambda: bench.Settings(shrink=-1)),
         ("scale", lambda: check_scale(0.0)),
         ("flwo", lambda: synth.recover_flow(GREY, GREY[..., 0] > 0, GREY[0, ..., 0] < 0, "flwo")),
         ("frames", lambda: synth.recover_flow(GREY / 255, GREY[..., 0] > 0, GREY[0, ..., 0] < 0)),  # type: ignore[arg-type]
