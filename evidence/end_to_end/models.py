@@ -54,7 +54,8 @@ def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
     """Force of one frame, the posterior mean for still tissue without a membrane, as a baseline's rule."""
     spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
     basis = posterior.load_basis(len(moved), TissueKind())
-    return posterior.infer(basis, physics.observe(moved, spread, mask), np.zeros(len(moved))).force.mean
+    still = np.zeros((len(moved), 6, 0))
+    return posterior.infer(basis, physics.observe(moved, spread, mask), still).force.mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
