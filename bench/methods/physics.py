@@ -240,7 +240,7 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     components, weight = len(weights.own_mm), weights.weight
     worlds = [(one, weights.own_mm) for one in weights.tissues]
     if weights.assumed:
-        worlds.append((weights.tissues[0], 0 * weights.own_mm))
+        worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
         weight = np.append(weight, TISSUES.unlikely)
     found = [posterior.infer(posterior.load_basis(components, one), frame, own) for one, own in worlds]
     return Posterior(

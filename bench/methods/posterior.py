@@ -219,7 +219,6 @@ def _weigh(
     noise = MODEL.correlated * (frame.deviation**2 + MODEL.least_mm**2 + MODEL.misfit**2 * local)
     weight = 1 / noise.ravel()
     modes = own_mm.reshape(basis.motion.shape[1] - rank, -1)
-    modes = modes[:, modes.any(axis=0)]
     motion = np.hstack([basis.motion[:, :rank], basis.motion[:, rank:] @ modes])
     weighed = motion * weight[:, None]
     gram, right = motion.T @ weighed, weighed.T @ moved

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_opening
 
+from bench.methods.posterior import polynomials
 from synth.arrays import Mask
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.harmonic_fit import Span
@@ -25,21 +26,19 @@ class Limits:
 class ContactFreeSearch:
     """Gathers a video's frames, in which spans without contact are then found."""
 
-    def __init__(self, tissue: Mask) -> None:
+    def __init__(self, tissue: Mask, mm_per_px: float) -> None:
         """`tissue`: (h, w) of the rest frame."""
-        self._tissue = tissue
-        grid = np.mgrid[tuple(slice(0, size, Limits.step_px) for size in tissue.shape)]
-        y, x = (axis / size - 0.5 for axis, size in zip(grid, tissue.shape, strict=True))
-        self._smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+        self._tissue, (height, width) = tissue, tissue.shape
+        y, x = np.mgrid[: height : Limits.step_px, : width : Limits.step_px].reshape(2, -1)
+        self._smooth = polynomials(mm_per_px * np.stack([x - width / 2, y - height / 2], axis=1))
         self._time_s, self._covered, self._uneven = list[float](), list[float](), list[float]()
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
         """Adds a frame at its time [s]; one that is not trusted is in no span."""
         some = slice(None, None, Limits.step_px), slice(None, None, Limits.step_px)
-        weight = np.sqrt((frame.confidence * self._tissue)[some])[..., None]
-        design, moved = (weight * one for one in (self._smooth, frame.flow[some]))
-        design, moved = design.reshape(-1, 6), moved.reshape(-1, 2)
-        left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        weight = np.sqrt((frame.confidence * self._tissue)[some]).reshape(-1, 1)
+        design, moved = weight * self._smooth, weight * frame.flow[some].reshape(-1, 2)
+        left = moved - design @ np.linalg.lstsq(design.T @ design, design.T @ moved, rcond=None)[0]
         self._time_s.append(time_s)
         covered = np.count_nonzero(frame.instruments & self._tissue) / np.count_nonzero(self._tissue)
         self._covered.append(covered if frame.trusted else np.inf)
@@ -57,6 +56,6 @@ class ContactFreeSearch:
             return ()
         if uneven[free].max() > Limits.still * np.quantile(uneven[shown], 0.9):
             return ()
-        ends = np.flatnonzero(np.diff(np.pad(free.astype(int), 1))).reshape(-1, 2)
+        ends = np.flatnonzero(np.diff(free, prepend=False, append=False)).reshape(-1, 2)
         spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in ends)
         return spans if sum(b - a for a, b in spans) >= Limits.least_s else ()

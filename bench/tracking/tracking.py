@@ -109,7 +109,7 @@ def track_recording(
         scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
-        free = ContactFreeSearch(video.rest.tissue)
+        free = ContactFreeSearch(video.rest.tissue, mm_per_px)
         for frame in video.frames():
             each(frame)
             pictures.add(frame)
@@ -238,8 +238,7 @@ class _Forces:
         known_mn = np.where(within(stated), 0.0, np.nan)
         if about.press_s is not None and about.young_kpa is not None:
             pressed = align_sensor(recording, times, np.where(trusted, self.out.speed, np.nan), None).size_mn
-            inside = (times >= about.press_s[0]) & (times <= about.press_s[1])
-            known_mn = known_mn if pressed is None else np.where(inside, pressed, known_mn)
+            known_mn = known_mn if pressed is None else np.where(within([about.press_s]), pressed, known_mn)
         for name, method in self.methods.items():
             if isinstance(method, Fusion):
                 with self.watch.stage(name):

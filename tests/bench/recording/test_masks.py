@@ -86,7 +86,7 @@ def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
 @pytest.mark.parametrize("shown", [range(6, 14), range(9, 14), range(20), range(0)])
 def test_no_contact_is_where_an_instrument_is_away_and_motion_is_smooth(shown: range) -> None:
     """It presses in frames 6 to 13 of a breath; in three of these cases its mask shows less, or more."""
-    search = ContactFreeSearch(np.ones(ROD.shape, bool))
+    search = ContactFreeSearch(np.ones(ROD.shape, bool), 0.2)
     for k in range(20):
         breath = np.float32(np.sin(k)) * np.dstack([1 + X / 80, X * Y / 4000])
         moved, sure = breath + load(2.0 * (k in range(6, 14))), np.ones(ROD.shape, np.float32)
