@@ -112,10 +112,8 @@ class Physics:
             tracked = np.flatnonzero(self._trusted)
             frames = [self._frames[k] for k in tracked]
             quiet, factor = quietest_frames(np.array(self._times)[tracked], frames)
-            bound = factor * posterior.own_motion(basis, [frames[k] for k in quiet])
-            size = np.minimum(np.sqrt(np.square(bound).sum(axis=2).mean(axis=1)), TISSUES.living_mm)
-            # A bound: contacts may be in it, so that its correlations are not those of the tissue alone.
-            own_mm = np.diag(np.repeat(size, bound.shape[1])).reshape(*bound.shape[:2], -1)
+            bound = factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)
+            own_mm = bound.clip(-TISSUES.living_mm, TISSUES.living_mm)
         assumed = not contact_free.any() and bool(own_mm.any())
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
         self._contact_free = int(contact_free.sum())

@@ -144,12 +144,13 @@ def polynomials(points: Floats) -> Floats:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
-def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
+def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated: bool = True) -> Floats:
     """Modes of the tissue's own motion in coefficients of the polynomials, (C, 6, M) mm, with amplitudes of
     unit deviation: a moment estimate from frames without contact that show all components.
 
     Their correlations matter: breathing lifts and bends the surface as one, a contact bends it alone. Modes
-    within the noise are included: without them intervals are too narrow.
+    within the noise are included: without them intervals are too narrow. Not `correlated`: one size per
+    component, for frames that contacts may be in.
     """
     components = len(basis.motion) // len(basis.known.points)
     terms = polynomials(basis.known.points)
@@ -169,6 +170,8 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation]) -> Floats:
         return np.zeros((components, terms.shape[1], 0))
     mean = (1 - MODEL.independent) * np.mean(excess, axis=0)
     mean += MODEL.independent / (1 - MODEL.independent) * np.diag(np.maximum(np.diag(mean), 0))
+    if not correlated:
+        mean = np.diag(np.repeat(np.mean(excess, axis=0).diagonal().reshape(components, -1).mean(axis=1), 6))
     values, vectors = eigh(mean)
     modes = MODEL.unmet * vectors[:, values > 0] * np.sqrt(values[values > 0])
     return np.asarray(modes.reshape(components, terms.shape[1], -1), np.float64)
