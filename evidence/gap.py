@@ -230,7 +230,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             f"{low:.3g} to {high:.3g} mN.**",
             "Gap: error on recovered flow less error on ideal flow, out of distribution, after training on "
             "ideal flow. I: trained on ideal flow, R: on recovered, N: on ideal with noise fitted to the "
-            "recovered flow's error, mixed: ideal first, recovered later (as stereo presets are). "
+            "recovered flow's error, mixed: both, and errors of other frames (as stereo presets are). "
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
             f"networks a training: {found['seeds']}; 95% BCa intervals.",
         ),

@@ -55,6 +55,11 @@ def train_command(
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
+    labels: Annotated[
+        list[Path] | None,
+        Option(help="A dataset of which only the truth is used, by a mixed input; repeat for more."),
+    ] = None,
+    start: Annotated[str | None, Option(help="A model to start from: its folder, mono or stereo.")] = None,
     preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
     threads: Threads = None,
@@ -62,12 +67,13 @@ def train_command(
     json: Json = False,
 ) -> None:
     """Train D2FNet on a dataset. The same command continues an interrupted run."""
-    from learn.checkpoint import disk_needed
+    from learn.checkpoint import disk_needed, read_model
     from learn.data.clips import sources
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
+    from learn.inference.shipped import find_model
     from learn.settings import preset as named
-    from learn.split import divide
+    from learn.split import add_labels, divide
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
@@ -77,13 +83,19 @@ def train_command(
     device = choose_device(accelerator)
     dataset, given = _split_arguments(str(dataset), changes or [])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
+    if labels and len(sources(settings.input)) < 2:
+        raise UserError(f"--labels needs a mixed input, not {settings.input}")
     with made_folder(out, disk_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
         clips = _read(datasets, settings.grid, sources(settings.input), cache)
         clips, split = divide(clips, datasets, settings.seed, _console.print)
+        if labels:
+            truth = _read(labels, settings.grid, sources(settings.input)[:1], cache)
+            clips, split = add_labels(clips, split, truth)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
-            card = train(clips, split, settings, out, device=device, report=progress, log=log)
+            model = read_model(find_model(start)) if start else None
+            card = train(clips, split, settings, out, start=model, device=device, report=progress, log=log)
     if card.intervals is None and card.weights_hash:
         with counting("Fitting intervals") as progress:
             card = add_intervals(out, load_model(out), clips, split, report=progress)
@@ -240,20 +252,12 @@ def predict_command(
 @app.command("calibrate", epilog="Example: learn calibrate model press.npz")
 def calibrate_command(
     model: Annotated[Path, Argument(help="Model folder.")],
-    data: Annotated[
-        list[Path],
-        Argument(help="Presses of known force (.zarr, .npz), or datasets: old training data and new."),
-    ],
+    data: Annotated[list[Path], Argument(help="Presses of known force: .zarr or .npz.")],
     input: Input = None,
-    from_test: Annotated[bool, Option("--from-test", help="Use half of the datasets' test brains.")] = False,
     threads: Threads = None,
-    cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """Fit Young's modulus to presses of known force, or a model's prediction intervals to datasets."""
-    from learn.checkpoint import read_card
-    from learn.data.clips import scored_source
-    from learn.evaluation.fit_intervals import fit_from_datasets
+    """Fit Young's modulus to presses of known force."""
     from learn.inference.apply import calibrate
     from learn.inference.motion import motions
     from learn.inference.predict import load_model
@@ -261,18 +265,6 @@ def calibrate_command(
 
     set_threads(threads)
     predictor = load_model(model)
-    if any(one.suffix not in (".npz", ".zarr") for one in data):
-        read_card(model)  # fails for the name of a pretrained model: those are not changed
-        source = predictor.readable(input or scored_source(predictor.card.settings.input))
-        clips = _read(data, predictor.grid, (source,), cache)
-        with counting("Fitting intervals") as progress:
-            intervals = fit_from_datasets(model, predictor, clips, data, source, from_test, progress)
-        found = {"units": intervals.units, "sequences": intervals.sequences, "input": intervals.source}
-        if json:
-            print(json_.dumps({"model": str(model), **found}))
-        else:
-            _console.print(_describe(intervals))
-        return
     presses = [motion for one in data for motion in motions(one, predictor.stored(input))]
     young = {press.name: calibrate(predictor, press) for press in presses}
     if json:

@@ -31,9 +31,9 @@ class TrainingSettings(Section):
     arch: Architecture = Architecture()
     loss: Loss = "antighost"
     input: Input = "ideal"
-    """Displacement to train on. `mixed`: each frame is drawn ideal or recovered, with odds that move from all
-    ideal to all recovered over the first half of the run. `motion`, `motion-ideal`, `motion-mixed`: stereo
-    motion, recovered, true or mixed; they need `arch.depth`."""
+    """Displacement to train on. `mixed`: each frame is drawn ideal, recovered, or ideal with the error of
+    another frame (`learn.training.error_transfer`). `motion`, `motion-ideal`, `motion-mixed`: stereo motion,
+    recovered, true or mixed; they need `arch.depth`."""
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
     learning_rate: Positive = 5e-4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -79,6 +79,15 @@ def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
     return replace(split, select=select, intervals=calibration)
 
 
+def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> tuple[list[Clip], Split]:
+    """All clips, `labels` in the fit part of the split but for those with a brain of another part."""
+    every = [*clips, *labels]
+    number = groups(every)
+    other = {number[i] for part in (split.select, split.test, split.intervals) for i in part}
+    more = (i for i in range(len(clips), len(every)) if number[i] not in other)
+    return every, replace(split, fit=(*split.fit, *more))
+
+
 def name_parts(clips: Sequence[Clip], split: Split) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Content hashes and groups of each part, for a model's card. UserError if two parts share a group."""
     parts = {"fit": split.fit, "select": split.select, "test": split.test}
@@ -114,38 +123,9 @@ def choose_unseen(
 
 def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
-    used = _in_parts(regroup(clips, find_unit(card)), card, USED)
-    return [clip for i, clip in enumerate(clips) if i not in used]
-
-
-def find_sides(clips: Sequence[Clip], card: ModelCard, test: Collection[str], from_test: bool) -> Split:
-    """Division of a dataset's sequences for fitting a trained model's intervals, by brains.
-
-    The interval part is the card's; else every brain that is neither in the card nor in a test; with
-    `from_test` a random half of the test brains. What the select part lacks for the error model is drawn from
-    it. `test`: hashes of further test sequences.
-    """
-    number = groups(clips)
-
-    def brains(part: str, more: Collection[str] = ()) -> set[int]:
-        return {number[i] for i in _in_parts(clips, card, [part], more)}
-
-    def of(chosen: Collection[int]) -> tuple[int, ...]:
-        return tuple(i for i in range(len(clips)) if number[i] in chosen)
-
-    rng = np.random.default_rng(card.settings.seed)
-    fitted, selected = brains("fit"), brains("select")
-    calibration, tests = brains("intervals") - fitted - selected, brains("test", test) - fitted - selected
-    if from_test:
-        drawn = rng.permutation(sorted(tests))
-        calibration = {int(brain) for brain in drawn[: len(tests) // 2]}
-    elif not calibration:
-        calibration = set(number) - fitted - selected - tests
-    left, missing = tests - calibration, max(LEAST_SELECTED - len(selected), 0)
-    if len(calibration) >= conformal.least_units(LEVELS[0]) + missing:
-        moved = {int(brain) for brain in rng.permutation(sorted(calibration))[:missing]}
-        selected, calibration = selected | moved, calibration - moved
-    return Split(of(fitted), of(selected), of(left), of(calibration))
+    brains = {name for part in USED for name in card.groups.get(part, ())}
+    grouped = zip(clips, regroup(clips, find_unit(card)), strict=True)
+    return [c for c, of in grouped if c.content_hash not in card.used and of.group not in brains]
 
 
 def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:
@@ -184,12 +164,3 @@ def find_unit(card: ModelCard) -> Unit:
 def groups(clips: Sequence[Clip]) -> list[int]:
     """A group number for each clip, equal for clips of one anatomy and for copies of one sequence."""
     return join_groups([c.group for c in clips], [c.content_hash for c in clips])
-
-
-def _in_parts(
-    clips: Sequence[Clip], card: ModelCard, parts: Sequence[str], more: Collection[str] = ()
-) -> set[int]:
-    """Indices of the clips in some parts of a card, by content hash (or one of `more`) or by group."""
-    hashes = {*more, *(name for part in parts for name in card.split.get(part, ()))}
-    names = {name for part in parts for name in card.groups.get(part, ())}
-    return {i for i, c in enumerate(clips) if c.content_hash in hashes or c.group in names}

@@ -173,6 +173,20 @@ def _partition(hats: sparse.csr_array) -> sparse.csr_array:
     return (hats @ sparse.diags_array(scale.astype(np.float32))).tocsr()
 
 
+def turned(values: Tensor, turn: int) -> Tensor:
+    """Fields (B, C, N, N) turned by `turn` % 4 × 90° counter-clockwise, and mirrored first if `turn` ≥ 4; two
+    or three channels begin with x, y components, a single one is a scalar."""
+    vector = values.shape[1] > 1
+    sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
+    if turn >= 4:
+        values = values.flip(-1) * sign if vector else values.flip(-1)
+    for _ in range(turn % 4):
+        values = values.rot90(dims=(2, 3))
+        if vector:
+            values = torch.cat([values[:, 1:2], -values[:, :1], values[:, 2:]], dim=1)
+    return values
+
+
 def divergence(displacement: Tensor, mask: Tensor, pitch_mm: float) -> Tensor:
     """∂dx/∂x + ∂dy/∂y of the smoothed displacement, dimensionless, 0 outside the mask.
 

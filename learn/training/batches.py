@@ -1,4 +1,4 @@
-"""Batches of frames as tensors, with augmentation by turns and surface motion."""
+"""Batches of frames as tensors, with augmentation by turns, surface motion and errors of other frames."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
-from learn.data.grid import Scales, channels, divergence, membrane_code
+from learn.data.grid import Scales, channels, divergence, membrane_code, turned
 from learn.settings import TrainingSettings
+from learn.training import error_transfer
+from learn.training.error_transfer import Transfer
 from synth.errors import UserError
 
 SHARE = 0.3  # of a GPU's free memory that frames of a part may take: those to fit, and those to select by
@@ -43,6 +45,7 @@ class FrameItem(NamedTuple):
     source: str  # displacement, as in `learn.data.clips.FIELDS`
     turn: int = 0  # 0-7, as of `turned`
     membrane_known: bool = False
+    errors: Transfer | None = None  # instead of those of `source`
 
 
 def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
@@ -67,20 +70,6 @@ def inputs(batch: Batch, settings: TrainingSettings, scales: Scales) -> Tensor:
     return channels(batch.displacement, batch.mask, settings.grid.pitch_mm, scales, confidence, membrane)
 
 
-def turned(values: Tensor, turn: int) -> Tensor:
-    """Fields (B, C, N, N) turned by `turn` % 4 × 90° counter-clockwise, and mirrored first if `turn` ≥ 4; two
-    or three channels begin with x, y components, a single one is a scalar."""
-    vector = values.shape[1] > 1
-    sign = values.new_tensor([-1.0, 1.0, 1.0][: values.shape[1]]).view(1, -1, 1, 1)
-    if turn >= 4:
-        values = values.flip(-1) * sign if vector else values.flip(-1)
-    for _ in range(turn % 4):
-        values = values.rot90(dims=(2, 3))
-        if vector:
-            values = torch.cat([values[:, 1:2], -values[:, :1], values[:, 2:]], dim=1)
-    return values
-
-
 class FrameDataset:
     """All frames of some clips, in batches on a device; a GPU with enough memory stores what it has read."""
 
@@ -92,13 +81,14 @@ class FrameDataset:
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
                 raise UserError(f"{clip.name}: its grid is {len(clip.mask)}², the model's {settings.size}²")
+        self._donors = [(c, clip.frames) for c, clip in enumerate(self.clips) if self._recovered(c)]
         self._masks = [torch.from_numpy(np.array(c.mask))[None, None].to(device) for c in self.clips]
         self._stored = dict[tuple[int, int, str], tuple[Tensor, ...]]()
         planes = 2 * settings.arch.displacements - 1 + settings.arch.components
         needed = sum(c.frames for c in self.clips) * len(self.sources) * planes * 4 * settings.size**2
         self._stores = device.type == "cuda" and needed < SHARE * torch.cuda.mem_get_info(device)[0]
 
-    def order(self, rng: np.random.Generator, share_recovered: float) -> list[FrameItem]:
+    def order(self, rng: np.random.Generator) -> list[FrameItem]:
         """The frames of one epoch, turned at random, in random order."""
         items: list[tuple[int, int]] = []
         for c, clip in enumerate(self.clips):
@@ -108,15 +98,30 @@ class FrameDataset:
             items += [(c, int(t)) for t in frames]
         if 0 < self.settings.epoch_frames < len(items):
             items = [items[i] for i in rng.choice(len(items), self.settings.epoch_frames, replace=False)]
-        source = [self.sources[0]] * len(items)
-        if len(self.sources) == 2:
-            source = [self.sources[int(u < share_recovered)] for u in rng.random(len(items))]
         turn = rng.integers(0, 8, len(items))
         order = rng.permutation(len(items))
         known = [False] * len(items)
         if self.settings.arch.membrane:
             known = [bool(one) for one in rng.random(len(items)) >= MEMBRANE_HIDDEN]
-        return [FrameItem._make((*items[i], source[i], int(turn[i]), known[i])) for i in order]
+        first = self.sources[0]
+        drawn = [FrameItem(items[i][0], items[i][1], first, int(turn[i]), known[i]) for i in order]
+        return [self._with_errors(one, rng) for one in drawn] if len(self.sources) > 1 else drawn
+
+    def _with_errors(self, item: FrameItem, rng: np.random.Generator) -> FrameItem:
+        """The frame with true or recovered motion, another's error, or its own with another confidence."""
+        share, recovered = rng.random(), self._recovered(item.clip)
+        if share < error_transfer.CERTAIN:
+            return item
+        if recovered and share > 1 - error_transfer.RECOVERED:
+            return item._replace(source=self.sources[-1])
+        parts = self.settings.arch.displacements
+        errors = error_transfer.draw(rng, self._donors, parts)
+        if recovered and share > error_transfer.CERTAIN + error_transfer.TRANSFERRED:
+            errors = errors._replace(clip=item.clip, frame=item.frame, factor=(1.0,) * parts)
+        return item._replace(errors=errors)
+
+    def _recovered(self, clip: int) -> bool:
+        return self.sources[-1] in self.clips[clip].displacement
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
         """All frames of one clip, in order, not turned."""
@@ -128,8 +133,13 @@ class FrameDataset:
     def batch(self, items: Sequence[FrameItem]) -> Batch:
         """The frames of `items` as tensors."""
         frames = []
-        for c, t, source, turn, known in items:
+        for c, t, source, turn, known, errors in items:
             moved, confidence, true = self._read(c, t, source)
+            if errors is not None:
+                there = self._read(errors.clip, errors.frame, self.sources[-1])
+                donor = self._read(errors.clip, errors.frame, self.sources[0])[0]
+                moved, confidence = error_transfer.transfer(moved, donor, there[0] - donor, there[1], errors)
+                moved, confidence = moved * self._masks[c], confidence * self._masks[c]
             code = membrane_code(self.clips[c].membrane) if known else 0.0
             codes = torch.full((1,), code, device=self.device)
             frames.append(Batch(moved, self._masks[c], confidence, true, codes).turned(turn))
@@ -155,7 +165,7 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
         mask = torch.from_numpy(np.array(clip.mask))[None, None]
         inside = clip.mask > 0
         for t in np.unique(np.linspace(0, clip.frames - 1, frames).astype(int)):
-            for source in sources(settings.input):
+            for source in (one for one in sources(settings.input) if one in clip.displacement):
                 u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
                 moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
                 strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))

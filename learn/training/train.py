@@ -17,8 +17,8 @@ from torch.optim import AdamW
 from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from learn import checkpoint
-from learn.checkpoint import ModelCard
-from learn.data.clips import RECOVERED, Clip, scored_source, sources
+from learn.checkpoint import USED, ModelCard
+from learn.data.clips import RECOVERED, Clip, scored_source
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
@@ -47,25 +47,37 @@ def train(
     *,
     report: ProgressCallback = lambda done, of: None,
     device: torch.device | str = "cpu",
+    start: tuple[torch.nn.Module, ModelCard] | None = None,
     log: Callable[[dict[str, float]], None] = lambda numbers: None,
 ) -> ModelCard:
-    """Trains on `split.fit` and chooses the epoch on `split.select`; `split.test` is not used.
+    """Trains on `split.fit` and scores on `split.select`; `split.test` is not used.
 
     An unfinished run of the same settings and data in `out` is continued, with the result (bit for bit on one
-    CPU) of an uninterrupted run. `report` is called after every batch, `log` with each epoch's numbers.
+    CPU) of an uninterrupted run. `start`: a model from whose weights and scales training starts; what it was
+    trained on is the part `start` of the card. `report` is called after every batch, `log` with each epoch's
+    numbers.
 
-    Returns the card of the best epoch. Raises UserError if `out` holds another run, or on divergence.
+    Returns the card of the last epoch, by the schedule `plateau` of the best one. Raises UserError if `out`
+    holds another run, on divergence, and for a `start` of another architecture or that was trained on brains
+    of the select or interval part.
     """
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
-    scales = measure_scales(fit, settings)
+    scales = start[1].scales if start else measure_scales(fit, settings)
     typical_young = float(np.exp(np.mean([np.log(clip.young_kpa) for clip in fit])))
-    is_recovered = scored_source(settings.input) in RECOVERED
-    motion = sorted({clip.recovered_by for clip in fit if is_recovered} - {""})
+    source = scored_source(settings.input)
+    recovered = (clip.recovered_by for clip in fit if source in RECOVERED and source in clip.displacement)
+    motion = sorted({*recovered} - {""})
     parts = name_parts(clips, split)
+    if start:
+        for known, new in zip((start[1].split, start[1].groups), parts, strict=True):
+            new["start"] = sorted({one for part in USED for one in known.get(part, ())})
+            fitted = {*known["fit"], *known.get("start", ())}
+            if fitted & {*new["select"], *new.get("intervals", ())}:
+                raise UserError("start: was trained on brains of this data's validation side")
     card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)
     state = _open(out, card)
     try:
-        run = _start(card, state, torch.device(device))
+        run = _start(card, state, torch.device(device), start and start[0])
         frames, chooser = (FrameDataset(part, settings, torch.device(device)) for part in (fit, select))
         # Events after the epoch that a run is continued from are dropped.
         with SummaryWriter(str(out / "tensorboard"), purge_step=run.epoch) as board:
@@ -109,12 +121,14 @@ class _Run:
     best: float = -math.inf  # R² on the select sequences of the stored epoch
 
     def end_epoch(self, score: float, settings: TrainingSettings) -> bool:
-        """Updates the state by an epoch's score; returns whether it is the best so far."""
+        """Updates the state by an epoch's score; returns whether the epoch is to be stored."""
         self.epoch += 1
         if settings.schedule == "plateau":
             self.plateau.step(score)
-        # Epochs before the loss has its full penalty on off-target force are not chosen.
-        improved = full(settings.loss, self.epoch / settings.epochs) and score > self.best
+        # No epoch before the loss has its full penalty on off-target force. By a cosine schedule the last:
+        # the best on the select side erred half as much again on other mechanics (design.md).
+        chosen = score > self.best or settings.schedule == "cosine"
+        improved = full(settings.loss, self.epoch / settings.epochs) and chosen
         self.best = score if improved else self.best
         return improved
 
@@ -123,11 +137,17 @@ class _Run:
         return {"epoch": self.epoch, "best": self.best, "model": _cpu(self.model.state_dict()), **moving}
 
 
-def _start(card: ModelCard, state: dict[str, Any] | None, device: torch.device) -> _Run:
-    """A new run, or one continued from a state of `_Run.as_dict`."""
+def _start(
+    card: ModelCard, state: dict[str, Any] | None, device: torch.device, start: torch.nn.Module | None
+) -> _Run:
+    """A new run, from the weights of `start` if given, or one continued from a state of `_Run.as_dict`."""
     settings = card.settings
     torch.manual_seed(settings.seed)
-    model = D2FNet(settings.arch).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    model = D2FNet(settings.arch)
+    if start is not None:
+        with as_user_error("start: a model of another architecture"):
+            model.load_state_dict(start.state_dict())
+    model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     # `fused` saves a fifth of a small network's training time on a CPU.
     optimizer = AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=WEIGHT_DECAY, fused=True)
     plateau = ReduceLROnPlateau(optimizer, mode="max", factor=0.5, patience=PATIENCE)
@@ -153,7 +173,7 @@ def _epoch(
     # Seeds depend on (seed, epoch) alone, so a resumed run draws as an uninterrupted one.
     seed = np.random.SeedSequence([settings.seed, epoch])
     torch.manual_seed(int(seed.generate_state(1)[0]))
-    order = frames.order(np.random.default_rng(seed), min(1.0, epoch / max(settings.epochs // 2, 1)))
+    order = frames.order(np.random.default_rng(seed))
     batches = max(len(order) // settings.batch, 1)
     net.train()
     total = torch.zeros((), device=frames.device)
@@ -241,8 +261,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    planned = len(sources(there.settings.input)) > 1 or not full(there.settings.loss, 0.0)
-    bound = planned or there.settings.schedule == "cosine"
+    bound = not full(there.settings.loss, 0.0) or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
     return checked_file.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None

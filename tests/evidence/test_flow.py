@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates
 
 from evidence.flow import foreign, segmentation_training
 from evidence.flow.foreign_scenes import Recipe, recipes, video
-from evidence.flow.measure import divergence, errors
+from evidence.flow.measure import errors
 from evidence.flow.scenes import CLEAN, Pair, inverse, pairs, pixels, pull_field
 from evidence.flow.scenes import Recipe as Pull
 from evidence.flow.stereo import figures
@@ -32,11 +32,6 @@ def test_error_of_a_known_offset() -> None:
     contact[:2], hidden[0] = True, True
     error = errors(flow, known(truth, hidden, contact))
     assert [error[part] for part in ("contact", "contact_visible", "hidden")] == [4.0, 0.0, 8.0]
-
-
-def test_divergence_of_a_linear_field() -> None:
-    found = divergence(pixels(30, 30) * np.array([0.3, -0.1], np.float32))
-    np.testing.assert_allclose(found[8:-8, 8:-8], 0.2, atol=1e-5)
 
 
 def test_scene_agrees_with_its_flow() -> None:

@@ -77,7 +77,7 @@ def test_the_membrane_is_known_in_two_of_three_frames_and_changes_the_estimate(
     stereo: list[Clip], model: Path
 ) -> None:
     frames = FrameDataset(stereo, replace(small(), frames=0))
-    drawn = [item.membrane_known for k in range(9) for item in frames.order(np.random.default_rng(k), 1.0)]
+    drawn = [item.membrane_known for k in range(9) for item in frames.order(np.random.default_rng(k))]
     assert np.mean(drawn) == pytest.approx(1 - MEMBRANE_HIDDEN, abs=4 * (2 / 9 / len(drawn)) ** 0.5)
     codes, mask = torch.tensor([-1.0, 0.0, 1.0]), torch.ones(3, 1, 32, 32)
     x = channels(torch.randn(3, 3, 32, 32), mask, 1.0, SCALES, torch.rand(3, 2, 32, 32), codes)

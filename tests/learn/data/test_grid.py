@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from learn.data.grid import CHANNELS, Grid, GridView, Scales, channels, divergence, settled
-from learn.training.batches import turned
+from learn.data.grid import CHANNELS, Grid, GridView, Scales, channels, divergence, settled, turned
 
 GRID = Grid(64, 36.0)
 

@@ -99,10 +99,6 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int) 
     assert {clip.content_hash for clip in partition.choose_unseen(clips, own, card)} == set(
         card.split["test"]
     )
-    grouped = partition.regroup(clips, partition.find_unit(card))
-    used = partition.find_sides(grouped, card, set(card.split["test"]), from_test=False)
-    assert {clips[i].content_hash for i in used.test} == set(card.split["test"])
-    assert not set(used.test) & {*used.fit, *used.select, *used.intervals}
 
 
 def test_training_sequences_are_not_scored_whatever_another_split_says(tmp_path: Path) -> None:
@@ -187,13 +183,17 @@ def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: lis
     assert partition.find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
 
 
-def test_brains_in_the_card_or_in_a_test_are_not_used_for_intervals(clips: list[Clip]) -> None:
-    some = many(clips, 30)
-    named = partition.name_parts(some, partition.Split(of(range(6)), of(range(6, 10)), of([10, 11])))
-    known = ModelCard(preset("tiny"), SCALES, 1.7, *named)
-    # A sequence of its own of a brain that was fitted, of one that is test, and a brain marked test.
-    some += [replace(some[0], content_hash=f"new-{b}", group=f"brain-{b}") for b in (3, 10)]
-    found = partition.find_sides(some, known, {"12-0"}, from_test=False)
-    assert {some[i].group for i in found.intervals} == {f"brain-{b}" for b in range(13, 30)}
-    assert {some[i].group for i in found.test} == {"brain-10", "brain-11", "brain-12"}
-    assert {some[i].group for i in found.fit} == {f"brain-{b}" for b in range(6)}
+@pytest.mark.slow
+def test_labels_join_training_unless_their_brain_is_on_another_side(tmp_path: Path) -> None:
+    own, truth = make(tmp_path / "own", [*range(9)]), make(tmp_path / "truth", [*range(12)], first=20)
+    words = ["--preset", "tiny", "size=32", "epochs=1", "--input", "mixed", "-o", tmp_path / "m"]
+    run(cli.app, "train", own, "--labels", truth, *words)
+    card, labels = read_card(tmp_path / "m"), load_clips(truth, BASE.grid, ["ideal"])
+    other = {*card.groups["select"], *card.groups["test"]}
+    assert {c.content_hash for c in labels if c.group not in other} <= {*card.split["fit"]}
+    assert not {c.content_hash for c in labels if c.group in other} & {*card.split["fit"]}
+    run(cli.app, "train", own, "--labels", truth, "--input", "ideal", "-o", tmp_path / "n", code=2)
+    run(cli.app, "train", own, "--start", tmp_path / "m", *words[:-1], tmp_path / "again")
+    assert {*card.split["fit"]} <= {*read_card(tmp_path / "again").split["start"]}
+    run(synth, "split", own, "--shares", "0.2,0.6,0.2")
+    run(cli.app, "train", own, "--start", tmp_path / "m", *words[:-1], tmp_path / "leak", code=2)
