@@ -39,12 +39,8 @@ _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequenc
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
-USED = (
-    "fit",
-    "select",
-    "intervals",
-    "start",
-)  # parts of `ModelCard.split` that the model must not be scored on
+# Parts of `ModelCard.split` that the model must not be scored on.
+USED = ("fit", "select", "intervals", "start")
 
 
 @dataclass(frozen=True)
@@ -57,15 +53,16 @@ class ModelCard:
     scales: Scales
     typical_young_kpa: Positive  # geometric mean of E in the training data, used where E is unknown
     split: dict[str, list[str]]
-    """Content hashes of the sequences by use: `fit` (weights), `select` (epoch), `test`, and `intervals`."""
+    """Content hashes of the sequences by use: `fit` (weights), `select` (epoch, gain), `test`, `intervals`,
+    and `start` (those of the model that training began with)."""
     groups: dict[str, list[str]]  # the anatomies of each part: other sequences of those are not unseen either
     dataset_splits: list[str] = field(default_factory=list)  # hash of each training dataset's split
     epoch: Annotated[int, Field(ge=0)] = 0
     score: FiniteFloat = 0.0
-    """R² of the network's map, before `force_gain`, on the select sequences at the chosen epoch."""
+    """R² of the network's map, before `force_gain`, on the select sequences at the stored epoch."""
     force_gain: Positive = 1.0
     """Factor on the network's map: the slope through the origin of the true on the predicted total force, on
-    the select sequences at the chosen epoch."""
+    the select sequences at the stored epoch."""
     weights_hash: str = ""  # of the file of weights; empty before the first epoch is stored
     intervals: Intervals | None = None  # prediction intervals; None if not fitted
     no_intervals: str = ""  # why they could not be fitted; else empty

@@ -36,7 +36,7 @@ Input = Annotated[
     str | None,
     Option(
         help="Displacement read from a store: ideal, recovered or noisy; of a stereo model motion or "
-        "motion-ideal. Default: recovered; for intervals and `learn eval` as in training."
+        "motion-ideal. Default: recovered; for `learn eval` as in training."
     ),
 ]
 Threads = Annotated[int | None, Option(help="CPU threads. Default: half the cores.")]
@@ -57,9 +57,11 @@ def train_command(
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
     labels: Annotated[
         list[Path] | None,
-        Option(help="A dataset of which only the truth is used, by a mixed input; repeat for more."),
+        Option(help="A dataset of which only the true motion and force are used; repeat for more."),
     ] = None,
-    start: Annotated[str | None, Option(help="A model to start from: its folder, mono or stereo.")] = None,
+    start: Annotated[
+        str | None, Option(help="Start with this model's weights: a folder, mono or stereo.")
+    ] = None,
     preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
     threads: Threads = None,
@@ -85,17 +87,19 @@ def train_command(
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
     if labels and len(sources(settings.input)) < 2:
         raise UserError(f"--labels needs a mixed input, not {settings.input}")
+    begin = read_model(find_model(start)) if start else None
     with made_folder(out, disk_needed(out, settings.arch)):
         datasets = [dataset, *(also or [])]
         clips = _read(datasets, settings.grid, sources(settings.input), cache)
         clips, split = divide(clips, datasets, settings.seed, _console.print)
         if labels:
+            count = len(split.fit)
             truth = _read(labels, settings.grid, sources(settings.input)[:1], cache)
             clips, split = add_labels(clips, split, truth)
+            _console.print(f"{len(split.fit) - count} of {len(truth)} sequences of --labels are trained on.")
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
-            model = read_model(find_model(start)) if start else None
-            card = train(clips, split, settings, out, start=model, device=device, report=progress, log=log)
+            card = train(clips, split, settings, out, start=begin, device=device, report=progress, log=log)
     if card.intervals is None and card.weights_hash:
         with counting("Fitting intervals") as progress:
             card = add_intervals(out, load_model(out), clips, split, report=progress)
@@ -264,6 +268,8 @@ def calibrate_command(
     from learn.training.threads import set_threads
 
     set_threads(threads)
+    if wrong := [one for one in data if one.suffix not in (".npz", ".zarr")]:
+        raise UserError(f"{wrong[0]}: not a press (.zarr or .npz); intervals are fitted by `learn train`")
     predictor = load_model(model)
     presses = [motion for one in data for motion in motions(one, predictor.stored(input))]
     young = {press.name: calibrate(predictor, press) for press in presses}

@@ -31,15 +31,15 @@ class TrainingSettings(Section):
     arch: Architecture = Architecture()
     loss: Loss = "antighost"
     input: Input = "ideal"
-    """Displacement to train on. `mixed`: each frame is drawn ideal, recovered, or ideal with the error of
-    another frame (`learn.training.error_transfer`). `motion`, `motion-ideal`, `motion-mixed`: stereo motion,
-    recovered, true or mixed; they need `arch.depth`."""
+    """Displacement to train on. `mixed`: drawn for each frame, ideal, recovered, or ideal with another error
+    (`learn.training.error_transfer`). `motion`, `motion-ideal`, `motion-mixed`: stereo motion, recovered,
+    true or mixed; they need `arch.depth`."""
     epochs: AtLeastOne = 50
     batch: AtLeastOne = 8
     learning_rate: Positive = 5e-4
     schedule: Literal["plateau", "cosine"] = "plateau"
-    """`plateau`: the learning rate is halved when the score stalls, as published; `cosine`: a warm-up over a
-    twentieth of the run, then half a cosine to zero, for runs too short for a plateau."""
+    """`plateau`: the learning rate is halved when the score stalls, as published; the best epoch is stored.
+    `cosine`: a warm-up over a twentieth of the run, half a cosine to zero; the last epoch is stored."""
     surface_motion_mm: NonNegative = 0.0
     """Standard deviation of a random motion of the whole surface, without force, that is added to half of the
     frames: along the optical axis (with `arch.depth`), and a third of it across. It shifts, tilts and bulges,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -80,8 +80,10 @@ def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
 
 
 def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> tuple[list[Clip], Split]:
-    """All clips, `labels` in the fit part of the split but for those with a brain of another part."""
-    every = [*clips, *labels]
+    """All clips, `labels` in the fit part but for copies and for those with a brain of another part."""
+    known = {clip.content_hash for clip in clips}
+    new = [one for one in labels if one.content_hash not in known]
+    every = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
     number = groups(every)
     other = {number[i] for part in (split.select, split.test, split.intervals) for i in part}
     more = (i for i in range(len(clips), len(every)) if number[i] not in other)
@@ -155,7 +157,11 @@ def regroup(clips: Sequence[Clip], unit: Unit) -> list[Clip]:
 
 def find_unit(card: ModelCard) -> Unit:
     """The unit of the groups in a model's card."""
-    names = [name for part in card.groups.values() for name in part]
+    return _unit(name for part in card.groups.values() for name in part)
+
+
+def _unit(names: Iterable[str]) -> Unit:
+    names = [*names]
     if any(_SEQUENCE in name for name in names):
         return "sequence"
     return "opening" if any(_OPENING in name for name in names) else "anatomy"

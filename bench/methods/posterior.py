@@ -150,7 +150,7 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated:
 
     Their correlations matter: breathing lifts and bends the surface as one, a contact bends it alone. Modes
     within the noise are included: without them intervals are too narrow. Not `correlated`: one size per
-    component, for frames that contacts may be in.
+    component, for frames that may have contacts.
     """
     components = len(basis.motion) // len(basis.known.points)
     terms = polynomials(basis.known.points)
@@ -168,10 +168,12 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated:
             excess.append(np.outer(both, both) - block_diag(*error))
     if not excess:
         return np.zeros((components, terms.shape[1], 0))
-    mean = (1 - MODEL.independent) * np.mean(excess, axis=0)
-    mean += MODEL.independent / (1 - MODEL.independent) * np.diag(np.maximum(np.diag(mean), 0))
-    if not correlated:
-        mean = np.diag(np.repeat(np.mean(excess, axis=0).diagonal().reshape(components, -1).mean(axis=1), 6))
+    if correlated:
+        mean = (1 - MODEL.independent) * np.mean(excess, axis=0)
+        mean += MODEL.independent / (1 - MODEL.independent) * np.diag(np.maximum(np.diag(mean), 0))
+    else:
+        size = np.mean(excess, axis=0).diagonal().reshape(components, -1).mean(axis=1)
+        mean = np.diag(np.repeat(size, terms.shape[1]))
     values, vectors = eigh(mean)
     modes = MODEL.unmet * vectors[:, values > 0] * np.sqrt(values[values > 0])
     return np.asarray(modes.reshape(components, terms.shape[1], -1), np.float64)

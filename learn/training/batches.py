@@ -45,7 +45,7 @@ class FrameItem(NamedTuple):
     source: str  # displacement, as in `learn.data.clips.FIELDS`
     turn: int = 0  # 0-7, as of `turned`
     membrane_known: bool = False
-    errors: Transfer | None = None  # instead of those of `source`
+    errors: Transfer | None = None  # an error that is added to `source`, with its confidence
 
 
 def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
@@ -81,7 +81,7 @@ class FrameDataset:
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
                 raise UserError(f"{clip.name}: its grid is {len(clip.mask)}², the model's {settings.size}²")
-        self._donors = [(c, clip.frames) for c, clip in enumerate(self.clips) if self._recovered(c)]
+        self._donors = [(c, clip.frames) for c, clip in enumerate(self.clips) if self._has_recovered(c)]
         self._masks = [torch.from_numpy(np.array(c.mask))[None, None].to(device) for c in self.clips]
         self._stored = dict[tuple[int, int, str], tuple[Tensor, ...]]()
         planes = 2 * settings.arch.displacements - 1 + settings.arch.components
@@ -109,18 +109,18 @@ class FrameDataset:
 
     def _with_errors(self, item: FrameItem, rng: np.random.Generator) -> FrameItem:
         """The frame with true or recovered motion, another's error, or its own with another confidence."""
-        share, recovered = rng.random(), self._recovered(item.clip)
-        if share < error_transfer.CERTAIN:
+        share, recovered = rng.random(), self._has_recovered(item.clip)
+        if share < error_transfer.IDEAL:
             return item
         if recovered and share > 1 - error_transfer.RECOVERED:
             return item._replace(source=self.sources[-1])
         parts = self.settings.arch.displacements
         errors = error_transfer.draw(rng, self._donors, parts)
-        if recovered and share > error_transfer.CERTAIN + error_transfer.TRANSFERRED:
+        if recovered and share > error_transfer.IDEAL + error_transfer.TRANSFERRED:
             errors = errors._replace(clip=item.clip, frame=item.frame, factor=(1.0,) * parts)
         return item._replace(errors=errors)
 
-    def _recovered(self, clip: int) -> bool:
+    def _has_recovered(self, clip: int) -> bool:
         return self.sources[-1] in self.clips[clip].displacement
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:

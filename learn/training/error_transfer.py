@@ -3,8 +3,13 @@
 A frame of which only the truth is known gets motion as a video would show it: its true motion, plus the error
 (recovered minus true) and the confidence of another frame, both aligned on the contact. Labels are cheap and
 may be of any mechanics; the errors are real ones. The error's size and sign, and the confidence, are also
-drawn, so that a network learns neither the shortfall of one estimator nor to read force from confidence:
-with the same motion, one trained without this estimated 0.44 to 1.2 times the force by confidence alone.
+drawn, so that a network learns neither one estimator's shortfall nor a link between confidence and force.
+Without this, one network's force for the same motion varied from 0.44 to 1.2 times the true one with
+confidence alone (docs/design.md).
+
+Shares of frames with recovered motion: true motion (`IDEAL`), an error of another frame (`TRANSFERRED`),
+recovered motion (`RECOVERED`); the others have their own error with another confidence. Frames without
+recovered motion have true motion, or an error of another frame.
 """
 
 from __future__ import annotations
@@ -18,12 +23,10 @@ from torch.nn.functional import pad
 
 from learn.data.grid import turned
 
-# Shares of frames with true motion and full confidence; of those with recovered motion also with the error of
-# another frame, and as recovered. The others have their own error with another confidence.
-CERTAIN, TRANSFERRED, RECOVERED = 0.25, 0.25, 0.25
+IDEAL, TRANSFERRED, RECOVERED = 0.25, 0.25, 0.25
 FACTOR = 2.0  # largest factor of a transferred error, of either sign
 SPREAD = 0.8  # standard deviation of the logarithm of the factor of stated deviations
-LARGEST = 3.0  # of the factor by which an error grows with the motion
+LARGEST_SCALE = 3.0  # factor by which an error grows with the motion
 _LEAST_MM = 0.05  # largest motion of a frame without a contact
 _FAR = 0.1  # share of the largest motion; where less moves it is far from the contact
 
@@ -34,7 +37,7 @@ class Transfer(NamedTuple):
     clip: int
     frame: int
     factor: tuple[float, ...]  # of each component of the error
-    deviation: float  # factor of the stated deviation
+    deviation_factor: float  # factor of the stated deviation
 
 
 def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: int) -> Transfer:
@@ -50,9 +53,9 @@ def transfer(
     """Motion and confidence of a frame with the error of another.
 
     `true`, `donor_true`, `error`: (1, C, N, N) mm; `confidence`: of the error, (1, 1 or 2, N, N) in 0..1. The
-    turn or mirror image of the donor is the one whose motion, with the contacts on one place, resembles this
-    frame's most or is most opposite to it; then the error changes sign. A frame without a contact gets the
-    error far from the donor's contact, as it is.
+    turn or mirror image of the donor is the one whose motion, with the contacts aligned, is most like this
+    frame's or most opposite to it; then the error changes sign. If one of the two frames has no contact, the
+    error far from the other's contact is added where it is.
     """
     place, size = _contact(true)
     _, donor_size = _contact(donor_true)
@@ -68,11 +71,11 @@ def transfer(
             alike = float((_shifted(there, moved) * true).sum())
             if abs(alike) > abs(likeness):
                 likeness, turn, shift = alike, one, moved
-        scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST)
+        scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
     factor = scale * error.new_tensor(how.factor).view(1, -1, 1, 1)
     sure = _shifted(turned(confidence.transpose(0, 1), turn).transpose(0, 1), shift)
-    # See `learn.data.grid.certainty`.
-    sure = sure / (sure + how.deviation**2 * (1 - sure)).clamp_min(1e-6)
+    # As of `learn.data.grid.certainty`, and of flow's confidence.
+    sure = sure / (sure + how.deviation_factor**2 * (1 - sure)).clamp_min(1e-6)
     return true + factor * _shifted(turned(error, turn), shift), sure
 
 

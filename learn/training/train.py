@@ -24,7 +24,7 @@ from learn.evaluation.metrics import agreement, moments
 from learn.loss import full, loss
 from learn.network.d2fnet import D2FNet
 from learn.settings import TrainingSettings, replace
-from learn.split import Split, name_parts
+from learn.split import Split, find_unit, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
@@ -57,9 +57,8 @@ def train(
     trained on is the part `start` of the card. `report` is called after every batch, `log` with each epoch's
     numbers.
 
-    Returns the card of the last epoch, by the schedule `plateau` of the best one. Raises UserError if `out`
-    holds another run, on divergence, and for a `start` of another architecture or that was trained on brains
-    of the select or interval part.
+    Returns the card of the stored epoch: the last with `cosine`, the best with `plateau`. Raises UserError if
+    `out` holds another run, on divergence, and for a `start` that `_begun` refuses.
     """
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
     scales = start[1].scales if start else measure_scales(fit, settings)
@@ -68,13 +67,8 @@ def train(
     recovered = (clip.recovered_by for clip in fit if source in RECOVERED and source in clip.displacement)
     motion = sorted({*recovered} - {""})
     parts = name_parts(clips, split)
-    if start:
-        for known, new in zip((start[1].split, start[1].groups), parts, strict=True):
-            new["start"] = sorted({one for part in USED for one in known.get(part, ())})
-            fitted = {*known["fit"], *known.get("start", ())}
-            if fitted & {*new["select"], *new.get("intervals", ())}:
-                raise UserError("start: was trained on brains of this data's validation side")
     card = ModelCard(settings, scales, typical_young, *parts, [*split.hashes], motion=motion)
+    card = _begun(card, start[1]) if start else card
     state = _open(out, card)
     try:
         run = _start(card, state, torch.device(device), start and start[0])
@@ -101,6 +95,31 @@ def train(
     return checkpoint.read_card(out)
 
 
+def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
+    """The card of a training that begins with the weights of a model with the card `start`.
+
+    UserError if that is of another architecture, grid or unit of the split, or was trained on brains of the
+    select, interval or test part.
+    """
+    shapes = {
+        (one.settings.arch.model_copy(update={"dropout": 0.0}), one.settings.grid) for one in (card, start)
+    }
+    if len(shapes) > 1:
+        raise UserError("start: a model of another architecture or grid")
+    if find_unit(card) != find_unit(start):
+        raise UserError("start: its data were split by another unit (anatomy, opening or sequence)")
+    for known, new in ((start.split, card.split), (start.groups, card.groups)):
+        for part, used in {
+            "select": ("fit", "start"),
+            "intervals": ("fit", "select", "start"),
+            "test": USED,
+        }.items():
+            if {one for name in used for one in known.get(name, ())}.intersection(new.get(part, ())):
+                raise UserError(f"start: was trained on brains of this data's {part} part")
+        new["start"] = sorted({one for name in USED for one in known.get(name, ())})
+    return dataclasses.replace(card, motion=sorted({*card.motion, *start.motion}))
+
+
 def _write_numbers(file: Path, board: SummaryWriter, epoch: int, numbers: dict[str, float]) -> None:
     """Writes the numbers of epoch `epoch`, counted from 0, as a line of JSON and as TensorBoard events."""
     lines = file.read_text().splitlines()[:epoch] if file.exists() else []
@@ -125,9 +144,9 @@ class _Run:
         self.epoch += 1
         if settings.schedule == "plateau":
             self.plateau.step(score)
-        # No epoch before the loss has its full penalty on off-target force. By a cosine schedule the last:
-        # the best on the select side erred half as much again on other mechanics (design.md).
-        chosen = score > self.best or settings.schedule == "cosine"
+        # No epoch before the loss has its full penalty on off-target force. With `cosine` the last one: the
+        # best on the select side erred half as much again on other mechanics (design.md).
+        chosen = score > (-math.inf if settings.schedule == "cosine" else self.best)
         improved = full(settings.loss, self.epoch / settings.epochs) and chosen
         self.best = score if improved else self.best
         return improved
@@ -145,8 +164,7 @@ def _start(
     torch.manual_seed(settings.seed)
     model = D2FNet(settings.arch)
     if start is not None:
-        with as_user_error("start: a model of another architecture"):
-            model.load_state_dict(start.state_dict())
+        model.load_state_dict(start.state_dict())
     model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     # `fused` saves a fifth of a small network's training time on a CPU.
     optimizer = AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=WEIGHT_DECAY, fused=True)

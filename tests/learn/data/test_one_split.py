@@ -192,7 +192,6 @@ def test_labels_join_training_unless_their_brain_is_on_another_side(tmp_path: Pa
     other = {*card.groups["select"], *card.groups["test"]}
     assert {c.content_hash for c in labels if c.group not in other} <= {*card.split["fit"]}
     assert not {c.content_hash for c in labels if c.group in other} & {*card.split["fit"]}
-    run(cli.app, "train", own, "--labels", truth, "--input", "ideal", "-o", tmp_path / "n", code=2)
     run(cli.app, "train", own, "--start", tmp_path / "m", *words[:-1], tmp_path / "again")
     assert {*card.split["fit"]} <= {*read_card(tmp_path / "again").split["start"]}
     run(synth, "split", own, "--shares", "0.2,0.6,0.2")
