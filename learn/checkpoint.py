@@ -39,8 +39,7 @@ _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequenc
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
-# Parts of `ModelCard.split` that the model must not be scored on.
-USED = ("fit", "select", "intervals", "start")
+USED = ("fit", "select", "intervals", "start")  # parts of `ModelCard.split` that it must not be scored on
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from synth.system.terminal import counting
 if TYPE_CHECKING:
     from learn.data.clips import Clip
     from learn.data.grid import Grid
+    from learn.settings import TrainingSettings
+    from learn.split import Split
     from learn.uncertainty.intervals import Intervals
 
 app = typer.Typer(
@@ -55,13 +57,8 @@ def train_command(
     ] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder for the model.")] = Path("model"),
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
-    labels: Annotated[
-        list[Path] | None,
-        Option(help="A dataset of which only the true motion and force are used; repeat for more."),
-    ] = None,
-    start: Annotated[
-        str | None, Option(help="Start with this model's weights: a folder, mono or stereo.")
-    ] = None,
+    labels: Annotated[list[Path] | None, Option(help="A dataset of which only the truth is used.")] = None,
+    start: Annotated[str | None, Option(help="A model to start from: a folder, mono or stereo.")] = None,
     preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
     threads: Threads = None,
@@ -70,12 +67,10 @@ def train_command(
 ) -> None:
     """Train D2FNet on a dataset. The same command continues an interrupted run."""
     from learn.checkpoint import disk_needed, read_model
-    from learn.data.clips import sources
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
     from learn.inference.shipped import find_model
     from learn.settings import preset as named
-    from learn.split import add_labels, divide
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
@@ -85,18 +80,9 @@ def train_command(
     device = choose_device(accelerator)
     dataset, given = _split_arguments(str(dataset), changes or [])
     settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
-    if labels and len(sources(settings.input)) < 2:
-        raise UserError(f"--labels needs a mixed input, not {settings.input}")
     begin = read_model(find_model(start)) if start else None
     with made_folder(out, disk_needed(out, settings.arch)):
-        datasets = [dataset, *(also or [])]
-        clips = _read(datasets, settings.grid, sources(settings.input), cache)
-        clips, split = divide(clips, datasets, settings.seed, _console.print)
-        if labels:
-            count = len(split.fit)
-            truth = _read(labels, settings.grid, sources(settings.input)[:1], cache)
-            clips, split = add_labels(clips, split, truth)
-            _console.print(f"{len(split.fit) - count} of {len(truth)} sequences of --labels are trained on.")
+        clips, split = _divided([dataset, *(also or [])], labels or [], settings, cache)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
             card = train(clips, split, settings, out, start=begin, device=device, report=progress, log=log)
@@ -136,6 +122,25 @@ def _read(datasets: Iterable[Path], grid: Grid, wanted: Sequence[str], cache: Pa
         with counting("Reading sequences") as progress:
             clips += load_clips(one, grid, wanted, cache=cache, report=progress)
     return clips
+
+
+def _divided(
+    datasets: Sequence[Path], labels: Sequence[Path], settings: TrainingSettings, cache: Path | None
+) -> tuple[list[Clip], Split]:
+    """The sequences of datasets and of those for labels, and what each is for."""
+    from learn.data.clips import sources
+    from learn.split import add_labels, divide
+
+    wanted = sources(settings.input)
+    if labels and len(wanted) < 2:
+        raise UserError(f"--labels needs a mixed input, not {settings.input}")
+    clips = _read(datasets, settings.grid, wanted, cache)
+    clips, split = divide(clips, datasets, settings.seed, _console.print)
+    count, truth = len(split.fit), _read(labels, settings.grid, wanted[:1], cache)
+    clips, split = add_labels(clips, split, truth)
+    if labels:
+        _console.print(f"{len(split.fit) - count} of {len(truth)} sequences of --labels are trained on.")
+    return clips, split
 
 
 def _describe(found: Intervals) -> str:

@@ -125,9 +125,9 @@ def choose_unseen(
 
 def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
-    brains = {name for part in USED for name in card.groups.get(part, ())}
+    brains, used = {name for part in USED for name in card.groups.get(part, ())}, card.used
     grouped = zip(clips, regroup(clips, find_unit(card)), strict=True)
-    return [c for c, of in grouped if c.content_hash not in card.used and of.group not in brains]
+    return [c for c, of in grouped if c.content_hash not in used and of.group not in brains]
 
 
 def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str:

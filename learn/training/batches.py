@@ -46,6 +46,7 @@ class FrameItem(NamedTuple):
     turn: int = 0  # 0-7, as of `turned`
     membrane_known: bool = False
     errors: Transfer | None = None  # an error that is added to `source`, with its confidence
+    deviation_factor: float = 1.0  # of the deviation that the confidence states
 
 
 def add_surface_motion(batch: Batch, settings: TrainingSettings, generator: torch.Generator) -> Batch:
@@ -81,7 +82,8 @@ class FrameDataset:
         for clip in self.clips:
             if clip.mask.shape != (settings.size, settings.size):
                 raise UserError(f"{clip.name}: its grid is {len(clip.mask)}², the model's {settings.size}²")
-        self._donors = [(c, clip.frames) for c, clip in enumerate(self.clips) if self._has_recovered(c)]
+        self._recovered = [self.sources[-1] in clip.displacement for clip in self.clips]
+        self._donors = [(c, clip.frames) for c, clip in enumerate(self.clips) if self._recovered[c]]
         self._masks = [torch.from_numpy(np.array(c.mask))[None, None].to(device) for c in self.clips]
         self._stored = dict[tuple[int, int, str], tuple[Tensor, ...]]()
         planes = 2 * settings.arch.displacements - 1 + settings.arch.components
@@ -103,25 +105,20 @@ class FrameDataset:
         known = [False] * len(items)
         if self.settings.arch.membrane:
             known = [bool(one) for one in rng.random(len(items)) >= MEMBRANE_HIDDEN]
-        first = self.sources[0]
-        drawn = [FrameItem(items[i][0], items[i][1], first, int(turn[i]), known[i]) for i in order]
+        drawn = [FrameItem(items[i][0], items[i][1], self.sources[0], int(turn[i]), known[i]) for i in order]
         return [self._with_errors(one, rng) for one in drawn] if len(self.sources) > 1 else drawn
 
     def _with_errors(self, item: FrameItem, rng: np.random.Generator) -> FrameItem:
         """The frame with true or recovered motion, another's error, or its own with another confidence."""
-        share, recovered = rng.random(), self._has_recovered(item.clip)
+        share, recovered = rng.random(), self._recovered[item.clip]
         if share < error_transfer.IDEAL:
             return item
         if recovered and share > 1 - error_transfer.RECOVERED:
             return item._replace(source=self.sources[-1])
-        parts = self.settings.arch.displacements
-        errors = error_transfer.draw(rng, self._donors, parts)
+        errors, factor = error_transfer.draw(rng, self._donors, self.settings.arch.displacements)
         if recovered and share > error_transfer.IDEAL + error_transfer.TRANSFERRED:
-            errors = errors._replace(clip=item.clip, frame=item.frame, factor=(1.0,) * parts)
-        return item._replace(errors=errors)
-
-    def _has_recovered(self, clip: int) -> bool:
-        return self.sources[-1] in self.clips[clip].displacement
+            return item._replace(source=self.sources[-1], deviation_factor=factor)
+        return item._replace(errors=errors, deviation_factor=factor)
 
     def sequential(self, clip: int, source: str) -> Iterator[Batch]:
         """All frames of one clip, in order, not turned."""
@@ -133,13 +130,15 @@ class FrameDataset:
     def batch(self, items: Sequence[FrameItem]) -> Batch:
         """The frames of `items` as tensors."""
         frames = []
-        for c, t, source, turn, known, errors in items:
+        for c, t, source, turn, known, errors, factor in items:
             moved, confidence, true = self._read(c, t, source)
             if errors is not None:
                 there = self._read(errors.clip, errors.frame, self.sources[-1])
                 donor = self._read(errors.clip, errors.frame, self.sources[0])[0]
                 moved, confidence = error_transfer.transfer(moved, donor, there[0] - donor, there[1], errors)
                 moved, confidence = moved * self._masks[c], confidence * self._masks[c]
+            if factor != 1:
+                confidence = error_transfer.restated(confidence, factor)
             code = membrane_code(self.clips[c].membrane) if known else 0.0
             codes = torch.full((1,), code, device=self.device)
             frames.append(Batch(moved, self._masks[c], confidence, true, codes).turned(turn))

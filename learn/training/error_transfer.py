@@ -37,14 +37,18 @@ class Transfer(NamedTuple):
     clip: int
     frame: int
     factor: tuple[float, ...]  # of each component of the error
-    deviation_factor: float  # factor of the stated deviation
 
 
-def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: int) -> Transfer:
-    """A frame out of `donors` (clip, frames of it), and the factors."""
+def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: int) -> tuple[Transfer, float]:
+    """A frame out of `donors` (clip, frames of it) with factors, and the factor of the stated deviation."""
     clip, frames = donors[int(rng.integers(len(donors)))]
     factor = tuple(float(one) for one in rng.uniform(-FACTOR, FACTOR, components))
-    return Transfer(clip, int(rng.integers(frames)), factor, float(np.exp(rng.normal(0, SPREAD))))
+    return Transfer(clip, int(rng.integers(frames)), factor), float(np.exp(rng.normal(0, SPREAD)))
+
+
+def restated(confidence: Tensor, factor: float) -> Tensor:
+    """The confidence for deviations `factor` times as large, as of `learn.data.grid.certainty`."""
+    return confidence / (confidence + factor**2 * (1 - confidence)).clamp_min(1e-6)
 
 
 def transfer(
@@ -73,10 +77,8 @@ def transfer(
                 likeness, turn, shift = alike, one, moved
         scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
     factor = scale * error.new_tensor(how.factor).view(1, -1, 1, 1)
-    sure = _shifted(turned(confidence.transpose(0, 1), turn).transpose(0, 1), shift)
-    # As of `learn.data.grid.certainty`, and of flow's confidence.
-    sure = sure / (sure + how.deviation_factor**2 * (1 - sure)).clamp_min(1e-6)
-    return true + factor * _shifted(turned(error, turn), shift), sure
+    planes = turned(confidence.transpose(0, 1), turn).transpose(0, 1)
+    return true + factor * _shifted(turned(error, turn), shift), _shifted(planes, shift)
 
 
 def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:

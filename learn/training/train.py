@@ -53,9 +53,8 @@ def train(
     """Trains on `split.fit` and scores on `split.select`; `split.test` is not used.
 
     An unfinished run of the same settings and data in `out` is continued, with the result (bit for bit on one
-    CPU) of an uninterrupted run. `start`: a model from whose weights and scales training starts; what it was
-    trained on is the part `start` of the card. `report` is called after every batch, `log` with each epoch's
-    numbers.
+    CPU) of an uninterrupted run. `start`: a model whose weights and scales training starts from; what it was
+    trained on is the card's part `start`. `report` is called after a batch, `log` with an epoch's numbers.
 
     Returns the card of the stored epoch: the last with `cosine`, the best with `plateau`. Raises UserError if
     `out` holds another run, on divergence, and for a `start` that `_begun` refuses.
@@ -109,11 +108,8 @@ def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
     if find_unit(card) != find_unit(start):
         raise UserError("start: its data were split by another unit (anatomy, opening or sequence)")
     for known, new in ((start.split, card.split), (start.groups, card.groups)):
-        for part, used in {
-            "select": ("fit", "start"),
-            "intervals": ("fit", "select", "start"),
-            "test": USED,
-        }.items():
+        barred = {"select": ("fit", "start"), "intervals": ("fit", "select", "start"), "test": USED}
+        for part, used in barred.items():
             if {one for name in used for one in known.get(name, ())}.intersection(new.get(part, ())):
                 raise UserError(f"start: was trained on brains of this data's {part} part")
         new["start"] = sorted({one for name in USED for one in known.get(name, ())})
