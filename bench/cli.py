@@ -124,8 +124,12 @@ def pool(
 
 
 @app.command(epilog="Example: bench init recording")
-def init(recording: Annotated[Path, Argument(help="Recording folder; it may exist.")]) -> None:
+def init(
+    recording: Annotated[Path, Argument(help="Recording folder; it may exist.")],
+    protocol: Annotated[bool, Option("--protocol", help="Also write what to record: protocol.md.")] = False,
+) -> None:
     """Writes a recording's meta.yaml with an explanation of every key."""
+    from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
     path = recording / "meta.yaml"
@@ -133,6 +137,8 @@ def init(recording: Annotated[Path, Argument(help="Recording folder; it may exis
         recording.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(commented())
+        if protocol:
+            (recording / "protocol.md").write_text(as_markdown(), "utf-8")
     print(f"wrote {path}; fill in its scale, then: bench check {recording}")
 
 

@@ -18,6 +18,7 @@ import api_page
 import typer
 from pydantic import BaseModel
 
+from bench.checks import protocol
 from bench.recording.meta import Meta
 from synth.dataset.size_forecast import amount, field_bytes
 from synth.fields import FIELDS, STORED_WHEN, TIME
@@ -98,6 +99,35 @@ and its depth is
 """
 
 
+_PROTOCOL_HEAD = """\
+# A first specimen
+
+The list is written by `make docs` from `bench/checks/protocol.yaml`. An afternoon's protocol for a
+recording from which force can be estimated and scored. `bench init --protocol RECORDING` writes the list at
+the end of this page next to a `meta.yaml`; `bench check RECORDING` says which steps a recording has, and
+what each missing one costs. The keys are those of [`meta.yaml`](../reference/recording.md).
+
+## Settings
+
+| | recommended | the published experiment (Heraoui et al.) |
+| --- | --- | --- |
+| camera | a stereo microscope, both cameras recorded | one endoscope |
+| frames a second | 20 or more | 23 |
+| picture | 640 × 480 px or more, tissue from edge to edge | 680 × 480 px |
+| force sensor | at least 10 times the frame rate, noise below 1% of the largest force | SensONE |
+| clocks | one clock, or taps | |
+| stiffness | measured next to the site | 0.5 kPa throughout |
+
+Scale, stiffness and a second camera decide most: force is proportional to stiffness and to the square of
+the scale, and one camera hardly measures force along its line of sight. What a statement in `meta.yaml`
+gains, from scale and stiffness alone to the state of the membrane, is measured on rendered recordings: see
+*undegraded recordings* in [stability](../results/scoring/stability/README.md).
+
+## Steps
+
+"""
+
+
 def pages() -> dict[Path, str]:
     """The generated pages: path and text."""
     return {
@@ -106,6 +136,7 @@ def pages() -> dict[Path, str]:
         DOCS / "reference" / "recording.md": _recording(),
         DOCS / "reference" / "commands.md": _commands(),
         DOCS / "reference" / "python.md": api_page.write_page(_WRITTEN),
+        DOCS / "howto" / "protocol.md": _PROTOCOL_HEAD + protocol.as_markdown(),
         ROOT / "CONTRIBUTING.md": _contributing(),
         ROOT / "mkdocs.yml": _site(),
     }

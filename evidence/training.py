@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from evidence import cache, report
+from evidence.flow.networks import write_onnx
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
@@ -55,11 +56,10 @@ def follow(average: torch.nn.Module, net: torch.nn.Module, share: float) -> None
                 mean.lerp_(now, share)
 
 
-def export(net: torch.nn.Module, weights: Path, card: Mapping[str, Any]) -> None:
-    """Writes the weights of a network at half precision, and next to them its card as JSON."""
+def export(net: torch.nn.Module, weights: Path, card: Mapping[str, Any], channels: int) -> None:
+    """Writes a network of `flow.networks` with its number of inputs, and next to it its card."""
     weights.parent.mkdir(parents=True, exist_ok=True)
-    state = net.state_dict().items()
-    torch.save({name: v.half() if v.is_floating_point() else v for name, v in state}, weights)
+    write_onnx(net, weights, channels)
     card = {**card, "parameters": sum(p.numel() for p in net.parameters()), "torch": torch.__version__}
     report.save(weights.parent, f"{weights.stem}.json", card)
     print(card)

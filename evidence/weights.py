@@ -60,15 +60,15 @@ def measure(
     about = {"generator": generator, "seed": seed}
     about["sequences"] = {job: len(some) for job, some in files.items()}
     below: dict[str, str] = {}
-    parts = {"segmentation": segmentation, "correction": correction, "depth_correction": depth_correction}
-    for name, part in parts.items():
+    for part in (segmentation, correction, depth_correction):
+        name = part.__name__.rpartition(".")[2]
         depth = part is depth_correction
         settings: dict[str, Any] = {"drawn": drawn, "minutes": minutes}
         if part is segmentation:
             settings = {"steps": steps, "device": device}
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
-        made = folder / f"{name}-{key}.pt"
+        made = folder / f"{name}-{key}.onnx"
         if not made.with_suffix(".json").exists():  # written last
             net: torch.nn.Module
             if part is segmentation:
@@ -77,10 +77,10 @@ def measure(
             else:
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
-            training.export(net, made, card | data)
-        weights = folder / "made" / f"{name}.pt"
+            training.export(net, made, card | data, part.CHANNELS)
+        weights = folder / "made" / f"{name}.onnx"
         weights.parent.mkdir(exist_ok=True)
-        for suffix in (".pt", ".json"):
+        for suffix in (".onnx", ".json"):
             shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
         vars(part).update(WEIGHTS=made)  # the next part learns from what is recovered with these
         below[name] = hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]

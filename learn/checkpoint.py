@@ -10,6 +10,8 @@ import io
 import json
 import math
 import os
+import pickle
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -125,6 +127,24 @@ def read_card(folder: Path) -> ModelCard:
         raise UserError(f"{file}: damaged or of another version ({first_mistake(error)})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
+
+
+def read_tensors(path: Path) -> dict[str, Any]:
+    """The tensors and plain values that `torch.save` wrote, by name, on the CPU. UserError for others."""
+    with checked_file.open_file(path, _LARGEST_WEIGHTS) as file, as_user_error(f"{path}: corrupt checkpoint"):
+        with zipfile.ZipFile(file) as archive:  # PyTorch ignores checksums
+            if sum(entry.file_size for entry in archive.infolist()) > os.fstat(file.fileno()).st_size:
+                raise ValueError("compressed")
+            if (damaged := archive.testzip()) is not None:
+                raise ValueError(f"a checksum of {damaged} does not match")
+        try:
+            file.seek(0)
+            tree = torch.load(file, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:  # its message advises to load them all the same
+            raise ValueError("holds other objects than tensors and plain values") from None
+        if not isinstance(tree, dict):
+            raise TypeError("holds no state")
+        return tree
 
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:

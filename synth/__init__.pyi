@@ -1,3 +1,4 @@
+from .dataset.sample import sample as sample
 from .dataset.store import Dataset as Dataset
 from .dataset.store import Sequence as Sequence
 from .dataset.store import open_sequence as open_sequence

@@ -267,7 +267,11 @@ def export(
     out: Out,
     target: Annotated[Path, Argument(help="The new folder.")],
     to: Annotated[
-        str, Option(help="folder, hf, webdataset, lerobot, endonerf, tapvid, hdf5, d2fnet-npz, vtu or video.")
+        str,
+        Option(
+            help="folder, hf, webdataset, lerobot, endonerf, tapvid, flow-pairs, hdf5, d2fnet-npz, vtu or "
+            "video."
+        ),
     ] = "folder",
     overlay: Annotated[
         list[str] | None, Option(help="Of a video: flow, recovered, force, none. [default: flow and force]")
@@ -317,39 +321,24 @@ def verify(
 def view(
     out: Out,
     sequence: Index = 0,
-    save: Annotated[Path, Option(help="A picture (.png, .jpg), or an .rrd.")] = Path("view.png"),
+    save: Annotated[Path, Option(help="The picture, .png or .jpg.")] = Path("view.png"),
     frame: Annotated[
-        list[int] | None,
-        Option("--frame", "-f", help="Of a picture; repeatable; default: the largest force."),
+        list[int] | None, Option("--frame", "-f", help="Repeatable; default: the largest force.")
     ] = None,
 ) -> None:
-    """Draws frames of a sequence with their flow and force map side by side, as in the README.
-
-    Or writes all of it for the viewer rerun: frames, depth, flow, traction and force over time.
-    """
+    """Draws frames of a sequence with their flow and force map side by side, as in the README."""
     from synth.dataset import location
     from synth.dataset.store import open_sequence
     from synth.publish.picture import draw_sequence, strongest
-    from synth.publish.rerun_view import save_recording
     from synth.system.checked_file import write_picture
 
-    if save.suffix.lower() not in (".rrd", ".png", ".jpg", ".jpeg"):
-        raise UserError(f"{save}: its name must end with .rrd for a recording, .png or .jpg for a picture")
-    pictured = save.suffix.lower() != ".rrd"
-    if frame and not pictured:
-        raise UserError("--frame needs --save with a name that ends with .png or .jpg")
+    if save.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise UserError(f"{save}: its name must end with .png or .jpg")
     chosen = open_sequence(location.store(out, sequence))
-    if pictured:
-        rows = draw_sequence(chosen, frame or [strongest(chosen)])
-        save.parent.mkdir(parents=True, exist_ok=True)
-        write_picture(save, rows)
-        print(f"wrote {save}")
-    else:
-        save_recording(chosen, save)
-        print(f"wrote {save}; open it with: rerun {save}")
-        print(
-            "rerun sends anonymous usage data to its makers until `rerun analytics disable`", file=sys.stderr
-        )
+    rows = draw_sequence(chosen, frame or [strongest(chosen)])
+    save.parent.mkdir(parents=True, exist_ok=True)
+    write_picture(save, rows)
+    print(f"wrote {save}")
 
 
 @app.command(epilog="Example: synth doctor .")

@@ -18,7 +18,7 @@ FIRST = 2  # written by 0.2, the first release: nothing older is read
 @cache
 def motion_version() -> str:
     """Version of recovered motion, `MOTION` and a digest of the weights below it: `4-0a1b2c3d`."""
-    weights = b"".join(file.read_bytes() for file in sorted(MOTION_WEIGHTS.rglob("*.pt")))
+    weights = b"".join(file.read_bytes() for file in sorted(MOTION_WEIGHTS.rglob("*.onnx")))
     return f"{MOTION}-{hashlib.blake2b(weights, digest_size=4).hexdigest()}"
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from bench.checks.judgement import judge
+from bench.checks.protocol import check_protocol
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording, open_recording
 from bench.tracking.tracking import TrackedRecording, track_recording
@@ -45,7 +46,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
     except UserError as error:
         failed, tracked = [Finding("error", "tracking", str(error))], _decode(recording)
     tracked.scale_mm_per_px = mm_per_px
-    return by_severity([*failed, *judge(recording, tracked)])
+    return by_severity([*failed, *judge(recording, tracked), *check_protocol(recording)])
 
 
 def _track_some(recording: Recording, mm_per_px: float, picture: Path | None) -> TrackedRecording:

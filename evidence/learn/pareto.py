@@ -1,6 +1,6 @@
 """Time and error of networks: each preset's and others on the same grid.
 
-An hour on a core; without --cache only times.
+Without --dataset only times.
 """
 
 import time
@@ -16,13 +16,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
 from evidence.intervals import difference, mean_of
-from evidence.learn import labels
-from evidence.learn.runs import JOB, Run, base_settings, by_sequence, carry_out, pictured
+from evidence.learn.runs import Run, base_settings, by_sequence, carry_out
 from evidence.study import Study
+from learn.data.clips import load_clips
 from learn.data.grid import Grid, Scales, channels
 from learn.network.d2fnet import Architecture, D2FNet, freeze, fused
 from learn.settings import PRESETS, replace
-from synth.job import reader
 
 OTHERS: Mapping[str, tuple[tuple[int, int, int], ...]] = {
     "live": ((16, 4, 3), (8, 4, 4), (12, 4, 4), (16, 4, 4)),
@@ -39,32 +38,36 @@ LIGHT = 5e9  # FLOP a frame up to which a network is timed `repeats` times
 
 
 def measure(
-    cache: Path | None = None, repeats: int = 60, seeds: int = 1, device: str = "cpu"
+    dataset: Path | None = None,
+    cache: Path = Path("runs/networks"),
+    repeats: int = 60,
+    seeds: int = 1,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Errors of networks trained in equal steps, and the time of one frame on one core or a GPU."""
     shapes = [(PRESETS[name].size, *shape) for name, group in OTHERS.items() for shape in group]
-    known = {} if cache is None else errors(cache, seeds)
+    known = {} if dataset is None else errors(dataset, cache, seeds)
     rows = time_networks([*shapes, *HEAVY], repeats, device)
     return {
         "device": device if device == "cpu" else torch.cuda.get_device_name(),
         "torch": torch.__version__,
-        "data": status.data(JOB),
+        "data": status.data(*filter(None, [dataset])),
         "trained": {name: PRESETS[name].loss for name in OTHERS if known},
         "rows": [row | known.get(key(row), {}) for row in rows],
     }
 
 
-def errors(cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
+def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
     """Errors of `OTHERS`, trained with the loss and dropout of their preset, else as `base_settings`, fold 0.
 
     Returns:
         By grid, width, stem and levels: `map_rmse` [mN/mm²], mean over sequences with its interval, and
         `against`, its difference from the preset's, relative.
     """
-    job, found = reader.load_job(str(JOB)), {}
+    found = {}
     for name, group in OTHERS.items():
         preset = PRESETS[name]
-        clips = labels.clips(pictured(job, preset.size), Grid(preset.size), cache)
+        clips = load_clips(dataset, Grid(preset.size), ("ideal",), cache=cache)
         usual = replace(base_settings(), size=preset.size, loss=preset.loss)
         runs: dict[tuple[int, int, int], list[dict[str, Any]]] = {}
         for shape, seed in product(group, range(seeds)):
@@ -205,4 +208,4 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
     return report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True)
 
 
-STUDY = Study(measure, "learn/pareto/pareto.json", page, ("--cache {work}/labels",))
+STUDY = Study(measure, "learn/pareto/pareto.json", page, ("--dataset {mission} --cache {work}/networks",))

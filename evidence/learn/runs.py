@@ -1,8 +1,4 @@
-"""Comparison of losses: networks trained on labels without images, over seeds and folds, paired by sequence.
-
-9 trainings of 80 to 100 core-seconds on 300 sequences; with --sequences 1500 --folds 3 --seeds 1 each anatomy
-is tested once (350 core-seconds a training).
-"""
+"""Comparison of losses: networks trained on ideal flow, over seeds and folds, paired by sequence."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -17,9 +13,8 @@ import typer
 from evidence import cache as stored
 from evidence import report, status, training
 from evidence.intervals import difference, mean_of
-from evidence.learn import labels
 from evidence.study import Study
-from learn.data.clips import Clip
+from learn.data.clips import Clip, load_clips
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
 from learn.inference.predict import Predictor
@@ -27,11 +22,7 @@ from learn.loss import Loss
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import Split
 from synth.arrays import Floats
-from synth.job import reader
-from synth.job.schema import Job
-from synth.tune.search import changed
 
-JOB = report.RESULTS / "learn/data/labels.yaml"
 LOSSES: tuple[Loss, ...] = ("mse", "antighost", "off-target")
 SCORES = (
     "map_r2",
@@ -61,17 +52,16 @@ class Run:
 
 
 def measure(
-    cache: Path, sequences: int = 300, folds: int = 1, seeds: int = 3, epochs: int = 8
+    dataset: Path, cache: Path = Path("runs/losses"), folds: int = 1, seeds: int = 3, epochs: int = 8
 ) -> dict[str, Any]:
     """Trains with every loss; `cache` gets packed sequences and networks, and completed runs are reused."""
-    job = reader.load_job(str(JOB)).model_copy(update={"sequences": sequences})
-    clips = labels.clips(job, base_settings().grid, cache)
+    clips = load_clips(dataset, base_settings().grid, ("ideal",), cache=cache)
     runs: dict[str, list[dict[str, Any]]] = {}
     for loss, fold, seed in product(LOSSES, range(folds), range(seeds)):
         settings = replace(base_settings(), loss=loss, seed=seed, epochs=epochs)
         one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings, fold), clips, cache)
         runs.setdefault(loss, []).append(one)
-    return {"data": status.data(JOB), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
+    return {"data": status.data(dataset), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -142,15 +132,8 @@ def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
     return training.fit(run.name, clips, _split(run, clips), run.settings, cache / "models")
 
 
-def pictured(job: Job, size: int) -> Job:
-    """The job with images of at least one pixel a cell of a grid of `size`, so that a fine grid has more
-    information than a coarse one."""
-    times = -(-size // job.render.size[0])
-    return changed(job, {"render.size": [times * edge for edge in job.render.size]})
-
-
 def _split(run: Run, clips: Sequence[Clip]) -> Split:
     return training.nested(clips, 3, run.fold, 0)
 
 
-STUDY = Study(measure, "learn/losses/losses.json", page, ("{work}/labels",))
+STUDY = Study(measure, "learn/losses/losses.json", page, ("{mission} --cache {work}/losses",))

@@ -2,13 +2,15 @@
 
 Inputs: `displacement` (B, 2, N, N) mm, in stereo (B, 3, N, N), and `mask` (B, 1, N, N) 0/1; for some models
 `confidence` (B, 1 or, in stereo, 2, N, N) 0..1 and `membrane` (B,): -1 stripped, 0 unknown, 1 intact. Output:
-force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. The .json next to it describes their use.
+force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. The .json next to it describes their use, and
+`NAME.onnx.example.py` runs it on one frame.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
 from learn.inference.predict import Predictor
 from synth.errors import UserError
 
+_EXAMPLE = Path(__file__).with_name("onnx_example.py.txt")
 TOLERANCE = 1e-4  # largest difference from PyTorch allowed, in units of the training data's 99.9th percentile
 
 
@@ -87,6 +90,7 @@ def export(predictor: Predictor, file: Path) -> float:
         file.unlink()
         raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
     file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, worst), indent=1))
+    shutil.copyfile(_EXAMPLE, file.with_suffix(file.suffix + ".example.py"))
     return worst
 
 

@@ -28,7 +28,6 @@ from learn.split import Split, find_unit, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
-from synth.system import checked_file
 from synth.system.terminal import ProgressCallback
 
 CLIP = 1.0  # largest norm of the gradient
@@ -278,7 +277,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     bound = not full(there.settings.loss, 0.0) or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
-    return checked_file.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None
+    return checkpoint.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None
 
 
 def _cpu(state: dict[str, Any]) -> dict[str, Any]:

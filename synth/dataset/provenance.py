@@ -41,7 +41,7 @@ def code(*folders: str, home: Path = HOME) -> str:
     """A hash of the names and bytes of the code and networks in folders below `home`."""
     total = hashlib.blake2b(digest_size=8)
     for path in sorted(path for folder in folders for path in (home / folder).rglob("*")):
-        if path.suffix in (".py", ".pt", ".json"):
+        if path.suffix in (".py", ".onnx", ".json"):
             total.update(f"{path.relative_to(home)}\n{path.stat().st_size}\n".encode() + path.read_bytes())
     return total.hexdigest()
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_right
+from collections.abc import Callable
 from collections.abc import Sequence as Several
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from synth.arguments import checked
+from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset, FieldReader, Sequence
 from synth.errors import UserError
 from synth.fields import FIELDS, TIME
@@ -25,28 +27,48 @@ def _open(
 
 
 class TorchDataset:
-    """Every frame of every sequence in `root`, as `{field: array}`, with its `index` and `frame`.
+    """Frames of the sequences in `root`, as `{field: array}`, with `index` of the sequence and `frame`.
 
     Fields without a frame axis are returned whole. Safe in forked or spawned workers.
 
-        frames = TorchDataset("out", ["rgb", "flow", "traction"])
+        frames = TorchDataset("out", ["rgb", "flow", "traction"], split="train")
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 
     @checked
-    def __init__(self, root: Path | str, fields: Several[str], sequences: Several[int] | None = None) -> None:
+    def __init__(
+        self,
+        root: Path | str,
+        fields: Several[str],
+        sequences: Several[int] | None = None,
+        *,
+        split: str | None = None,
+        clip: int = 0,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> None:
         """
         Args:
             root: the dataset.
             fields: names from the field table.
-            sequences: positions in the dataset of those to use (one side of a split); default: all.
+            sequences: positions in the dataset of those to use; default: all.
+            split: use the sequences of this side of the dataset's split instead.
+            clip: consecutive frames of an item, whose fields then have a frame axis; `frame` is its first.
+                0: single frames, without that axis.
+            transform: applied to each item.
 
         Raises:
-            UserError: not a dataset, or a sequence lacks a field.
+            UserError: not a dataset, no such side, or a sequence lacks a field or is shorter than a clip.
         """
         if unknown := [name for name in fields if name not in FIELDS]:
             raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
+        self._clip, self._transform = clip, transform
+        if split is not None:
+            sides = group_by_side(self._dataset)
+            if split not in sides or sequences is not None:
+                sides_known = f"{root} has {', '.join(sides)}"
+                raise UserError(f"split: {split!r}, {sides_known}; and give no sequences with it")
+            sequences = sides[split]
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         if not all(0 <= position < len(self._dataset) for position in self._chosen):
             raise UserError(f"sequences: the dataset has positions 0 to {len(self._dataset) - 1}")
@@ -54,16 +76,20 @@ class TorchDataset:
         for sequence in map(self._dataset.__getitem__, self._chosen):
             if missing := [name for name in fields if name not in sequence]:
                 raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
-            self._ends.append(len(self) + sequence.frames)
+            if sequence.frames < clip:
+                raise UserError(f"{sequence.path}: has {sequence.frames} frames, fewer than clip={clip}")
+            self._ends.append(len(self) + sequence.frames - max(clip - 1, 0))
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 
-    def __getitem__(self, item: int) -> dict[str, Any]:
+    def __getitem__(self, item: int) -> Any:
         if not 0 <= item < len(self):
             raise IndexError(item)
         which = bisect_right(self._ends, item)
         frame = item - (self._ends[which - 1] if which else 0)
         sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)
-        values = {name: one[frame] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
-        return {"index": sequence.index, "frame": frame, **values}
+        at = slice(frame, frame + self._clip) if self._clip else frame
+        values = {name: one[at] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
+        found = {"index": sequence.index, "frame": frame, **values}
+        return found if self._transform is None else self._transform(found)

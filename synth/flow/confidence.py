@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from synth.arrays import Map
 from synth.flow import image
@@ -34,16 +32,16 @@ def add_deviation(confidence: Map, deviation_px: float) -> Map:
     return np.asarray(confidence / (1 + confidence * np.float32(deviation_px / _HALF_PX) ** 2), np.float32)
 
 
-def agreement(pictures: image.Level, warped: Tensor, visible: Tensor) -> Tensor:
-    """Local correlation (B, 1, H, W) in 0..1 of the rest frame with the warped frame; 0 where either is
-    masked or blank.
+def agreement(pictures: image.Level, warped: Map, visible: Map) -> Map:
+    """Local correlation (H, W) in 0..1 of the rest frame with the warped frame; 0 where either is masked or
+    blank.
 
-    `pictures`: a level; `warped`, `visible`: (B, 1, H, W), see `image.warp`.
+    `pictures`: a level; `warped`, `visible`: (H, W), see `image.warp`.
     """
     mask = pictures.rest_usable * visible
-    first, second = pictures.rest, warped
-    sums = torch.cat([mask, mask * first * second, mask * first * first, mask * second * second], 1)
-    around = image.window(sums, _WINDOW)
-    product, power, power_now = (around[:, 1:] / around[:, :1].clamp_min(1e-4)).unbind(1)
-    agreement = product / torch.sqrt((power + _NOISE) * (power_now + _NOISE))
-    return mask * image.doubled(agreement[:, None].clamp(0, 1), mask)
+    first, second = mask * pictures.rest, mask * warped
+    sums = np.stack([mask, first * warped, first * pictures.rest, second * warped])
+    total, product, power, power_now = image.window(sums, _WINDOW)
+    product, power, power_now = (part / np.maximum(total, 1e-4) for part in (product, power, power_now))
+    found = product / np.sqrt((power + np.float32(_NOISE)) * (power_now + np.float32(_NOISE)))
+    return np.asarray(mask * image.doubled(found.clip(0, 1)[None], mask.shape)[0])

@@ -11,22 +11,17 @@ distribution). `evidence.flow.correction_training` trains the weights, stored ne
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
 
 from synth.arrays import Array, Map, Mask, Pixels
-from synth.flow import kernels
+from synth.flow import kernels, onnx_network
 from synth.flow.image import GREY
-from synth.system import checked_file
 from synth.system.jit import vectorised
 
-WEIGHTS = Path(__file__).with_name("correction.pt")
+WEIGHTS = Path(__file__).with_name("correction.onnx")
 CELL = 4  # px, side of a cell
 _WINDOWS = 3, 7  # cells, sides of the windows of Lucas and Kanade's steps
 _STEPS = [f"{of} {n} {part}" for of in ("grey", "colour") for n in _WINDOWS for part in ("x", "y", "known")]
@@ -44,7 +39,6 @@ LIGHTS = ("red", "green", "blue", "luminance")
 """Further planes of `sum_cells`, for the rest frame and then for the frame now."""
 _PRODUCTS, _LIGHTS, _LUMINANCE = len(PRODUCTS), len(LIGHTS), LIGHTS.index("luminance")
 _MULTIPLE = 8  # cells: the levels of the network need multiples of it on both sides
-_WIDTHS = 20, 32, 48
 _LEAST = 0.02  # added to squared gradients per pixel, so that steps of windows without contrast vanish
 _FARTHEST_PX = 2.0  # limit of a linearised step
 _LEAST_RESIDUAL = 1e-3  # mean square, in squared local deviations
@@ -52,50 +46,7 @@ _OFFSET = np.float32(8)  # grey levels added before ratios are taken: the black 
 _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
 
 
-class CorrectionNet(nn.Module):
-    """U-Net from features (B, channels, h, w) to corrections and their log-variances (B, 2 parts, h, w)."""
-
-    mean: Tensor
-    deviation: Tensor
-
-    def __init__(self, channels: int = CHANNELS, parts: int = 2) -> None:
-        super().__init__()
-        a, b, c = _WIDTHS
-        self.parts = parts
-        self.register_buffer("mean", torch.zeros(1, channels, 1, 1))
-        self.register_buffer("deviation", torch.ones(1, channels, 1, 1))
-        self.stem = nn.Sequential(nn.Conv2d(channels, a, 1), nn.ReLU(), nn.Conv2d(a, a, 3, 1, 1), nn.ReLU())
-        self.down = nn.ModuleList([_block(a, b, 2), _block(b, c, 2), _block(c, c, 2)])
-        self.up = nn.ModuleList([_block(c + c, c), _block(c + b, b), _block(b + a, a)])
-        self.head = nn.Conv2d(a, 2 * parts, 1)
-        self.straight = nn.Conv2d(channels, parts, 1, bias=False)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.straight.weight)
-
-    def forward(self, features: Tensor) -> Tensor:
-        skips = [self.stem((features - self.mean) / self.deviation)]
-        for layer in self.down:
-            skips.append(layer(skips[-1]))
-        field = skips.pop()
-        for layer in self.up:
-            wide = F.interpolate(field, scale_factor=2, mode="bilinear", align_corners=False)
-            field = layer(torch.cat([wide, skips.pop()], 1))
-        found = self.head(field)
-        added, log_variance = found.split(self.parts, 1)
-        return torch.cat([added + self.straight(features), log_variance], 1)
-
-
-@cache
-def load(path: Path, channels: int = CHANNELS, parts: int = 2) -> CorrectionNet:
-    """A network with its weights."""
-    net = CorrectionNet(channels, parts)
-    state = checked_file.read_tensors(path)
-    net.load_state_dict({name: value.float() for name, value in state.items()})
-    # This layout takes two thirds of the time on a CPU.
-    return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
-
-
-def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
+def correct(features: Map, flow: Map) -> tuple[Map, Map]:
     """The corrected flow (H, W, 2) px, and the standard deviation (H, W) px of a component.
 
     What the network adds is shrunk where it isn't sure (Wiener), and where the pictures determine the flow
@@ -104,7 +55,7 @@ def correct(net: CorrectionNet, features: Map, flow: Map) -> tuple[Map, Map]:
     `features`: (CHANNELS, h, w), see `describe`, of the given flow (H, W, 2) px.
     """
     height, width, _ = flow.shape
-    found = predict(net, features)[:, : features.shape[1], : features.shape[2]]
+    found = predict(WEIGHTS, features)[:, : features.shape[1], : features.shape[2]]
     missing, spread = found[:2], found[2:]
     # Log-variances are limited to the trained range; the deviation is the geometric mean of both components.
     variance = np.exp(0.5 * spread.clip(-8, 5).sum(axis=0))
@@ -133,11 +84,9 @@ def _information(features: Map) -> Map:
     return np.asarray(visible * contrast * side**2 * area / np.maximum(residual, _LEAST_RESIDUAL))
 
 
-def predict(net: CorrectionNet, features: Map) -> Map:
-    """Output (2 parts, h', w') of the network for features (channels, h, w), with its padding."""
-    with torch.inference_mode():
-        cells = torch.from_numpy(padded(features))[None]
-        return np.asarray(net(cells.to(memory_format=torch.channels_last))[0])
+def predict(weights: Path, features: Map) -> Map:
+    """Output (2 parts, h', w') of a network for features (channels, h, w), with its padding."""
+    return onnx_network.run(weights, padded(features))
 
 
 def padded(cells: Map) -> Map:
@@ -264,13 +213,3 @@ def sum_cells(colours: Pixels, greys: Map, mask: Map, sums: Map) -> None:
                 sums[k, row, column] = lines[k, column * CELL]
                 for x in range(column * CELL + 1, column * CELL + CELL):
                     sums[k, row, column] += lines[k, x]
-
-
-def _block(inside: int, outside: int, stride: int = 1) -> nn.Sequential:
-    # A stride of 2 needs an even kernel: a kernel of 3 would shift the field by half a cell.
-    return nn.Sequential(
-        nn.Conv2d(inside, outside, 2 + stride, stride, 1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(outside, outside, 3, 1, 1),
-        nn.ReLU(inplace=True),
-    )

@@ -1,6 +1,6 @@
-"""Image operations of the flow solver on batched torch tensors; masked pixels are excluded throughout.
+"""Image operations of the flow solver; masked pixels are excluded throughout.
 
-Tensors are (B, C, H, W) float32 on the CPU; `usable` is (B, 1, H, W) float32 in 0..1.
+Pictures and masks are (H, W), stacks of planes (C, H, W), all float32; `usable` is in 0..1.
 """
 
 from __future__ import annotations
@@ -9,11 +9,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor
 
-from synth.arrays import Map, Mask, Pixels
+from synth.arrays import Array, Map, Pixels
 from synth.flow import kernels
 
 # Luminance from red, green and blue: vessels have most contrast in green, averaging reduces noise.
@@ -31,14 +28,14 @@ def local_contrast(grey: Map, window: tuple[int, int]) -> Pixels:
     return np.asarray(np.clip(128 + GREY_PER_DEVIATION * detail / spread, 0, 255), np.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Level:
-    """One level of the pyramid: contrast-normalised pictures and their masks, each (B, 1, H, W)."""
+    """One level of the pyramid: contrast-normalised pictures and their masks, each (H, W)."""
 
-    rest: Tensor
-    now: Tensor
-    rest_usable: Tensor
-    now_usable: Tensor
+    rest: Map
+    now: Map
+    rest_usable: Map
+    now_usable: Map
 
 
 def ends(flow: Map) -> tuple[Map, Map]:
@@ -47,87 +44,79 @@ def ends(flow: Map) -> tuple[Map, Map]:
     return x + flow[..., 0], y[:, None] + flow[..., 1]
 
 
-def tensor(picture: Pixels) -> Tensor:
-    """Luminance of (H, W, 3) or (B, H, W, 3) uint8 RGB in grey levels: (B, 1, H, W)."""
-    rgb = torch.from_numpy(np.ascontiguousarray(picture)).float()
-    grey = rgb @ torch.from_numpy(GREY)
-    return grey.reshape(-1, 1, *grey.shape[-2:])
+def luminance(picture: Pixels) -> Map:
+    """Luminance (H, W) in grey levels of RGB (H, W, 3) uint8."""
+    return np.asarray(picture.astype(np.float32) @ GREY)
 
 
-def flags(mask: Mask | Map) -> Tensor:
-    """(H, W) or (B, H, W) as (B, 1, H, W) float32."""
-    wide = torch.from_numpy(np.ascontiguousarray(mask)).float()
-    return wide.reshape(-1, 1, *wide.shape[-2:])
+def flags(mask: Array) -> Map:
+    """A mask (H, W) as float32."""
+    return np.ascontiguousarray(mask, np.float32)
 
 
-def box(field: Tensor, radius: int) -> Tensor:
-    """Mean of (B, C, H, W) over squares of 2 radius + 1 pixels; over fewer at the border."""
-    planes = field.contiguous().numpy().reshape(-1, *field.shape[-2:])
+def box(planes: Map, radius: int) -> Map:
+    """Mean of (C, H, W) over squares of 2 radius + 1 pixels; over fewer at the border."""
     out = np.empty_like(planes)
     kernels.box_into(planes, (0,) * (2 * radius + 1), out)
-    return torch.from_numpy(out).view_as(field)
+    return out
 
 
-def halved(field: Tensor) -> Tensor:
-    """Mean of (B, C, H, W) over 2 x 2 pixels: (B, C, ceil(H/2), ceil(W/2)); over fewer at an odd border."""
-    *batch, height, width = field.shape
-    planes = field.contiguous().numpy().reshape(-1, height, width)
-    out = np.empty((len(planes), (height + 1) // 2, (width + 1) // 2), np.float32)
+def halved(planes: Map) -> Map:
+    """Mean of (C, H, W) over 2 x 2 pixels: (C, ceil(H/2), ceil(W/2)); over fewer at an odd border."""
+    count, height, width = planes.shape
+    out = np.empty((count, (height + 1) // 2, (width + 1) // 2), np.float32)
     kernels.halve_into(planes, out)
-    return torch.from_numpy(out).view(*batch, *out.shape[1:])
+    return out
 
 
-def window(field: Tensor, sigma: float) -> Tensor:
-    """Approximate Gaussian blur at half the size, (B, C, H/2, W/2): two box filters."""
-    small = halved(field)
+def window(planes: Map, sigma: float) -> Map:
+    """Approximate Gaussian blur at half the size, (C, H/2, W/2): two box filters."""
     radius = max(1, round(sigma / 2 * 1.5**0.5 - 0.5))  # each box has the variance ((2r+1)^2 - 1)/12
-    return box(box(small, radius), radius)
+    return box(box(halved(planes), radius), radius)
 
 
-def doubled(field: Tensor, like: Tensor) -> Tensor:
-    """`field` (B, C, h, w) at twice its size (bilinear), cropped to the height and width of `like`."""
-    planes, (height, width) = field.numpy().reshape(-1, *field.shape[-2:]), like.shape[-2:]
-    size = 2 * planes.shape[2], 2 * planes.shape[1]
-    found = np.stack([cv2.resize(plane, size)[:height, :width] for plane in planes])
-    return torch.from_numpy(found).view(*field.shape[:2], height, width)
+def doubled(planes: Map, shape: tuple[int, ...]) -> Map:
+    """Planes (C, h, w) at twice their size (bilinear), cropped to a height and a width."""
+    return np.stack([cv2.resize(one, None, fx=2, fy=2)[: shape[0], : shape[1]] for one in planes])
 
 
-def normalise(grey: Tensor, usable: Tensor) -> Tensor:
-    """Local contrast normalisation (I - mean) / (deviation + floor) of grey levels (B, 1, H, W) over usable
+def resized(planes: Map, shape: tuple[int, ...]) -> Map:
+    """Planes (C, h, w) at another height and width (bilinear)."""
+    return np.stack([cv2.resize(one, (shape[1], shape[0])) for one in planes])
+
+
+def normalise(grey: Map, usable: Map) -> Map:
+    """Local contrast normalisation (I - mean) / (deviation + floor) of grey levels (H, W) over usable
     neighbours only: local standard deviations, 0 at masked pixels.
 
     It removes gains and offsets that vary more slowly than the window, such as drifting illumination.
     """
     # Centring at 128 avoids cancellation in the difference of squares.
-    centred = (grey - 128.0) * usable
-    sums = window(torch.cat([usable, centred, (grey - 128.0) * centred], dim=1), _WINDOW)
-    mean = sums[:, 1:] / sums[:, :1].clamp_min(1e-4)
-    deviation = (mean[:, 1:] - mean[:, :1] ** 2).clamp_min(0).sqrt() + _FLOOR
-    smooth = doubled(torch.cat([mean[:, :1] + 128.0, 1 / deviation], 1), grey)
-    return (usable > 0) * (grey - smooth[:, :1]) * smooth[:, 1:]
+    centred = (grey - np.float32(128)) * usable
+    total, first, second = window(np.stack([usable, centred, (grey - np.float32(128)) * centred]), _WINDOW)
+    mean, square = first / np.maximum(total, 1e-4), second / np.maximum(total, 1e-4)
+    deviation = np.sqrt(np.maximum(square - mean**2, 0)) + np.float32(_FLOOR)
+    offset, scale = doubled(np.stack([mean + 128, 1 / deviation]), grey.shape)
+    return np.asarray((usable > 0) * (grey - offset) * scale)
 
 
-def fill(field: Tensor, usable: Tensor) -> Tensor:
-    """A field (B, C, H, W) whose masked pixels are filled from around; zeros if no pixel is usable.
+def fill(field: Map, usable: Map) -> Map:
+    """A field (H, W) whose masked pixels are filled from around; zeros if no pixel is usable.
 
     Push-pull (Gortler et al., The Lumigraph, 1996, sec. 3.5). Where `usable` is 1 the field stays as it is.
     """
     known = field * usable
-    if min(field.shape[-2:]) <= 2:
-        mean = known.mean((-2, -1), keepdim=True) / usable.mean((-2, -1), keepdim=True).clamp_min(1e-6)
-        return known + (1 - usable) * mean
-    total = halved(torch.cat([known, usable], 1))
-    weight = total[:, -1:]
-    coarse = fill(total[:, :-1] / weight.clamp_min(1e-6), (weight > 0).to(field.dtype))
-    back = F.interpolate(coarse, size=field.shape[-2:], mode="bilinear", align_corners=False)
-    return known + (1 - usable) * back
+    if min(field.shape) <= 2:
+        return np.asarray(known + (1 - usable) * (known.mean() / max(usable.mean(), np.float32(1e-6))))
+    total, weight = halved(np.stack([known, usable]))
+    coarse = fill(total / np.maximum(weight, 1e-6), flags(weight > 0))
+    return np.asarray(known + (1 - usable) * resized(coarse[None], field.shape)[0])
 
 
-def warp(now: Tensor, usable: Tensor, flow: Tensor) -> tuple[Tensor, Tensor]:
-    """Samples of `now` (1, 1, H, W) at x + w (bicubic) for a flow w (1, 2, H, W) px, and the largest
-    weight of the four pixels around: 0 where the interpolated weight is at most 0.9 of it, as at a masked
-    pixel or the border."""
-    out = np.empty((2, 1, 1, *now.shape[-2:]), np.float32)
-    one, known, by = (field.contiguous().numpy() for field in (now[0, 0], usable[0, 0], flow[0]))
-    kernels.warp_into(one, known, by, out[0, 0, 0], out[1, 0, 0])
-    return torch.from_numpy(out[0]), torch.from_numpy(out[1])
+def warp(now: Map, usable: Map, flow: Map) -> tuple[Map, Map]:
+    """Samples of `now` (H, W) at x + w (bicubic) for a flow w (2, H, W) px, and the largest weight of the
+    four pixels around: 0 where the interpolated weight is at most 0.9 of it, as at a masked pixel or the
+    border."""
+    warped, visible = np.empty((2, *now.shape), np.float32)
+    kernels.warp_into(now, usable, flow, warped, visible)
+    return warped, visible

@@ -63,8 +63,7 @@ def _solve(
 def _prepare(picture: Pixels, usable: Mask) -> Pixels:
     """Contrast-normalised picture (H, W) uint8 centred at 128, with masked pixels filled."""
     known = image.flags(usable)
-    contrast = image.normalise(image.tensor(picture), known)
-    filled = image.fill(contrast, known)[0, 0].numpy()
+    filled = image.fill(image.normalise(image.luminance(picture), known), known)
     return np.clip(np.round(128 + image.GREY_PER_DEVIATION * filled), 0, 255).astype(np.uint8)
 
 

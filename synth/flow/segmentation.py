@@ -9,62 +9,22 @@ instruments, shadows and objects drawn over other pictures (D. Dwibedi et al., "
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from scipy.special import expit
 
 from synth.arrays import Map, Mask, Pixels
-from synth.flow.tvl1 import one_thread
-from synth.system import checked_file
+from synth.flow import onnx_network
 
-WEIGHTS = Path(__file__).with_name("segmentation.pt")
+WEIGHTS = Path(__file__).with_name("segmentation.onnx")
 CLASSES = "instrument", "shadow", "highlight"
+CHANNELS = 6  # of the network's input: the frame and the rest frame
 SIDE = 256  # px, longest side of the pictures in which classes are predicted: what it learnt is of one scale
-_BLOCK = 4  # px: the finest level holds blocks of as many pixels in its channels
-_MULTIPLE = 8 * _BLOCK  # px: the levels of the network need multiples of it on both sides
-_WIDTHS = 32, 48, 80, 104
+_MULTIPLE = 32  # px: the levels of the network need multiples of it on both sides
 _FOUND = 0.5  # probability above which a class is taken to be there
 _HIDING = 0.9  # and above which an instrument is taken to hide tissue, whose motion would be lost (design.md)
-
-
-class SegmentationNet(nn.Module):
-    """U-Net from a frame and the rest frame (B, 6, H, W) to logits (B, 3, H, W) of `CLASSES`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        a, b, c, d = _WIDTHS
-        self.stem = nn.Sequential(_layer(6 * _BLOCK**2, a, 1), _layer(a, a))
-        self.down = nn.ModuleList([_block(a, b), _block(b, c), _block(c, d)])
-        self.whole = nn.Linear(d, d)
-        self.up = nn.ModuleList([_join(d + c, c), _join(c + b, b), _join(b + a, a)])
-        self.head = nn.Conv2d(a, len(CLASSES) * _BLOCK**2, 1)
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        skips = [self.stem(F.pixel_unshuffle(pictures, _BLOCK))]
-        for layer in self.down:
-            skips.append(layer(skips[-1]))
-        field = skips.pop()
-        field = field + self.whole(field.mean((2, 3)))[..., None, None]  # colours of the whole picture
-        for layer in self.up:
-            field = layer(torch.cat([_doubled(field), skips.pop()], 1))
-        return F.pixel_shuffle(self.head(field), _BLOCK)
-
-
-class _Residual(nn.Module):
-    """Two convolutions whose result is added to what they were given (K. He et al., CVPR 2016)."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.first = _layer(width, width)
-        self.second = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width))
-
-    def forward(self, field: Tensor) -> Tensor:
-        return F.relu(field + self.second(self.first(field)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +58,7 @@ def segment(rest: Pixels, frame: Pixels) -> Segmentation:
     size = max(1, round(width * share)), max(1, round(height * share))
     mode = cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC
     small = [cv2.resize(one, size, interpolation=mode) for one in (frame, rest)]
-    with torch.inference_mode(), one_thread():
-        found = torch.sigmoid(load(WEIGHTS)(prepare(*small)))[0, :, : size[1], : size[0]].numpy()
+    found = expit(onnx_network.run(WEIGHTS, prepare(*small))[:, : size[1], : size[0]])
     return Segmentation(*(cv2.resize(plane, (width, height)) for plane in found))
 
 
@@ -109,44 +68,18 @@ def with_highlights(video: Pixels, tools: Mask) -> Mask:
     return np.asarray(tools | found, bool)
 
 
-def prepare(frame: Pixels, rest: Pixels) -> Tensor:
-    """Input (1, 6, H', W') of the network: each picture (H, W, 3) with mean 0 and deviation 1, padded."""
+def prepare(frame: Pixels, rest: Pixels) -> Map:
+    """Input (6, H', W') of the network: each picture (H, W, 3) with mean 0 and deviation 1, padded."""
     height, width = frame.shape[:2]
     spare = 0, -height % _MULTIPLE, 0, -width % _MULTIPLE
-    pictures = []
+    planes: list[Map] = []
     for picture in (frame, rest):
         mean, deviation = cv2.meanStdDev(picture)
         scale = 1 / (np.sqrt((deviation**2).mean() + mean.var()) + 8.0)
-        wide = torch.from_numpy(cv2.copyMakeBorder(picture, *spare, cv2.BORDER_REPLICATE))
-        pictures.append((wide.float() - float(mean.mean())) * float(scale))
-    return torch.cat(pictures, -1).permute(2, 0, 1)[None]  # channels last in memory, as convolutions want it
-
-
-@cache
-def load(path: Path) -> SegmentationNet:
-    """The network with its weights."""
-    net = SegmentationNet()
-    net.load_state_dict(checked_file.read_tensors(path))  # half precision, widened
-    return net.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
+        wide = cv2.copyMakeBorder(picture, *spare, cv2.BORDER_REPLICATE)
+        planes += [(plane - np.float32(mean.mean())) * np.float32(scale) for plane in cv2.split(wide)]
+    return np.stack(planes)
 
 
 def _grown(mask: Mask) -> Mask:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-
-
-def _doubled(field: Tensor) -> Tensor:
-    return F.interpolate(field, scale_factor=2.0, mode="bilinear", align_corners=False)
-
-
-def _layer(inside: int, outside: int, size: int = 3, stride: int = 1) -> nn.Sequential:
-    convolution = nn.Conv2d(inside, outside, size, stride, (size - stride + 1) // 2, bias=False)
-    return nn.Sequential(convolution, nn.BatchNorm2d(outside), nn.ReLU(inplace=True))
-
-
-def _block(inside: int, outside: int) -> nn.Sequential:
-    # A stride of 2 needs an even kernel: a kernel of 3 would shift the picture by half a pixel.
-    return nn.Sequential(_layer(inside, outside, 4, 2), _Residual(outside))
-
-
-def _join(inside: int, outside: int) -> nn.Sequential:
-    return nn.Sequential(_layer(inside, outside, 1), _layer(outside, outside))

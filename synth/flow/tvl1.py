@@ -17,15 +17,10 @@ Chambolle and Pock (J. Math. Imaging Vis. 40, 2011) with lagged weights.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
-import torch.nn.functional as F
-from torch import Tensor
 
 from synth.arrays import Map, Mask, Pixels
 from synth.flow import confidence, correction, image, kernels
@@ -80,42 +75,37 @@ class Tvl1:
         """`corrected`: a network corrects the flow and gives its confidence, which otherwise is the local
         correlation of the rest and the warped frame; see `synth.flow.correction`."""
         self.settings = settings
-        self.correction = correction.load(correction.WEIGHTS) if corrected else None
+        self.corrected = corrected
         # The last rest frame, its mask and its pyramid, which are the same for all frames of a video.
-        self._rest: tuple[Tensor, Tensor, list[tuple[Tensor, Tensor]]] | None = None
+        self._rest: tuple[Map, Map, list[tuple[Map, Map]]] | None = None
 
     def flow(
         self, rest: Pixels, now: Pixels, rest_usable: Mask, now_usable: Mask, initial: Map | None = None
     ) -> tuple[Map, Map]:
         """See `Estimator.flow`."""
-        with torch.inference_mode(), one_thread():
-            start = None
-            if initial is not None:
-                # Planes: sums over neighbours take five times as long on interleaved components.
-                planes = np.ascontiguousarray(np.moveaxis(initial, -1, 0))
-                start = torch.from_numpy(planes)[None]
-            pictures = image.tensor(rest), image.tensor(now)
-            usable = image.flags(rest_usable), image.flags(now_usable)
-            found, agreed, aligned = self.tensors(*pictures, *usable, start)
-            flow, sure = found[0].movedim(0, -1).numpy(), agreed[0, 0].numpy()
-            if self.correction is None:
-                return flow, sure
-            *greys, visible = (plane[0, 0].numpy() for plane in aligned)
-            described = correction.describe(rest, now, rest_usable, (greys[0], greys[1]), visible, flow, sure)
-            flow, deviation = correction.correct(self.correction, described, flow)
-            # The network was not trained where pictures disagree, as under an unmasked instrument.
-            return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
+        # Planes: sums over neighbours take five times as long on interleaved components.
+        start = None if initial is None else np.ascontiguousarray(np.moveaxis(initial, -1, 0), np.float32)
+        pictures = image.luminance(rest), image.luminance(now)
+        usable = image.flags(rest_usable), image.flags(now_usable)
+        found, sure, (before, after, visible) = self.uncorrected(*pictures, *usable, start)
+        flow = np.moveaxis(found, 0, -1)
+        if not self.corrected:
+            return flow, sure
+        described = correction.describe(rest, now, rest_usable, (before, after), visible, flow, sure)
+        flow, deviation = correction.correct(described, flow)
+        # The network was not trained where pictures disagree, as under an unmasked instrument.
+        return flow, np.minimum(sure / _AGREED, 1) ** 2 * confidence.of_deviation(deviation)
 
-    def tensors(
-        self, rest: Tensor, now: Tensor, rest_usable: Tensor, now_usable: Tensor, initial: Tensor | None
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """Uncorrected flow on tensors: greys and masks (1, 1, H, W), initial flow (1, 2, H, W).
+    def uncorrected(
+        self, rest: Map, now: Map, rest_usable: Map, now_usable: Map, initial: Map | None
+    ) -> tuple[Map, Map, tuple[Map, Map, Map]]:
+        """Uncorrected flow (2, H, W) px of greys and masks (H, W) float32, and of an initial flow.
 
         Returns the flow, its agreement, and the normalised rest frame, the warped frame and its mask.
         """
         s = self.settings
         last = self._rest
-        if last is None or not (torch.equal(rest, last[0]) and torch.equal(rest_usable, last[1])):
+        if last is None or not (np.array_equal(rest, last[0]) and np.array_equal(rest_usable, last[1])):
             self._rest = last = rest, rest_usable, pyramid(rest, rest_usable, s)
         both = zip(last[2], pyramid(now, now_usable, s), strict=True)
         levels = [Level(before, after, known, known_now) for (before, known), (after, known_now) in both]
@@ -127,31 +117,19 @@ class Tvl1:
         return found, confidence.agreement(levels[0], warped, visible), (levels[0].rest, warped, visible)
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Limits PyTorch to one thread: more are slower on tensors of this size."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def pyramid(grey: Tensor, usable: Tensor, s: TVL1Settings) -> list[tuple[Tensor, Tensor]]:
+def pyramid(grey: Map, usable: Map, s: TVL1Settings) -> list[tuple[Map, Map]]:
     """Normalised picture and mask of each level, fine to coarse; pixel x is (x - 1/2)/2 on the next level."""
     levels = []
     while True:
         levels.append((image.normalise(grey, usable), usable * (usable > 0.1)))
-        if min(grey.shape[-2:]) < 2 * s.coarsest_px:
+        if min(grey.shape) < 2 * s.coarsest_px:
             return levels
-        pooled = image.halved(torch.cat([grey * usable, usable], 1))
-        usable = pooled[:, 1:]
-        grey = pooled[:, :1] / usable.clamp_min(1e-6)
+        grey, usable = image.halved(np.stack([grey * usable, usable]))
+        grey = np.asarray(grey / np.maximum(usable, 1e-6), np.float32)
 
 
-def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
-    """The first stage of a cold start with two values of lambda; returns the better flow (B, 2, H, W) px.
+def guess(levels: list[Level], s: TVL1Settings) -> Map:
+    """The first stage of a cold start with two values of lambda; returns the better flow (2, H, W) px.
 
     A large lambda follows large motion but fails on small areas between forceps tips; a small one does the
     opposite.
@@ -159,46 +137,41 @@ def guess(levels: list[Level], s: TVL1Settings) -> Tensor:
     weights = s.small_motion_weight, s.large_motion_weight
     small, large = (solve(levels, None, s.first_stage(weight)) for weight in weights)
     warped = [image.warp(levels[0].now, levels[0].now_usable, flow) for flow in (small, large)]
-    trust = [confidence.agreement(levels[0], *one).mean((1, 2, 3), keepdim=True) for one in warped]
-    return torch.where(trust[1] > _BETTER * trust[0], large, small)
+    trust = [float(confidence.agreement(levels[0], *one).mean()) for one in warped]
+    return large if trust[1] > _BETTER * trust[0] else small
 
 
-def solve(levels: list[Level], initial: Tensor | None, s: TVL1Settings) -> Tensor:
-    """Flow (B, 2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
-    coarsest = levels[-1].now
-    flow = coarsest.new_zeros(coarsest.shape[0], 2, *coarsest.shape[-2:])
-    weight = torch.full_like(flow[:, :1, :1, :1], s.weight)
+def solve(levels: list[Level], initial: Map | None, s: TVL1Settings) -> Map:
+    """Flow (2, H, W) px of the finest level; `levels`: fine to coarse; `initial`: as the result."""
+    flow: Map = np.zeros((2, *levels[-1].now.shape), np.float32)
+    weight = np.full(levels[0].now.shape, s.weight, np.float32)
     if initial is not None:
         flow = initial
         if s.steep > 0:
-            weight = weight * (1 + steepness(flow) / s.steep**2)
+            weight = weight * (1 + steepness(flow) / np.float32(s.steep**2))
         for _ in levels[1:]:
-            flow = 0.5 * image.halved(flow)
+            flow = np.float32(0.5) * image.halved(flow)
     for level in reversed(levels):
-        if flow.shape[-2:] != level.now.shape[-2:]:
+        shape = level.now.shape
+        if flow.shape[1:] != shape:
             flow = finer(flow, level)
-        here = weight
-        if weight.shape[-1] > 1:
-            here = F.interpolate(weight, size=flow.shape[-2:], mode="bilinear", align_corners=False)
+        here = image.resized(weight[None], shape)[0]
         flow = _solve_level(level, flow, here, s, s.bending_px if level is levels[0] else 0.0)
     return flow
 
 
-def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, bending_px: float) -> Tensor:
+def _solve_level(level: Level, flow: Map, weight: Map, s: TVL1Settings, bending_px: float) -> Map:
     """All warps of a level: each linearises r about the flow, weights it and minimises the energy.
 
     The smoothness term sees the flow less its Gaussian mean: of all of it, it damps a wave of wavenumber k by
     1 / (1 + (k / k_0)^2), and a tenth is lost at k_0 / 3 already.
     """
-    rest, now, rest_usable, now_usable = (
-        np.ascontiguousarray(field[0, 0].numpy())
-        for field in (level.rest, level.now, level.rest_usable, level.now_usable)
-    )
-    found = flow[0].contiguous().numpy().copy()
+    rest, now, rest_usable, now_usable = level.rest, level.now, level.rest_usable, level.now_usable
+    found = flow.copy()
     numbers = np.array([s.tau, s.gradient, s.epsilon, s.huber, s.hidden_huber], np.float32)
     before, after = np.empty((2, 6, *rest.shape), np.float32)
     mask, spare = np.empty((2, *rest.shape), np.float32)
-    lambda_ = here = np.ascontiguousarray(np.broadcast_to(weight[0, 0].numpy(), rest.shape))
+    here = weight
     state = new_state(*rest.shape)
     mean: Map | np.float32
 
@@ -216,11 +189,10 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
         differentiate(after)
         if s.noise > 0:
             share = noise_weight(before, after, mask, s.gradient, s.noise)
-            here = lambda_ * np.float32(np.clip(share, *_WEIGHT_LIMITS))
+            here = weight * np.float32(np.clip(share, *_WEIGHT_LIMITS))
         last, mean = found, _ZERO
         if bending_px > 0:
-            whole = torch.from_numpy(last)[None]
-            mean = image.doubled(image.window(whole, bending_px), whole)[0].numpy()
+            mean = image.doubled(image.window(last, bending_px), rest.shape)
         found = last - mean
         linearise(before, after, mask, here, found, numbers, state)
         primal_dual(found, state, np.float32(s.tau), s.steps)
@@ -230,30 +202,33 @@ def _solve_level(level: Level, flow: Tensor, weight: Tensor, s: TVL1Settings, be
         change = found - last
         if (mask * change**2).sum() < s.settled_px**2 * mask.sum():
             break
-    return torch.from_numpy(found)[None]
+    return found
 
 
-def steadied(flow: Tensor, within_px: float) -> Tensor:
-    """Smooths a flow (B, 2, H, W) px by about a Gaussian of 1.4 px where that changes it by little."""
+def steadied(flow: Map, within_px: float) -> Map:
+    """Smooths a flow (2, H, W) px by about a Gaussian of 1.4 px where that changes it by little."""
     smooth = flow
     for _ in range(3):
         smooth = image.box(smooth, 1)
     change = smooth - flow
-    return flow + change * torch.exp(-(change * change).sum(1, keepdim=True) / within_px**2)
+    return np.asarray(flow + change * np.exp(-(change * change).sum(0) / within_px**2), np.float32)
 
 
-def finer(flow: Tensor, level: Level) -> Tensor:
-    """Upsamples the flow (B, 2, h, w) of the next coarser level to `level`: (B, 2, H, W) in its pixels."""
-    return 2 * image.doubled(flow, level.now)
+def finer(flow: Map, level: Level) -> Map:
+    """Upsamples the flow (2, h, w) of the next coarser level to `level`: (2, H, W) in its pixels."""
+    return np.asarray(2 * image.doubled(flow, level.now.shape), np.float32)
 
 
-def steepness(flow: Tensor) -> Tensor:
-    """|grad w|^2 (B, 1, H, W) of w averaged over 16 x 16 px, which removes the noise."""
-    coarse = F.avg_pool2d(flow, 16, ceil_mode=True, count_include_pad=False)
-    wide = F.pad(coarse, (1, 1, 1, 1), "replicate")
-    dx, dy = wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2], wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]
-    slope = (dx * dx + dy * dy).sum(1, keepdim=True) / 32**2
-    return F.interpolate(slope, size=flow.shape[-2:], mode="bilinear", align_corners=False)
+def steepness(flow: Map) -> Map:
+    """|grad w|^2 (H, W) of w averaged over 16 x 16 px, which removes the noise."""
+    size, rows, columns = 16, *(np.arange(0, n, 16) for n in flow.shape[1:])
+    sums = np.add.reduceat(np.add.reduceat(flow, rows, 1), columns, 2)
+    areas = [np.minimum(size, n - at) for n, at in zip(flow.shape[1:], (rows, columns), strict=True)]
+    wide = np.pad(sums / np.outer(*areas).astype(np.float32), ((0, 0), (1, 1), (1, 1)), "edge")
+    dx, dy = wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2], wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]
+    slope = (dx * dx + dy * dy).sum(0) / np.float32((2 * size) ** 2)
+    found: Map = image.resized(slope[None], flow.shape[1:])[0]
+    return found
 
 
 @vectorised

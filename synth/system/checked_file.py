@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import stat
 import tempfile
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
@@ -78,26 +76,6 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             if array.dtype.kind not in "biuf":
                 raise ValueError(f"{name} is not an array of numbers")
         return found
-
-
-def read_tensors(path: Path) -> dict[str, Any]:
-    """The tensors and plain values that `torch.save` wrote, by name, on the CPU. UserError for others."""
-    import torch
-
-    with open_file(path, _LARGEST_ARRAYS) as file, as_user_error(f"{path}: corrupt checkpoint"):
-        with zipfile.ZipFile(file) as archive:  # PyTorch ignores checksums
-            if sum(entry.file_size for entry in archive.infolist()) > os.fstat(file.fileno()).st_size:
-                raise ValueError("compressed")
-            if (damaged := archive.testzip()) is not None:
-                raise ValueError(f"a checksum of {damaged} does not match")
-        try:
-            file.seek(0)
-            tree = torch.load(file, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:  # its message advises to load them all the same
-            raise ValueError("holds other objects than tensors and plain values") from None
-        if not isinstance(tree, dict):
-            raise TypeError("holds no state")
-        return tree
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 _OPENCV = "opencv-contrib-python-headless"
-COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "torch", "numba", "llvmlite", "xatlas")
+COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "onnxruntime", "numba", "llvmlite", "xatlas")
 
 
 def versions() -> dict[str, str]:

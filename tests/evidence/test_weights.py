@@ -24,7 +24,7 @@ def test_weights_are_made_from_nothing_and_cards_name_those_below(
     weights.measure(tmp_path / "work", **how)
     cards = {file.stem: json.loads(file.read_text()) for file in (tmp_path / "work/made").glob("*.json")}
     assert cards["segmentation"]["below"] == {}
-    first = hashlib.sha256((tmp_path / "work/made/segmentation.pt").read_bytes()).hexdigest()
+    first = hashlib.sha256((tmp_path / "work/made/segmentation.onnx").read_bytes()).hexdigest()
     assert first.startswith(cards["depth_correction"]["below"]["segmentation"])
     assert set(cards["depth_correction"]["below"]) == {"segmentation", "correction"}
     makers = (weights, "_rendered"), (segmentation_training, "train"), (correction_training, "train")

@@ -15,10 +15,9 @@ import safetensors.torch
 import torch
 from command import run
 
-from learn.checkpoint import read_card, read_model, save_tensors, write_card, write_model
+from learn.checkpoint import read_card, read_model, read_tensors, save_tensors, write_card, write_model
 from learn.cli import app
 from synth.errors import UserError
-from synth.system.checked_file import read_tensors
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,7 @@ HEAVY = {"numpy", "pydantic", "torch", "mitsuba", "drjit", "scipy", "cv2", "zarr
     [
         ("import synth, learn, bench", HEAVY),
         ("import synth; synth.Job()", {"mitsuba", "drjit", "torch", "zarr", "numba"}),
+        ("import synth.sequence.pipeline, synth.recording_flow.flow", {"torch"}),
     ],
 )
 def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> None:

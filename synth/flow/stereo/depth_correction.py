@@ -16,7 +16,7 @@ from synth.arrays import Map
 from synth.flow import correction
 from synth.flow.stereo.depth_motion import Change, Solver
 
-WEIGHTS = Path(__file__).with_name("depth_correction.pt")
+WEIGHTS = Path(__file__).with_name("depth_correction.onnx")
 _WINDOWS = 1, 3  # cells a side
 _STEPS = [f"{part} over {side}" for side in _WINDOWS for part in ("step", "precision")]
 FEATURES = (
@@ -58,5 +58,5 @@ def describe(
 def correct(features: Map) -> tuple[Map, Map]:
     """Correction of the depth motion and its deviation, (h, w) mm, for `FEATURES` (CHANNELS, h, w)."""
     height, width = features.shape[1:]
-    found = correction.predict(correction.load(WEIGHTS, CHANNELS, 1), features)[:, :height, :width]
+    found = correction.predict(WEIGHTS, features)[:, :height, :width]
     return UNIT_MM * found[0], UNIT_MM * np.exp(0.5 * found[1].clip(-8, 5))

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from synth.arrays import Map, Mask
 from synth.errors import UserError
-from synth.flow.tvl1 import Tvl1, one_thread
+from synth.flow.image import flags
+from synth.flow.tvl1 import Tvl1
 
 _STEP = 16  # OpenCV requires ranges in multiples of it and returns sixteenths of a pixel
 _BLOCK = 5  # px, side of the matched blocks; the penalties are those that OpenCV suggests for it
@@ -81,13 +80,7 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
 
 def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start: Map) -> tuple[Map, Map]:
     """Flow (2, H, W) px from the left to the right rest picture, and its agreement (H, W)."""
-
-    def wide(field: NDArray[np.generic]) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(field, np.float32))[None, None]
-
-    initial = torch.from_numpy(np.stack([-start, np.zeros_like(start)]))[None]
-    with torch.inference_mode(), one_thread():
-        flow, trust, _ = Tvl1(corrected=False).tensors(
-            wide(left), wide(right), wide(left_usable), wide(right_usable), initial
-        )
-    return flow[0].numpy(), trust[0, 0].numpy()
+    initial = np.stack([-start, np.zeros_like(start)])
+    usable = flags(left_usable), flags(right_usable)
+    flow, trust, _ = Tvl1(corrected=False).uncorrected(flags(left), flags(right), *usable, initial)
+    return flow, trust

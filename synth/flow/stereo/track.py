@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
@@ -153,16 +152,14 @@ class StereoTracker:
         visible = r.flags(confidence > 0, 0).astype(np.float32)
         share = coarse(visible)
         sure = coarse(r.picture(confidence, 0) * visible) / np.maximum(share, 0.1)
-        fields = (torch.from_numpy(np.asarray(one, np.float32))[None, None] for one in (sure, share > 0.1))
-        spread = deviation(np.asarray(image.fill(*fields)[0, 0], np.float32))
+        spread = deviation(image.fill(image.flags(sure), image.flags(share > 0.1)))
         sizes = self.px_per_mm, self._mm_per_px
         return depth_correction.describe(change, self.solver, flow, share, spread, *sizes), spread
 
     def _normalised(self, rgb: Pixels, usable: Mask, camera: int) -> tuple[Map, Map]:
         """Rectified picture in local deviations, and the mask, both (H, W) float32."""
-        known = usable.astype(np.float32)
-        grey = torch.from_numpy(self.rectified.picture(rgb @ image.GREY, camera))[None, None]
-        return image.normalise(grey, torch.from_numpy(known)[None, None])[0, 0].numpy(), known
+        known = image.flags(usable)
+        return image.normalise(self.rectified.picture(rgb @ image.GREY, camera), known), known
 
 
 def still_frames(flow: Map, tissue: Mask) -> int:

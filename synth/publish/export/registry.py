@@ -10,7 +10,17 @@ from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.publish import sequence_video
-from synth.publish.export import d2fnet, endonerf, hugging_face, lerobot, plain, tapvid, vtu, webdataset
+from synth.publish.export import (
+    d2fnet,
+    endonerf,
+    flow_pairs,
+    hugging_face,
+    lerobot,
+    plain,
+    tapvid,
+    vtu,
+    webdataset,
+)
 from synth.system import checked_file
 
 FORMATS: dict[str, Callable[..., None]] = {
@@ -20,6 +30,7 @@ FORMATS: dict[str, Callable[..., None]] = {
     "lerobot": lerobot.write_episodes,
     "endonerf": endonerf.write_scenes,
     "tapvid": tapvid.write_tracks,
+    "flow-pairs": flow_pairs.write_pairs,
     "hdf5": plain.write_hdf5,
     "d2fnet-npz": d2fnet.write_npz,
     "vtu": vtu.write_meshes,

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -67,6 +68,11 @@ def test_an_exported_model_predicts_the_same_force_with_its_gain(
         session = onnxruntime.InferenceSession(str(tmp_path / "net"))
         named = {put.name: one.numpy() for put, one in zip(session.get_inputs(), inputs, strict=True)}
         np.testing.assert_allclose(session.run(None, named)[0], after, rtol=1e-3, atol=1e-5)
+    ran = runpy.run_path(str(tmp_path / "net.example.py"))
+    moved, sure = ran["inputs"]["displacement"], ran["inputs"].get("confidence")
+    density = gained.density(moved, np.ones((32, 32), np.float32), plain.card.typical_young_kpa, sure)
+    force = (36 / 32) ** 2 * density[0].sum(axis=(1, 2))
+    np.testing.assert_allclose(ran["force_mn"], force, rtol=1e-3, atol=1e-4)
     monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
     with pytest.raises(UserError):
         export(gained, tmp_path / "refused")

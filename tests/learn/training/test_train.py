@@ -15,7 +15,6 @@ from learn.training.batches import Batch, FrameDataset, FrameItem, add_surface_m
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
 from synth.errors import UserError
-from synth.system import checked_file
 from synth.system.config_file import override
 
 
@@ -44,7 +43,7 @@ def test_killed_and_resumed_equals_uninterrupted(clips: list[Clip], model: Path,
     with pytest.raises(KeyboardInterrupt):
         train(clips, SPLIT, small(input="mixed"), out, log=kill)
     card = train(clips, SPLIT, small(input="mixed"), out)
-    whole, resumed = (checked_file.read_tensors(folder / "last.pt")["model"] for folder in (model, out))
+    whole, resumed = (checkpoint.read_tensors(folder / "last.pt")["model"] for folder in (model, out))
     for name, value in resumed.items():
         assert torch.equal(value, whole[name]), name
     assert (out / "history.jsonl").read_text() == (model / "history.jsonl").read_text()

@@ -11,7 +11,7 @@ from synth.dataset import provenance
 
 def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> None:
     files = dict.fromkeys(("engine/run.py", "flow/README.md"), False)
-    files |= dict.fromkeys(("flow/tvl1.py", "flow/segmentation.pt", "fem/mesh/lattice.py"), True)
+    files |= dict.fromkeys(("flow/tvl1.py", "flow/segmentation.onnx", "fem/mesh/lattice.py"), True)
     for name in files:
         file = tmp_path / "synth" / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -32,7 +32,7 @@ def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> 
 def test_the_version_of_motion_follows_its_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = formats.motion_version()
     monkeypatch.setattr(formats, "MOTION_WEIGHTS", tmp_path)
-    (tmp_path / "a.pt").write_bytes(b"one")
+    (tmp_path / "a.onnx").write_bytes(b"one")
     assert formats.motion_version.__wrapped__() != before
 
 

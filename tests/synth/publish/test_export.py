@@ -95,11 +95,43 @@ def test_frames_are_those_of_the_store(root: Path) -> None:
     assert np.array_equal(item["area"], sequence["area"][:])
     assert np.array_equal(item["force"], sequence["force"][1])
     assert TorchDataset(root, ["rgb"], sequences=[1])[0]["index"] == 1
+    pairs = TorchDataset(root, ["flow"], split="test", clip=2, transform=lambda item: item["flow"])
+    assert len(pairs) == 2
+    (last,) = sides(root)["test"]
+    assert np.array_equal(pairs[1], by_index(root)[last]["flow"][1:3])
+    for wrong in ({"split": "all"}, {"clip": 4}):
+        with pytest.raises(UserError):
+            TorchDataset(root, ["flow"], **wrong)
     with pytest.raises(IndexError):
         frames[18]
     for name in ("colour", "motion_recovered"):
         with pytest.raises(UserError):
             TorchDataset(root, [name])
+
+
+def test_flow_pairs_are_read_by_the_rules_of_their_layouts(root: Path, tmp_path: Path) -> None:
+    export_dataset(root, tmp_path / "to", "flow-pairs")
+    stores = by_index(root)
+    rows = (tmp_path / "to/kitti/pairs.csv").read_text().splitlines()[1:]
+    assert len(rows) == sum(sequence.frames - 1 for sequence in stores.values())
+    for pair, number, t in (map(int, row.split(",")) for row in rows):
+        sequence = stores[number]
+        flow, visible, tissue = sequence["flow"][t], sequence["visible"][t], sequence["tissue"][:]
+        scenes = tmp_path / "to/sintel/training"
+        one, clean = (scenes / kind / f"{number:06d}_{t:04d}" for kind in ("flow", "clean"))
+        assert len(sorted(clean.iterdir())) == len(sorted(one.iterdir())) + 1, "a loader pairs neighbours"
+        found = cv2.readOpticalFlow(str(one / "frame_0001.flo"))
+        assert np.array_equal(found[tissue], flow[tissue])
+        assert (found[~tissue] > 1e9).all()
+        hidden = cv2.imread(str(scenes / f"occlusions/{one.name}/frame_0001.png"), 0) > 0
+        assert np.array_equal(hidden, tissue & ~visible)
+        kitti = tmp_path / "to/kitti/training"
+        for kind, valid in (("occ", tissue), ("noc", tissue & visible)):
+            png = cv2.imread(str(kitti / f"flow_{kind}/{pair:06d}_10.png"), -1)[..., ::-1].astype(float)
+            assert np.array_equal(png[..., 2] > 0, valid)
+            assert np.abs((png[..., :2] - 2**15) / 64 - flow)[valid].max(initial=0) <= 1 / 128
+        for folder, name in ((clean, "frame_0002.png"), (kitti, f"image_2/{pair:06d}_11.png")):
+            assert np.array_equal(np.asarray(Image.open(folder / name)), sequence["rgb"][t])
 
 
 @pytest.mark.slow

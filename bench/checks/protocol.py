@@ -1,0 +1,48 @@
+"""The protocol of a first recording: what to record and to measure, and which of it a recording has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from bench.recording.folder import Recording
+from synth.recording_flow.finding import Finding
+from synth.system.checked_file import read_yaml
+
+# Whether a recording has a step of protocol.yaml; of the others its files don't tell.
+_IS_IN: Mapping[str, Callable[[Recording], bool]] = {
+    "second camera": lambda recording: recording.has_stereo,
+    "scale": lambda recording: recording.meta.scale_mm_per_px != "unknown",
+    "sensor": lambda recording: (
+        recording.meta.sensor.in_camera_axes or recording.meta.sensor.turn_s is not None
+    ),
+    "stiffness": lambda recording: recording.meta.young_kpa is not None,
+    "membrane": lambda recording: recording.meta.membrane != "unknown",
+    "rest": lambda recording: bool(recording.meta.sensor.free_s or recording.meta.pulse.free_s),
+    "taps": lambda recording: recording.meta.sync.method != "clock" or recording.times_s is not None,
+    "press": lambda recording: recording.meta.press_s is not None,
+    "outline": lambda recording: recording.tissue is not None,
+}
+
+
+def read_steps() -> list[dict[str, str]]:
+    """`title`, `how` and `without`, the cost of its absence, of each step in order."""
+    steps: list[dict[str, str]] = read_yaml(Path(__file__).with_suffix(".yaml"))
+    return steps
+
+
+def check_protocol(recording: Recording) -> list[Finding]:
+    """Findings on the steps: one for all that the recording has, and one for each that it lacks."""
+    known = [(step, _IS_IN[step["title"]](recording)) for step in read_steps() if step["title"] in _IS_IN]
+    has = [step["title"] for step, done in known if done]
+    found = [Finding("ok", "protocol", f"{len(has)} of {len(known)} steps: {', '.join(has) or 'none'}")]
+    for step in (step for step, done in known if not done):
+        message = f"{step['title']}: without it, {step['without']}. {step['how']}"
+        found.append(Finding("missing", "protocol", message))
+    return found
+
+
+def as_markdown() -> str:
+    """The steps as a list to tick off."""
+    line = "- [ ] **{title}**: {how} *Without it:* {without}.\n"
+    return "".join(line.format_map(step) for step in read_steps())

@@ -1,0 +1,34 @@
+"""A dataset of two short sequences that comes with the package.
+
+It was made by `synth render tiny -o sample store.flow=float16 store.without=[depth]` and zipped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from synth.dataset.store import Dataset
+from synth.system import cache
+
+_ARCHIVE = Path(__file__).with_name("sample.zip")
+
+
+def sample() -> Dataset:
+    """Two sequences of six frames of 160 × 120 px, to read without rendering anything.
+
+    They are unpacked into this user's cache once. Raises PermissionError if no folder is writable.
+
+        flow = synth.sample()[0]["flow"][3]  # (120, 160, 2) px
+    """
+    name = hashlib.blake2b(_ARCHIVE.read_bytes(), digest_size=8).hexdigest()
+    folder = cache.folder("sample") / name
+    if not folder.exists():
+        with tempfile.TemporaryDirectory(dir=folder.parent) as part:
+            shutil.unpack_archive(_ARCHIVE, Path(part) / name)
+            with suppress(OSError):  # another process was faster
+                (Path(part) / name).rename(folder)
+    return Dataset(folder)

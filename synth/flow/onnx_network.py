@@ -1,0 +1,37 @@
+"""Small networks in ONNX files, run by ONNX Runtime on one thread.
+
+PyTorch trains them (`evidence.flow.networks`). To run them it would take twice as long, and longer to import
+than a sequence's flow.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+from synth.arrays import Map
+from synth.errors import as_user_error
+from synth.system import checked_file
+
+_LARGEST = 1 << 24  # bytes of a file
+_ERRORS_ONLY = 3
+
+
+@cache
+def load(path: Path) -> onnxruntime.InferenceSession:
+    """The network of a file. UserError: it can't be read."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = _ERRORS_ONLY
+    data = checked_file.read_bytes(path, _LARGEST)
+    with as_user_error(f"{path}: not a network in ONNX"):
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+
+
+def run(path: Path, planes: Map) -> Map:
+    """Output (C', H', W') of the network of a file for one input (C, H, W) float32."""
+    (found,) = load(path).run(None, {"planes": planes[None]})
+    return np.asarray(found[0], np.float32)

@@ -1,0 +1,39 @@
+"""The protocol of a first recording, and which of it a recording has."""
+
+from pathlib import Path
+from typing import Any
+
+from command import run
+
+from bench.checks import protocol
+from bench.checks.protocol import check_protocol, read_steps
+from bench.cli import app
+from bench.recording.folder import Recording
+from bench.recording.meta import Meta
+
+
+def lacking(tissue: Path | None = None, **stated: Any) -> set[str]:
+    """Steps that a recording lacks with these statements."""
+    meta = Meta.model_validate({"scale_mm_per_px": "unknown", **stated})
+    recording = Recording(Path(), meta, {}, None, None, None, tissue, ())  # type: ignore[arg-type]
+    found = check_protocol(recording)
+    return {one.message.split(":")[0] for one in found if one.severity == "missing"}
+
+
+def test_each_statement_ticks_its_step(tmp_path: Path) -> None:
+    assert set(protocol._IS_IN) < {step["title"] for step in read_steps()}
+    given: dict[str, dict[str, Any]] = {
+        "scale": {"scale_mm_per_px": 0.1},
+        "stiffness": {"young_kpa": 1.0},
+        "membrane": {"membrane": "stripped"},
+        "press": {"press_s": [0.1, 0.2]},
+        "rest": {"pulse": {"free_s": [[0, 0.1]]}},
+        "sensor": {"sensor": {"axes": "camera"}},
+        "taps": {"sync": {"method": "correlate", "calibration_s": [0, 0.2]}},
+        "outline": {"tissue": Path("tissue.png")},
+    }
+    assert lacking() == {*protocol._IS_IN}
+    for title, meta in given.items():
+        assert lacking(**meta) == {*protocol._IS_IN} - {title}
+    run(app, "init", "--protocol", tmp_path / "new")
+    assert (tmp_path / "new/protocol.md").read_text().count("- [ ] ") == len(read_steps())

@@ -1,0 +1,25 @@
+"""The dataset that comes with the package."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synth
+from synth.checks.verify import verify_dataset
+from synth.dataset import sample
+
+
+def test_the_sample_is_small_sound_and_unpacked_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert sample._ARCHIVE.stat().st_size < 2e6
+    monkeypatch.setenv("SULCUS_CACHE", str(tmp_path))
+    sample.cache.folder.cache_clear()
+    first, again = synth.sample(), synth.sample()
+    sample.cache.folder.cache_clear()
+    assert first.root == again.root
+    assert first.root.is_relative_to(tmp_path)
+    assert len(first) == 2
+    moved = np.linalg.norm(first[0]["flow"][:], axis=-1)
+    assert moved[0].max() == 0 < 1 < moved.max()
+    report = verify_dataset(first.root)
+    assert report.good, [check.failures for check in report.checks]
