@@ -321,7 +321,7 @@ def verify(
 def view(
     out: Out,
     sequence: Index = 0,
-    save: Annotated[Path, Option(help="The picture, .png or .jpg.")] = Path("view.png"),
+    save: Annotated[Path, Option(help="A picture, .png or .jpg, or all frames: .webp.")] = Path("view.png"),
     frame: Annotated[
         list[int] | None, Option("--frame", "-f", help="Repeatable; default: the largest force.")
     ] = None,
@@ -329,15 +329,20 @@ def view(
     """Draws frames of a sequence with their flow and force map side by side, as in the README."""
     from synth.dataset import location
     from synth.dataset.store import open_sequence
-    from synth.publish.picture import draw_sequence, strongest
+    from synth.publish.picture import draw_sequence, strongest, write_animation
     from synth.system.checked_file import write_picture
 
-    if save.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise UserError(f"{save}: its name must end with .png or .jpg")
+    moving = save.suffix.lower() == ".webp"
+    if not moving and save.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise UserError(f"{save}: its name must end with .png, .jpg or .webp")
     chosen = open_sequence(location.store(out, sequence))
-    rows = draw_sequence(chosen, frame or [strongest(chosen)])
+    numbers = frame or ([*range(chosen.frames)] if moving else [strongest(chosen)])
+    rows = draw_sequence(chosen, numbers)
     save.parent.mkdir(parents=True, exist_ok=True)
-    write_picture(save, rows)
+    if moving:
+        write_animation(save, rows, len(numbers), chosen.attrs["fps"])
+    else:
+        write_picture(save, rows)
     print(f"wrote {save}")
 
 

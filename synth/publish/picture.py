@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -119,6 +121,15 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
             panels[f"traction, {total_mn:.1f} mN in total (yellow: {largest_kpa:.2g} kPa)"] = loaded
         rows.append(np.hstack([framed(panel, text) for text, panel in panels.items()]))
     return np.vstack(rows)[:, _GAP_PX:]
+
+
+def write_animation(path: Path, rows: Rgb, count: int, fps: float) -> None:
+    """Writes a picture of `draw_sequence`, of `count` rows, as an animated WebP that shows one at a time."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(row) for row in np.split(rows, count))
+    how: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": 85, "method": 6}
+    first.save(path, "WEBP", save_all=True, append_images=others, **how)
 
 
 def in_grey(picture: Rgb) -> Rgb:
