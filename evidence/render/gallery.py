@@ -50,7 +50,7 @@ _SCENERY: dict[str, str] = {
 _CAPTION_PX = 15
 
 
-def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 144, quality: int = 46) -> None:
+def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 320, quality: int = 60) -> None:
     """Draws families x instruments and lights x cameras as the images of docs/gallery.md.
 
     `width`: of a tile [px]; `quality`: of WebP.
