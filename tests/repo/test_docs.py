@@ -86,14 +86,28 @@ METHODS = "network and physics", "physics", "mean |flow|"  # columns of the READ
 
 
 def test_figures_of_the_readme_are_those_of_stored_results() -> None:
-    rows = re.findall(
-        r"^\| .*\((docs/results/.*)README.md\) \| (.*)% \|$", (ROOT / "README.md").read_text("utf-8"), re.M
-    )
+    text = (ROOT / "README.md").read_text("utf-8")
+    rows = re.findall(r"^\| .*\((docs/results/.*)README.md\) \| (.*)% \|$", text, re.M)
     assert len(rows) == 4
     for folder, shown in rows:
         found = json.loads((ROOT / folder / "pool.json").read_text("utf-8"))["methods"]
         stored = [found[name]["scores"]["mae_of_peak"]["mean"] for name in METHODS]
         assert shown.split("% | ") == [f"{100 * value:.1f}" for value in stored]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_percentages_in_a_sentence_that_links_to_a_result_are_on_its_page(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.S)
+    for part in re.split(r"(?<=[.!?])\s+(?=[A-Z*\[])|\n\n|\n\||\n- ", text):
+        links = re.findall(r"\]\(([^)#]*results/[^)#]*\.md)\)", part)
+        if not links:
+            continue
+        linked = " ".join((page.parent / one).read_text("utf-8") for one in links)
+        numbers = set(re.findall(r"\d+(?:\.\d+)?", linked))
+        for shown in re.findall(r"\d+(?:\.\d+)?(?=%)", re.sub(r"\([^)]*\)", "", part)):
+            digits = len(shown.partition(".")[2])
+            shares = {f"{100 * float(one):.{digits}f}" for one in numbers if "." in one}
+            assert shown in numbers | shares, f"{page.name}: {shown}% is not in {links}"
 
 
 HOWTO = ("instruments", "mechanics", "export", "camera", "models", *PLUG_INS)
