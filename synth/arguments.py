@@ -50,7 +50,9 @@ _hints = functools.cache(typing.get_type_hints)
 
 
 def _kind(hint: Any) -> Any:
-    return typing.get_origin(hint) or hint
+    kind = typing.get_origin(hint) or hint
+    # Since NumPy 2.5 `NDArray` is a named alias of the array's type.
+    return _kind(kind.__value__) if hasattr(kind, "__value__") else kind
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typing_extensions import TypeAliasType
 
 import bench
 import learn
 import synth
+from synth import arguments
 from synth.errors import UserError
 
 ODD: tuple[Any, ...] = (
@@ -46,6 +48,13 @@ def test_an_odd_argument_is_named(function: Any, tmp_path: Path, monkeypatch: py
                 function(**{**usual, name: value})
             assert re.search(rf"\b{name}\b|sequence -1|no such", str(refused.value)), (name, value)
     assert not any(tmp_path.iterdir())
+
+
+def test_a_named_alias_of_arrays_means_arrays() -> None:
+    """As `NDArray` is since NumPy 2.5."""
+    alias = TypeAliasType("alias", np.ndarray)
+    assert arguments._fits(np.zeros(2), alias)
+    assert not arguments._fits("a", alias)
 
 
 def test_a_motion_is_at_rest_in_frame_0_and_finite() -> None:
