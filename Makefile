@@ -5,7 +5,7 @@
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
 #   make docs    the pages in site/; open site/index.html
-#   make weights  trains the segmentation and the corrections of flow and of depth again, from nothing, into runs/weights: hours
+#   make weights  trains all networks again, from nothing, into runs/weights/made: segmentation, corrections, forces; many hours
 #   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
 #   make clean   removes all of the above
 #
@@ -82,8 +82,16 @@ docs: setup
 	$(BIN)/python docs/generate.py
 	PYTHONPATH=docs $(BIN)/python -m zensical build --strict --clean
 
+# Forces are learnt from motion recovered with the networks in the checkout: copy those made before if they are to be used.
+WEIGHTS := runs/weights
+FORCES := arch.levels=3 arch.dropout=0 arch.relative=true arch.confidence=true arch.membrane=true arch.output=vector loss=mse-frame \
+	  batch=16 learning_rate=1.5e-3 epochs=90 surface_motion_mm=0.7 frames=0 epoch_frames=4000 --labels $(WEIGHTS)/labels
 weights: setup
-	$(BIN)/python -m evidence weights runs/weights
+	$(BIN)/python -m evidence weights $(WEIGHTS)
+	$(BIN)/synth render mission -o $(WEIGHTS)/mission sequences=244 seed=56
+	$(BIN)/synth render randomized -o $(WEIGHTS)/labels sequences=330 seed=56
+	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo -o $(WEIGHTS)/made/stereo
+	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset cpu --input mixed -o $(WEIGHTS)/made/mono
 
 evidence: setup
 	$(BIN)/python -m evidence all runs/evidence $(if $(PHOTO),--photo $(PHOTO)) \

@@ -125,7 +125,8 @@ def test_batches_of_packed_clips_and_of_stored_frames_are_equal(stereo: list[Cli
 @pytest.mark.slow
 def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> None:
     run(app, "predict", model, data, "-o", tmp_path / "f")
-    assert np.load(tmp_path / "f/000000.npz")["force_mn"].shape == (6, 3)
+    with np.load(tmp_path / "f/000000.npz") as found:
+        assert found["force_mn"].shape == (6, 3)
     assert json.loads(run(app, "eval", model, data, "--all", "--json").stdout)["input"] == "motion"
     run(app, "eval", model, data, "--all", "--input", "recovered", code=2)
     assert export(load_model(model), tmp_path / "net.onnx") < 1e-4

@@ -133,11 +133,11 @@ def test_an_unknown_scale_is_reported_and_e_ignored(
     # The picture of 64 px is assumed to be 32 mm wide.
     for name, scale in (("unknown", ["--scale", "unknown", "--young", "3"]), ("stated", ["--scale", "0.5"])):
         run(app, *predict, *scale, "--out", name)
-    unknown, stated = (np.load(Path(name, "video.npz")) for name in ("unknown", "stated"))
-    np.testing.assert_array_equal(unknown["total_force_mn"], stated["total_force_mn"])
-    assert not unknown["young_known"]
-    assert UNKNOWN_NOTE in unknown["notes"]
-    assert UNKNOWN_NOTE not in stated["notes"]
+    with np.load("unknown/video.npz") as unknown, np.load("stated/video.npz") as stated:
+        np.testing.assert_array_equal(unknown["total_force_mn"], stated["total_force_mn"])
+        assert not unknown["young_known"]
+        assert UNKNOWN_NOTE in unknown["notes"]
+        assert UNKNOWN_NOTE not in stated["notes"]
     run(app, *predict, "--scale", -1, code=2)
 
 
