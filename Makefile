@@ -5,7 +5,7 @@
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
 #   make docs    the pages in site/; open site/index.html
-#   make weights  trains all networks again, from nothing, into runs/weights/made: segmentation, corrections, forces; many hours
+#   make weights  trains the networks again, from nothing, into runs/weights/made: of motion, then of force; many hours
 #   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
 #   make clean   removes all of the above
 #

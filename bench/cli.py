@@ -132,14 +132,18 @@ def init(
     from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
-    path = recording / "meta.yaml"
-    with as_user_error(f"{path}: cannot be written"):
-        recording.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(commented())
-        if protocol:
-            (recording / "protocol.md").write_text(as_markdown(), "utf-8")
-    print(f"wrote {path}; fill in its scale, then: bench check {recording}")
+    files = {"meta.yaml": commented()}
+    if protocol:
+        # Where meta.yaml exists, the list is added to it.
+        files = {name: text for name, text in files.items() if not (recording / name).exists()}
+        files["protocol.md"] = as_markdown()
+    for name, text in files.items():
+        with as_user_error(f"{recording / name}: cannot be written"):
+            recording.mkdir(parents=True, exist_ok=True)
+            with (recording / name).open("x", encoding="utf-8") as file:
+                file.write(text)
+    written = " and ".join(str(recording / name) for name in files)
+    print(f"wrote {written}; fill in meta.yaml, then: bench check {recording}")
 
 
 @app.command(epilog="Example: bench check recording")

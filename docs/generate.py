@@ -102,10 +102,11 @@ and its depth is
 _PROTOCOL_HEAD = """\
 # A first specimen
 
-The list is written by `make docs` from `bench/checks/protocol.yaml`. An afternoon's protocol for a
-recording from which force can be estimated and scored. `bench init --protocol RECORDING` writes the list at
-the end of this page next to a `meta.yaml`; `bench check RECORDING` says which steps a recording has, and
-what each missing one costs. The keys are those of [`meta.yaml`](../reference/recording.md).
+This protocol takes an afternoon. It leads to a recording from which force can be estimated and scored.
+`bench init --protocol RECORDING` writes the list at the end of this page into the recording's folder;
+`bench check RECORDING` says which steps a recording has, and what each missing one costs. The keys are those
+of [`meta.yaml`](../reference/recording.md). The list is written by `make docs` from
+`bench/checks/protocol.yaml`.
 
 ## Settings
 
@@ -119,9 +120,8 @@ what each missing one costs. The keys are those of [`meta.yaml`](../reference/re
 | stiffness | measured next to the site | 0.5 kPa throughout |
 
 Scale, stiffness and a second camera decide most: force is proportional to stiffness and to the square of
-the scale, and one camera hardly measures force along its line of sight. What a statement in `meta.yaml`
-gains, from scale and stiffness alone to the state of the membrane, is measured on rendered recordings: see
-*undegraded recordings* in [stability](../results/scoring/stability/README.md).
+the scale, and one camera hardly measures force along its line of sight. `python -m evidence
+scoring.stability WORK` measures what each further statement in `meta.yaml` gains, on rendered recordings.
 
 ## Steps
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from synth.job import identity
 
 @cache
 def code() -> str:
-    """Hash of this project's source files and of the packages' versions."""
-    return provenance.source("synth", "learn", "bench", "evidence")
+    """Hash of this project's source files and of the packages' versions, PyTorch's included."""
+    return f"{provenance.source('synth', 'learn', 'bench', 'evidence')} {version('torch')}"
 
 
 def key(*parts: Any) -> str:

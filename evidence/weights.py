@@ -48,7 +48,6 @@ def measure(
     """Renders sequences of two jobs, trains in turn, and writes weights and cards to `made` in the folder.
 
     They are not put next to the modules: whether they are better than those there is to be measured first.
-
     `drawn`: drawn pairs for the corrections; `steps`: of the segmentation, with 12 examples each, or 96 on
     the `device` "cuda"; `minutes`: CPU time of each correction. What a folder has is made again only where
     settings or weights below differ.
@@ -69,7 +68,7 @@ def measure(
         card = {**about, **settings, "below": dict(below)}
         key = hashlib.sha256(json.dumps(card, sort_keys=True).encode()).hexdigest()[:12]
         made = folder / f"{name}-{key}.onnx"
-        if not made.with_suffix(".json").exists():  # written last
+        if not (made.exists() and made.with_suffix(".json").exists()):  # the card is written last
             net: torch.nn.Module
             if part is segmentation:
                 frames, checkpoint = [dict(np.load(file)) for file in sequences], made.with_suffix(".ckpt")

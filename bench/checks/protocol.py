@@ -14,12 +14,16 @@ _IS_IN: Mapping[str, Callable[[Recording], bool]] = {
     "second camera": lambda recording: recording.has_stereo,
     "scale": lambda recording: recording.meta.scale_mm_per_px != "unknown",
     "sensor": lambda recording: (
-        recording.meta.sensor.in_camera_axes or recording.meta.sensor.turn_s is not None
+        recording.force is not None
+        and (recording.meta.sensor.in_camera_axes or recording.meta.sensor.turn_s is not None)
     ),
     "stiffness": lambda recording: recording.meta.young_kpa is not None,
-    "membrane": lambda recording: recording.meta.membrane != "unknown",
+    "membrane": lambda recording: recording.meta.membrane != "unknown" or recording.meta.tissue == "phantom",
     "rest": lambda recording: bool(recording.meta.sensor.free_s or recording.meta.pulse.free_s),
-    "taps": lambda recording: recording.meta.sync.method != "clock" or recording.times_s is not None,
+    "taps": lambda recording: (
+        recording.force is not None
+        and (recording.meta.sync.method != "clock" or recording.times_s is not None)
+    ),
     "press": lambda recording: recording.meta.press_s is not None,
     "outline": lambda recording: recording.tissue is not None,
 }

@@ -29,7 +29,9 @@ def _open(
 class TorchDataset:
     """Frames of the sequences in `root`, as `{field: array}`, with `index` of the sequence and `frame`.
 
-    Fields without a frame axis are returned whole. Safe in forked or spawned workers.
+    Fields without a frame axis are returned whole. `split`: only this side of the dataset's split; `clip`:
+    so many consecutive frames in an item; `transform`: applied to each item. Safe in forked or spawned
+    workers.
 
         frames = TorchDataset("out", ["rgb", "flow", "traction"], split="train")
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
@@ -51,10 +53,7 @@ class TorchDataset:
             root: the dataset.
             fields: names from the field table.
             sequences: positions in the dataset of those to use; default: all.
-            split: use the sequences of this side of the dataset's split instead.
-            clip: consecutive frames of an item, whose fields then have a frame axis; `frame` is its first.
-                0: single frames, without that axis.
-            transform: applied to each item.
+            split, clip, transform: see above; `frame` is a clip's first; clip 0: single frames, without axis.
 
         Raises:
             UserError: not a dataset, no such side, or a sequence lacks a field or is shorter than a clip.
@@ -62,12 +61,15 @@ class TorchDataset:
         if unknown := [name for name in fields if name not in FIELDS]:
             raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
         self._dataset, self._fields = Dataset(root), tuple(fields)
+        if clip < 0:
+            raise UserError(f"clip: {clip}: must be a number of frames, or 0 for single ones")
         self._clip, self._transform = clip, transform
         if split is not None:
             sides = group_by_side(self._dataset)
-            if split not in sides or sequences is not None:
-                sides_known = f"{root} has {', '.join(sides)}"
-                raise UserError(f"split: {split!r}, {sides_known}; and give no sequences with it")
+            if sequences is not None:
+                raise UserError("split: give split or sequences, not both")
+            if split not in sides:
+                raise UserError(f"split: {split!r}: {root} has {', '.join(sides)}")
             sequences = sides[split]
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         if not all(0 <= position < len(self._dataset) for position in self._chosen):

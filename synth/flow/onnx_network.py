@@ -1,7 +1,7 @@
 """Small networks in ONNX files, run by ONNX Runtime on one thread.
 
-PyTorch trains them (`evidence.flow.networks`). To run them it would take twice as long, and longer to import
-than a sequence's flow.
+PyTorch trains them (`evidence.flow.networks`). To run them it takes longer, and to import more than the flow
+of a short sequence.
 """
 
 from __future__ import annotations

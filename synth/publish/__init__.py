@@ -1,1 +1,1 @@
-"""Products of a finished dataset: card, exports, pictures, viewer."""
+"""Products of a finished dataset: card, exports, pictures, videos."""

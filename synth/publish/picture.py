@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from synth.arrays import Mask, Pixels
 from synth.dataset.store import Sequence as Sequence_
-from synth.errors import UserError
+from synth.errors import UserError, as_user_error
+from synth.system.checked_file import write_whole
 
 Rgb = Pixels  # (H, W, 3) uint8, sRGB
 
@@ -124,12 +126,15 @@ def draw_sequence(sequence: Sequence_, frames: Sequence[int]) -> Rgb:
 
 
 def write_animation(path: Path, rows: Rgb, count: int, fps: float) -> None:
-    """Writes a picture of `draw_sequence`, of `count` rows, as an animated WebP that shows one at a time."""
+    """Writes the `count` rows of `draw_sequence` as an animated WebP. UserError: it can't be written."""
     from PIL import Image
 
     first, *others = (Image.fromarray(row) for row in np.split(rows, count))
     how: dict[str, Any] = {"duration": round(1000 / fps), "loop": 0, "quality": 85, "method": 6}
-    first.save(path, "WEBP", save_all=True, append_images=others, **how)
+    file = io.BytesIO()
+    with as_user_error(f"{path}: cannot be written"):
+        first.save(file, "WEBP", save_all=True, append_images=others, **how)
+        write_whole(path, file.getvalue())
 
 
 def in_grey(picture: Rgb) -> Rgb:

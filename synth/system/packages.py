@@ -15,7 +15,7 @@ COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "onnxruntime", "numb
 def versions() -> dict[str, str]:
     """`{package: version}` of the installed packages that affect a sequence, and of Python."""
     found = {"python": platform.python_version()}
-    for name in ("sulcus", "zarr", *COMPUTING):
+    for name in ("sulcus", "zarr", "torch", *COMPUTING):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

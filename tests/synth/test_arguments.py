@@ -14,17 +14,7 @@ import synth
 from synth import arguments
 from synth.errors import UserError
 
-ODD: tuple[Any, ...] = (
-    -1,
-    float("nan"),
-    True,
-    [1, "a", None],
-    {"a": 1},
-    object(),
-    np.zeros((2, 2, 2)),
-    int,
-    b"x",
-)
+ODD: tuple[Any, ...] = (-1, float("nan"), True, [1, "a", None], {"a": 1}, object(), np.zeros(8), int, b"x")
 CALLS: dict[Any, tuple[Any, ...]] = {
     synth.simulate: ({"job": "tiny"}, "index", "case", "motions", "mechanics"),
     synth.load_job: ({"source": "tiny"}, "source", "overrides"),

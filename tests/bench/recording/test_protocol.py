@@ -3,19 +3,21 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from command import run
 
 from bench.checks import protocol
 from bench.checks.protocol import check_protocol, read_steps
 from bench.cli import app
-from bench.recording.folder import Recording
+from bench.recording.folder import Force, Recording
 from bench.recording.meta import Meta
 
 
-def lacking(tissue: Path | None = None, **stated: Any) -> set[str]:
+def lacking(tissue: Path | None = None, sensor_file: bool = True, **stated: Any) -> set[str]:
     """Steps that a recording lacks with these statements."""
     meta = Meta.model_validate({"scale_mm_per_px": "unknown", **stated})
-    recording = Recording(Path(), meta, {}, None, None, None, tissue, ())  # type: ignore[arg-type]
+    force = Force(np.zeros(2), np.zeros((2, 3))) if sensor_file else None
+    recording = Recording(Path(), meta, {}, None, force, None, tissue, ())  # type: ignore[arg-type]
     found = check_protocol(recording)
     return {one.message.split(":")[0] for one in found if one.severity == "missing"}
 
@@ -35,5 +37,11 @@ def test_each_statement_ticks_its_step(tmp_path: Path) -> None:
     assert lacking() == {*protocol._IS_IN}
     for title, meta in given.items():
         assert lacking(**meta) == {*protocol._IS_IN} - {title}
+    assert lacking(sensor_file=False, **given["sensor"], **given["taps"]) == {*protocol._IS_IN}
     run(app, "init", "--protocol", tmp_path / "new")
-    assert (tmp_path / "new/protocol.md").read_text().count("- [ ] ") == len(read_steps())
+    listed = tmp_path / "new/protocol.md"
+    assert listed.read_text().count("- [ ] ") == len(read_steps())
+    run(app, "init", "--protocol", tmp_path / "new", code=2)  # ticks are not overwritten
+    listed.unlink()
+    run(app, "init", "--protocol", tmp_path / "new")
+    assert listed.exists()

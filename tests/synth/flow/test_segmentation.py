@@ -1,26 +1,56 @@
 """Segmentation of instruments, highlights and foreground on pictures that it was not trained on."""
 
 import json
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
-from evidence.flow.networks import SegmentationNet
+from evidence.flow.networks import CorrectionNet, SegmentationNet, write_onnx
 from evidence.flow.scenes import Recipe, pairs
-from synth.flow import segmentation
+from synth.errors import UserError
+from synth.flow import correction, onnx_network, segmentation
 from synth.flow.segmentation import segment, with_highlights
+from synth.flow.stereo import depth_correction
 
 Picture = NDArray[np.uint8]
 ON_VESSEL = pytest.mark.xfail(strict=True, reason="it is taken for an instrument, and those are given")
 
 
 def test_bundled_weights_are_small_and_those_of_their_card() -> None:
-    card = json.loads(segmentation.WEIGHTS.with_suffix(".json").read_text())
-    assert segmentation.WEIGHTS.stat().st_size <= 1_500_000
-    parameters = sum(one.numel() for one in SegmentationNet().parameters())
-    assert parameters == card["parameters"]
+    onnx = pytest.importorskip("onnx")
+    for file in (segmentation.WEIGHTS, correction.WEIGHTS, depth_correction.WEIGHTS):
+        card = json.loads(file.with_suffix(".json").read_text())
+        assert file.stat().st_size <= 1_500_000
+        parts = [
+            one for one in onnx.load(file).graph.initializer if one.data_type == onnx.TensorProto.FLOAT16
+        ]
+        learnt = [one for one in parts if one.dims and not re.search("running|^mean|^deviation", one.name)]
+        assert sum(int(np.prod(one.dims)) for one in learnt) == card["parameters"]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of PyTorch's exporter
+@pytest.mark.parametrize("net", [SegmentationNet(), CorrectionNet()], ids=["segmentation", "correction"])
+def test_onnx_files_give_what_pytorch_gives_at_any_size(net: torch.nn.Module, tmp_path: Path) -> None:
+    with torch.no_grad():
+        for one in net.parameters():
+            one.copy_(torch.randn(one.shape).half() * one[0].numel() ** -0.5)
+    channels = 6 if isinstance(net, SegmentationNet) else correction.CHANNELS
+    write_onnx(net, tmp_path / "net.onnx", channels)
+    for size in ((64, 96), (128, 64)):
+        planes = np.random.default_rng(1).normal(size=(channels, *size)).astype(np.float32)
+        with torch.no_grad():
+            expected = net.eval()(torch.from_numpy(planes)[None])[0].numpy()
+        found = onnx_network.run(tmp_path / "net.onnx", planes)
+        np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+    (tmp_path / "bad.onnx").write_bytes(b"no network")
+    with pytest.raises(UserError):
+        onnx_network.run(tmp_path / "bad.onnx", planes)
 
 
 def tissue(height: int, width: int) -> Picture:

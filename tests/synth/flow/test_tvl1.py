@@ -1,4 +1,4 @@
-"""The masked TV-L1 solver against tensor code, flow of known warps, tracking; the correction of flow."""
+"""The masked TV-L1 solver against SciPy's solution, flow of known warps, tracking; the correction of flow."""
 
 from unittest.mock import patch
 

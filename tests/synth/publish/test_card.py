@@ -68,8 +68,10 @@ def test_a_picture_shows_flow_and_load_where_they_are(root: Path, tmp_path: Path
     words = ["view", root, "--frame", 0, "-f", picture.strongest(sequence), "--save"]
     run(app, *words, tmp_path / "two.png")
     assert np.array_equal(np.asarray(Image.open(tmp_path / "two.png")), drawn)
-    for name in ("two.txt",):
-        run(app, *words, tmp_path / name, code=2)
+    run(app, *words, tmp_path / "two.txt", code=2)
+    run(app, "view", root, "--save", tmp_path / "all.webp")
+    with Image.open(tmp_path / "all.webp") as moving:
+        assert (moving.n_frames, moving.size) == (sequence.frames, (drawn.shape[1], drawn.shape[0] // 2))
 
 
 @pytest.mark.slow

@@ -99,7 +99,7 @@ def test_frames_are_those_of_the_store(root: Path) -> None:
     assert len(pairs) == 2
     (last,) = sides(root)["test"]
     assert np.array_equal(pairs[1], by_index(root)[last]["flow"][1:3])
-    for wrong in ({"split": "all"}, {"clip": 4}):
+    for wrong in ({"split": "all"}, {"clip": 4}, {"clip": -1}, {"split": "test", "sequences": [0]}):
         with pytest.raises(UserError):
             TorchDataset(root, ["flow"], **wrong)
     with pytest.raises(IndexError):
