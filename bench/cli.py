@@ -132,10 +132,9 @@ def init(
     from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
-    files = {"meta.yaml": commented()}
+    joins = protocol and (recording / "meta.yaml").exists()
+    files = {} if joins else {"meta.yaml": commented()}
     if protocol:
-        # Where meta.yaml exists, the list is added to it.
-        files = {name: text for name, text in files.items() if not (recording / name).exists()}
         files["protocol.md"] = as_markdown()
     for name, text in files.items():
         with as_user_error(f"{recording / name}: cannot be written"):

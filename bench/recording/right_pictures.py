@@ -119,7 +119,7 @@ def _match(
     rectified: Rectified, pair: list[Pixels], left: Mask, right: Mask, *, refine: bool
 ) -> rest.Rest | None:
     """`rest.match` of two pictures; None: too little in common."""
-    one, other = (rectified.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(pair))
+    one, other = (rectified.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(pair))
     with suppress(UserError):
         return rest.match(one, other, left, right, refine=refine)
     return None
@@ -127,7 +127,7 @@ def _match(
 
 def _sharpness(rgb: Pixels) -> float:
     """Detail of 1 to 2 px, which is coarser than noise, over that of 4 to 8 px."""
-    levels = [cv2.GaussianBlur((rgb @ image.GREY), (0, 0), width) for width in (1, 2, 4, 8)]
+    levels = [cv2.GaussianBlur(image.luminance(rgb), (0, 0), width) for width in (1, 2, 4, 8)]
     return float((levels[0] - levels[1]).std() / max((levels[2] - levels[3]).std(), 1e-6))
 
 

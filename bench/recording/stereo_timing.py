@@ -29,7 +29,7 @@ class StereoTiming:
 
     def add(self, left: Pixels, right: Pixels, time_s: float) -> None:
         """Adds the next frame's pictures (H, W, 3)."""
-        greys = [self._rectified.picture(rgb @ image.GREY, k) for k, rgb in enumerate((left, right))]
+        greys = [self._rectified.picture(image.luminance(rgb), k) for k, rgb in enumerate((left, right))]
         now = [cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX) for grey in greys]
         pairs = zip(now, self._last or now, strict=True)
         self._changes.append(np.array([np.abs(one - last).mean(axis=1) for one, last in pairs]))

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import torch
 from torch import Tensor, nn
 
@@ -134,9 +135,8 @@ def _write(module: nn.Module, inputs: list[Tensor], names: list[str], file: Path
     """Writes `file`, for batches of any size, and returns a session of ONNX Runtime that runs it."""
     try:
         importlib.import_module("onnx")
-        runtime: Any = importlib.import_module("onnxruntime")
-    except ImportError as missing:
-        raise UserError(f"ONNX export needs {missing.name}: pip install '.[export]' in the clone") from None
+    except ImportError:
+        raise UserError("ONNX export needs onnx: pip install '.[export]' in the clone") from None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
@@ -149,4 +149,4 @@ def _write(module: nn.Module, inputs: list[Tensor], names: list[str], file: Path
             dynamo=False,
             opset_version=17,
         )
-    return runtime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])

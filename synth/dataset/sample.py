@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 
 from synth.dataset.store import Dataset
-from synth.system import cache
+from synth.errors import UserError
+from synth.system import cache, checked_file
 
 _ARCHIVE = Path(__file__).with_name("sample.zip")
 
@@ -27,8 +26,10 @@ def sample() -> Dataset:
     name = hashlib.blake2b(_ARCHIVE.read_bytes(), digest_size=8).hexdigest()
     folder = cache.folder("sample") / name
     if not folder.exists():
-        with tempfile.TemporaryDirectory(dir=folder.parent) as part:
-            shutil.unpack_archive(_ARCHIVE, Path(part) / name)
-            with suppress(OSError):  # another process was faster
-                (Path(part) / name).rename(folder)
+        try:
+            with checked_file.folder_of(folder) as part:
+                shutil.unpack_archive(_ARCHIVE, part)
+        except (OSError, UserError):
+            if not folder.exists():  # else another process was faster
+                raise
     return Dataset(folder)

@@ -46,7 +46,7 @@ def ends(flow: Map) -> tuple[Map, Map]:
 
 def luminance(picture: Pixels) -> Map:
     """Luminance (H, W) in grey levels of RGB (H, W, 3) uint8."""
-    return np.asarray(picture.astype(np.float32) @ GREY)
+    return np.asarray(picture @ GREY)
 
 
 def flags(mask: Array) -> Map:

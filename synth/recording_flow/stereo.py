@@ -106,7 +106,7 @@ class RightCamera:
         if self.stereo is None or self._pair is None:
             return None
         r, anywhere = self.stereo.rectified, np.ones(self._pair[0].shape[:2], bool)
-        left, right = (r.picture(rgb @ image.GREY, camera) for camera, rgb in enumerate(self._pair))
+        left, right = (r.picture(image.luminance(rgb), camera) for camera, rgb in enumerate(self._pair))
         try:
             found = match(left, right, anywhere, anywhere, refine=False)
         except UserError:

@@ -81,6 +81,7 @@ def match(left: Map, right: Map, left_usable: Mask, right_usable: Mask, *, refin
 def _refined(left: Map, right: Map, left_usable: Mask, right_usable: Mask, start: Map) -> tuple[Map, Map]:
     """Flow (2, H, W) px from the left to the right rest picture, and its agreement (H, W)."""
     initial = np.stack([-start, np.zeros_like(start)])
+    pictures = np.ascontiguousarray(left), np.ascontiguousarray(right)
     usable = flags(left_usable), flags(right_usable)
-    flow, trust, _ = Tvl1(corrected=False).uncorrected(flags(left), flags(right), *usable, initial)
+    flow, trust, _ = Tvl1(corrected=False).uncorrected(*pictures, *usable, initial)
     return flow, trust

@@ -72,7 +72,7 @@ class StereoTracker:
         r = self.rectified
         usable = (r.flags(tissue & ~left_blocked, 0), r.flags(~right_blocked, 1))
         greys = [
-            np.stack([r.picture(picture @ image.GREY, camera) for picture in pictures])
+            np.stack([r.picture(image.luminance(picture), camera) for picture in pictures])
             for camera, pictures in enumerate((lefts, rights))
         ]
         self.rest = rest.match(greys[0], greys[1], *usable)
@@ -152,14 +152,14 @@ class StereoTracker:
         visible = r.flags(confidence > 0, 0).astype(np.float32)
         share = coarse(visible)
         sure = coarse(r.picture(confidence, 0) * visible) / np.maximum(share, 0.1)
-        spread = deviation(image.fill(image.flags(sure), image.flags(share > 0.1)))
+        spread = deviation(image.fill(np.asarray(sure, np.float32), image.flags(share > 0.1)))
         sizes = self.px_per_mm, self._mm_per_px
         return depth_correction.describe(change, self.solver, flow, share, spread, *sizes), spread
 
     def _normalised(self, rgb: Pixels, usable: Mask, camera: int) -> tuple[Map, Map]:
         """Rectified picture in local deviations, and the mask, both (H, W) float32."""
         known = image.flags(usable)
-        return image.normalise(self.rectified.picture(rgb @ image.GREY, camera), known), known
+        return image.normalise(self.rectified.picture(image.luminance(rgb), camera), known), known
 
 
 def still_frames(flow: Map, tissue: Mask) -> int:

@@ -51,9 +51,9 @@ def _write_sintel(
         (root / kind / name).mkdir(parents=True)
     for k, data in enumerate(both, 1):
         (root / "clean" / name / f"frame_{k:04d}.png").write_bytes(data)
-    cv2.writeOpticalFlow(
-        str(root / "flow" / name / "frame_0001.flo"), np.where(tissue[..., None], flow, _UNKNOWN)
-    )
+    head = b"PIEH" + np.array(flow.shape[1::-1], "<i4").tobytes()  # Middlebury's format
+    values = np.where(tissue[..., None], flow, _UNKNOWN).astype("<f4").tobytes()
+    (root / "flow" / name / "frame_0001.flo").write_bytes(head + values)
     (root / "occlusions" / name / "frame_0001.png").write_bytes(as_png(tissue & ~visible))
     (root / "invalid" / name / "frame_0001.png").write_bytes(as_png(~tissue))
 
@@ -68,4 +68,4 @@ def _write_kitti(
     for kind, valid in (("flow_occ", tissue), ("flow_noc", tissue & visible)):
         levels = np.rint(64 * flow + 2**15).clip(0, 2**16 - 1) * valid[..., None]
         planes = np.dstack([valid, levels[..., 1], levels[..., 0]]).astype(np.uint16)  # OpenCV stores BGR
-        cv2.imwrite(str(root / kind / f"{name}_10.png"), planes)
+        (root / kind / f"{name}_10.png").write_bytes(cv2.imencode(".png", planes)[1].tobytes())
