@@ -6,6 +6,7 @@ latter corrects depth too (`synth.flow.stereo.depth_correction`).
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -75,24 +76,21 @@ class CorrectionNet(nn.Module):
 
 
 def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
-    """Writes a network of `channels` inputs as ONNX, for pictures of any size, its weights at half precision.
-
-    ONNX Runtime widens them once, when it reads the file. Needs the extra `export`.
-    """
+    """Writes a network as ONNX, for pictures of any size, with float16 weights; needs the extra `export`."""
     import onnx
 
-    sides = {2: "height", 3: "width"}
-    torch.onnx.export(
-        net.cpu().eval(), (torch.zeros(1, channels, 64, 64),), str(file), dynamo=False, opset_version=17,
-        input_names=["planes"], output_names=["found"], dynamic_axes={"planes": sides, "found": sides},
-        do_constant_folding=False, training=torch.onnx.TrainingMode.PRESERVE,
-    )  # fmt: skip
+    sides, wide = {2: "height", 3: "width"}, onnx.TensorProto.FLOAT
+    with warnings.catch_warnings(action="ignore"):  # of the exporter that keeps the names of weights
+        torch.onnx.export(
+            net.cpu().eval(), (torch.zeros(1, channels, 64, 64),), str(file), dynamo=False, opset_version=17,
+            input_names=["planes"], output_names=["found"], dynamic_axes={"planes": sides, "found": sides},
+            do_constant_folding=False, training=torch.onnx.TrainingMode.PRESERVE,
+        )  # fmt: skip
     model = onnx.load(file)
-    for weight in [one for one in model.graph.initializer if one.data_type == onnx.TensorProto.FLOAT]:
+    for weight in [one for one in model.graph.initializer if one.data_type == wide]:
         values, name = onnx.numpy_helper.to_array(weight).astype(np.float16), weight.name
         weight.CopyFrom(onnx.numpy_helper.from_array(values, f"{name} half"))
-        cast = onnx.helper.make_node("Cast", [f"{name} half"], [name], to=onnx.TensorProto.FLOAT)
-        model.graph.node.insert(0, cast)
+        model.graph.node.insert(0, onnx.helper.make_node("Cast", [f"{name} half"], [name], to=wide))
     onnx.save(model, file)
 
 
