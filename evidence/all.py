@@ -19,7 +19,7 @@ from evidence import report, study
 from evidence.steps import Step, run_steps
 
 DATASETS: Mapping[str, tuple[str, ...]] = {
-    "mission": ("mission", "sequences=400"),
+    "mission": ("mission", "sequences=240"),
     "mission-ood": (str(report.CHECKOUT / "evidence/curves/mission-ood.yaml"), "sequences=80"),
     "stereo-640": ("stereo", "sequences=8", "seed=77", "render.size=[640, 480]"),
     "stereo-320": ("stereo", "sequences=8", "seed=77", "render.size=[320, 240]"),

@@ -1,6 +1,6 @@
 """Learning curves: error of the force against fitted sequences, by model and cameras.
 
-Every estimator is fitted on 30, 100, 300, ... sequences of one dataset and tested on held-out sequences of it
+Every estimator is fitted on 24, 72, 144 sequences of one dataset and tested on held-out sequences of it
 and on whole datasets out of distribution. Each row is stored at once: an interrupted run continues.
 """
 
@@ -142,7 +142,7 @@ def figures(estimate: Estimate, part: Sequence[Clip], bare: Sequence[bool]) -> d
 
 def measure(
     datasets: list[Path],
-    sizes: str = "30,100,300",
+    sizes: str = "24,72,144",
     steps: int = 4000,
     test: int = 56,
     select: int = 40,

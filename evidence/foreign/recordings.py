@@ -1,9 +1,9 @@
 """Stereo recordings with a force sensor, simulated and rendered by other programs.
 
 Mechanics by felupe (triquadratic bricks, compressible neo-Hookean, Hertz's pressure; a membrane as a net of
-trusses; a pulse applied to the ground), images by Blender's Cycles. This module contributes texture, the
-tool's shape and motion, the sensor and the folder's layout. They are scored by `bench score` and `bench pool`
-in stereo, and monocular without their right camera.
+trusses; a pulse applied to the ground; two tools at a time), images by Blender's Cycles. This module
+contributes texture, the tools' shape and motion, the sensor and the folder's layout. They are scored by
+`bench score` and `bench pool` in stereo, and monocular without their right camera.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.interpolate import KroghInterpolator, RectBivariateSpline
+from scipy.interpolate import KroghInterpolator, LinearNDInterpolator, RectBivariateSpline
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import Delaunay
 
 from bench.recording import writer
 from bench.recording.meta import read_meta
@@ -33,12 +34,16 @@ from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import read_picture
 
-KINDS = ("plain", "membrane", "pulse")
+KINDS = ("plain", "membrane", "pulse", "two")
 _WORKER = Path(__file__).with_name("worker.py")
 _FIELD_MM, _SIDE, _TEXELS, _SIZE = 46.0, 220, 1200, (320, 240)
 _DISTANCE_MM, _BASE_MM, _SENSOR_HZ = 300.0, 24.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
+# Directions of a left and a right tool's shaft; a single one is the right one.
+_SHAFTS = np.array([[-0.5, -0.6, 1.0], [0.5, -0.6, 1.0]]) / np.linalg.norm([0.5, -0.6, 1.0])
+_APART_MM = 8.0  # half of the distance of two tools, on average
 _VIDEOS = {"": "video.mp4", "right-": "right.mp4"}  # prefix of a camera's images, and its video
+TRUTH = "truth.npz"  # of every frame: `flow_px` (T, H, W, 2), of the contacts alone, and `force_mn` (T, 3)
 _HEART_HZ, _BREATH_HZ = 1.2, 0.25
 
 
@@ -93,7 +98,10 @@ def record(
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
     young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
-    contacts = [_contact(young, rng) for _ in range(_CONTACTS)]
+    contacts = [[_contact(young, rng) for _ in range(1 + (kind == "two"))] for _ in range(_CONTACTS)]
+    for one in contacts if kind == "two" else ():
+        for tool, side in zip(one, (-1, 1), strict=True):
+            tool["at_mm"][0] = side * (_APART_MM + tool["at_mm"][0] / 3)
     specimen = {
         "block_mm": (90.0, 50.0),
         "elements": (12, 7),
@@ -110,6 +118,8 @@ def record(
         sensor_s, level, away = tool_motion(seconds, rng)
         arrays = _scene(surface, level, away, times, contacts, rng)
         camera, focal = first_camera(rng)
+        at = np.minimum((times * _SENSOR_HZ).astype(int), len(level) - 1)
+        flow = [projected(surface.rest, surface.at(level[k], 0.0), camera, focal) for k in at]
         pair = camera, right_camera(camera)
         drawn = {
             "size": _SIZE,
@@ -117,7 +127,7 @@ def record(
             "cameras": {prefix: matrix.tolist() for prefix, matrix in zip(_VIDEOS, pair, strict=True)},
             "spp": spp,
             "threads": 1,
-            "tool_mm": 0.6 * min(one["radius_mm"] for one in contacts),
+            "tool_mm": 0.6 * min(tool["radius_mm"] for one in contacts for tool in one),
             "lamps_mm": [[70.0, 40.0, 260.0], [-60.0, 20.0, 280.0]],
             "watts": 2.6e5,
         }
@@ -126,8 +136,9 @@ def record(
         for prefix, file in _VIDEOS.items():
             pictures = (_sensed(folder / f"{prefix}{k:05d}.png", noise) for k in range(len(times)))
             writer.write_video(part / file, pictures, times, crf=18)
-    whole = level @ np.array([one["force_mn"] for one in contacts])
+    whole = level @ np.array([np.sum([tool["force_mn"] for tool in one], axis=0) for one in contacts])
     measured = whole @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    np.savez_compressed(part / TRUTH, flow_px=np.array(flow, np.float16), force_mn=measured[at])
     measured = measured + 0.02 * rng.normal(size=(len(sensor_s), 3))
     writer.write_force(part, sensor_s, measured / 1000)
     write_pair(part / "pair.yaml", *pair, focal)
@@ -228,10 +239,10 @@ def _scene(
     level: Floats,
     away: Floats,
     times: Floats,
-    contacts: list[dict[str, Any]],
+    contacts: list[list[dict[str, Any]]],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Renderer input: rest, motion (T, N, N, 3), the tool's tip and shaft (T, 3), texture and bumps."""
+    """Renderer input: rest, motion (T, N, N, 3), tips (T, tools, 3), shafts (tools, 3), texture and bumps."""
     phase = rng.uniform(0, 2 * np.pi, 2)
 
     def pulse(time: float) -> float:
@@ -239,18 +250,18 @@ def _scene(
         return float(np.array([0.7, 0.3]) @ np.sin(angle))
 
     moved, tips = [], []
-    shaft = np.array([0.5, -0.6, 1.0]) / np.linalg.norm([0.5, -0.6, 1.0])
+    shafts = _SHAFTS[-len(contacts[0]) :]
     for time in times:
         at = min(int(time * _SENSOR_HZ), len(level) - 1)
         now = surface.at(level[at], pulse(time) - pulse(0.0))
         k = int(np.argmin(away[at]))
-        here = np.array(contacts[k]["at_mm"])
-        row, column = np.rint((here[::-1] / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
-        tips.append(surface.rest[row, column] + now[row, column] + _HOVER_MM * away[at, k] * shaft)
+        here = np.array([tool["at_mm"] for tool in contacts[k]])
+        column, row = np.rint((here.T / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
+        tips.append(surface.rest[row, column] + now[row, column] + _HOVER_MM * away[at, k] * shafts)
         moved.append(now.astype(np.float32))
     albedo, bumps = texture(rng)
-    tool = {"tip": np.array(tips), "shaft": np.tile(shaft, (len(tips), 1))}
-    return {"rest": surface.rest, "moved": np.array(moved), "albedo": albedo, "bumps": bumps} | tool
+    tools = {"tips": np.array(tips), "shafts": shafts}
+    return {"rest": surface.rest, "moved": np.array(moved), "albedo": albedo, "bumps": bumps} | tools
 
 
 def texture(rng: np.random.Generator) -> tuple[Map, Map]:
@@ -293,6 +304,20 @@ def first_camera(rng: np.random.Generator) -> tuple[Floats, float]:
     back = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     matrix = _looking(_DISTANCE_MM * back, np.cross([0.0, 1.0, 0.0], back))
     return matrix, float(_SIZE[0] * _DISTANCE_MM / rng.uniform(31, 36))
+
+
+def projected(rest: Floats, moved: Floats, camera: Floats, focal_px: float) -> Map:
+    """Flow (H, W, 2) px, in a camera's image of a surface (N, N, 3) at rest, of its motion (N, N, 3) mm."""
+
+    def image(points: Floats) -> Floats:
+        x, y, z = np.moveaxis((points.reshape(-1, 3) - camera[:3, 3]) @ camera[:3, :3], -1, 0)
+        plane = np.stack([x, -y], axis=-1) / -z[:, None]
+        return np.asarray(focal_px * plane + np.array(_SIZE) / 2 - 0.5)
+
+    start = image(rest)
+    pixels = np.stack(np.meshgrid(*map(np.arange, _SIZE)), axis=-1)
+    shift = LinearNDInterpolator(Delaunay(start), image(rest + moved) - start, fill_value=0.0)
+    return np.asarray(shift(pixels), np.float32)
 
 
 def right_camera(camera: Floats) -> Floats:

@@ -85,13 +85,14 @@ def _membrane(mesh: Any, field: Any, top: Any, stiffness: float) -> Any:
 
 
 def _pressed(mesh: Any, field: Any, items: list[Any], top: Any, held: Any, contact: Any, levels: int) -> Any:
-    """Displacement (levels, nodes, 3) mm at equal steps of a contact's force, by Hertz's pressure."""
+    """Displacement (levels, nodes, 3) mm at equal steps of the tools' force, each by Hertz's pressure."""
     field[0].values[:] = 0
-    at = mesh.points[top, :2]
-    away = np.linalg.norm(at - contact["at_mm"], axis=1) / contact["radius_mm"]
+    at, whole = mesh.points[top, :2], 0.0
     line = _simpson(at[: round(len(top) ** 0.5), 0])
-    share = np.outer(line, line).ravel() * np.sqrt(np.clip(1 - away**2, 0, None))
-    whole = np.outer(share / share.sum(), contact["force_mn"])
+    for tool in contact:
+        away = np.linalg.norm(at - tool["at_mm"], axis=1) / tool["radius_mm"]
+        share = np.outer(line, line).ravel() * np.sqrt(np.clip(1 - away**2, 0, None))
+        whole = whole + np.outer(share / share.sum(), tool["force_mn"])
     out = []
     for level in np.linspace(0, 1, levels + 1)[1:]:
         load = fem.PointLoad(field, top, values=level * whole)
@@ -137,7 +138,7 @@ def pictures(folder: Path) -> None:
     scene = bpy.context.scene
     tissue = _sheet(arrays["rest"])
     tissue.data.materials.append(_wet(arrays["albedo"], arrays["bumps"]))
-    tool = _rod(given["tool_mm"])
+    tools = [(_rod(given["tool_mm"]), mathutils.Vector(shaft.tolist())) for shaft in arrays["shafts"]]
     for k, at in enumerate(given["lamps_mm"]):
         light = bpy.data.lights.new(f"lamp{k}", "AREA")
         light.shape, light.size, light.energy = "DISK", 25.0, given["watts"]
@@ -155,11 +156,8 @@ def pictures(folder: Path) -> None:
     for k, moved in enumerate(arrays["moved"]):
         tissue.data.vertices.foreach_set("co", (arrays["rest"] + moved).astype(np.float32).ravel())
         tissue.data.update()
-        shaft = mathutils.Vector(arrays["shaft"][k].tolist())
-        tool.location, tool.rotation_euler = (
-            arrays["tip"][k].tolist(),
-            shaft.to_track_quat("Z", "Y").to_euler(),
-        )
+        for (tool, shaft), tip in zip(tools, arrays["tips"][k], strict=True):
+            tool.location, tool.rotation_euler = tip.tolist(), shaft.to_track_quat("Z", "Y").to_euler()
         for number, (name, camera) in enumerate(cameras.items()):
             scene.camera = camera
             scene.cycles.seed = 2 * k + number  # noise common to both cameras would be matched

@@ -40,12 +40,6 @@ def test_pixels_outside_the_mask_do_not_count() -> None:
     assert set(np.unique(carried)) <= {0.0, 1.0}
 
 
-def test_grid_values_on_the_picture() -> None:
-    field = np.indices((64, 64))[1].astype(np.float32) * GRID.pitch_mm
-    back = whole((72, 72), 0.5).to_image(field)
-    np.testing.assert_allclose(np.diff(back[36, 5:-5]), 0.5, atol=1e-5)
-
-
 def test_divergence_of_a_stretch_is_the_sum_of_its_strains_up_to_the_masks_edge() -> None:
     mask = torch.zeros(1, 1, 64, 64)
     mask[..., 10:50, 8:56] = 1

@@ -10,9 +10,7 @@ from learn.uncertainty import conformal
 DRAWS = 2000
 
 
-def coverage(
-    units: int, frames: int, own: float, level: float, seed: int, naive: bool = False
-) -> tuple[float, float]:
+def coverage(units: int, frames: int, own: float, level: float, seed: int) -> tuple[float, float]:
     """Share of a new unit's frames within the quantile, mean over draws, and its standard error.
 
     A frame's score is the size of its unit's error plus `own` times one of its own.
@@ -22,8 +20,6 @@ def coverage(
         errors = rng.normal(size=(units + 1, 1)) + own * rng.normal(size=(units + 1, frames))
         scores = np.abs(errors)
         bound = conformal.quantile(list(scores[:-1]), level)
-        if naive:
-            bound = np.sort(scores[:-1].ravel())[math.ceil((units * frames + 1) * level) - 1]
         held[k] = (scores[-1] <= bound).mean()
     return float(held.mean()), float(held.std() / math.sqrt(DRAWS))
 
@@ -41,13 +37,6 @@ def test_coverage_does_not_depend_on_the_correlation_within_units(own: float) ->
     found, error = coverage(19, 6, own, 0.9, seed=1)
     assert found >= 0.9 - 3 * error
     assert found <= 0.9 + 1 / 20 + 3 * error
-
-
-def test_frames_pooled_as_if_independent_cover_too_little() -> None:
-    found, error = coverage(12, 40, 0.05, 0.9, seed=2, naive=True)
-    assert found < 0.9 - 6 * error
-    held, error = coverage(12, 40, 0.05, 0.9, seed=2)
-    assert held >= 0.9 - 3 * error
 
 
 def test_units_weigh_equally_whatever_their_length() -> None:

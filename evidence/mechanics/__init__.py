@@ -1,1 +1,0 @@
-"""Mechanical conditions (membrane, pulse, slip) that a force estimator must have been fitted on."""
