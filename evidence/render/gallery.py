@@ -47,10 +47,10 @@ _SCENERY: dict[str, str] = {
     "retractor": "bayonet",
     "bone, drape": "suction",
 }
-_CAPTION_PX = 15
+_CAPTION_PX = 24
 
 
-def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 320, quality: int = 60) -> None:
+def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 640, quality: int = 50) -> None:
     """Draws families x instruments and lights x cameras as the images of docs/gallery.md.
 
     `width`: of a tile [px]; `quality`: of WebP.
@@ -88,7 +88,7 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
     appearance = replace(case.appearance, scenery=job.render.scenery)
     shot = _ready(replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1])))
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
-    cv2.putText(band, caption, (3, 11), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (40, 40, 40), 1, cv2.LINE_AA)
+    cv2.putText(band, caption, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([band, shot])
 
 
