@@ -1,8 +1,9 @@
 """Share of the sim-to-real gap closed by training on recovered flow, and by training with fitted noise.
 
-Three trainings on one split: ideal flow (I), recovered flow (R), and ideal flow plus noise fitted to the
-recovered flow's error (N). Each is tested on ideal and on recovered flow: in distribution, out of
-distribution ('), and on recordings simulated and rendered by other programs ('').
+Trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the error of the
+recovered flow (N), and as a control recovered flow with another sequence's force (S). Each is tested on ideal
+and on recovered flow: in distribution, out of distribution ('), and on recordings simulated and rendered by
+other programs ('').
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ from synth.recording_flow.frame_motion import FrameMotion
 
 Errors = Mapping[str, list[float | None]]  # by test, of each sequence [mN]
 Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
-KINDS = ("I", "R", "N")
+KINDS = ("I", "R", "N", "S")
 _KEY = "force_mae"  # error of a sequence: of the total force [mN]
 _RESAMPLES = 2000
-_INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered"}
+_INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered", "S": "recovered"}
 _TESTS = {
     "I": "ideal flow",
     "R": "recovered flow",
@@ -69,7 +70,7 @@ def measure(
     training.
     """
     tiny = preset("tiny", epochs=epochs)
-    settings = changed(tiny, arch=changed(tiny.arch, output="magnitude"))  # the same metrics for all
+    settings = changed(tiny, arch=changed(tiny.arch, output="vector", relative=True))
     known, others = (
         load_clips(root, settings.grid, ("ideal", "recovered"), cache=work) for root in (dataset, unseen)
     )
@@ -86,6 +87,10 @@ def measure(
     seeded = [changed(settings, seed=seed) for seed in range(seeds)]
     trained = {kind: [errors(kind, clips, split, one, tests, work) for one in seeded] for kind in KINDS}
     noise = fit_noise([clips[i] for i in split.fit])
+    nothing = {
+        test: [float(np.linalg.norm(clip.force, axis=1).mean()) for clip in part]
+        for test, (part, _) in tests.items()
+    }
     sizes = (split.fit, split.select, *tested)
     return {
         "data": status.data(dataset, unseen),
@@ -93,7 +98,7 @@ def measure(
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen", "foreign"), map(len, sizes), strict=True)),
         "seeds": seeds,
-        "flows": {"tvl1": {"noise": asdict(noise)} | summary(trained)},
+        "flows": {"tvl1": {"noise": asdict(noise)} | summary(trained, nothing)},
     }
 
 
@@ -150,6 +155,11 @@ def errors(
 
     def compute() -> Errors:
         own = list(clips)
+        if kind == "S":
+            for k, other in enumerate(clips):
+                own[k - len(clips) // 2] = replace(
+                    clips[k - len(clips) // 2], density=other.density, force=other.force
+                )
         if kind == "N":
             noise = fit_noise([clips[i] for i in split.fit])
             for k, clip in enumerate(clips):
@@ -167,15 +177,17 @@ def errors(
     return done
 
 
-def summary(trained: Mapping[str, Sequence[Errors]]) -> dict[str, Any]:
-    """Errors with intervals, and the share of the gap closed by each training."""
+def summary(
+    trained: Mapping[str, Sequence[Errors]], nothing: Mapping[str, Sequence[float]]
+) -> dict[str, Any]:
+    """Errors with intervals, also of no force (`nothing`), and the share of the gap that each one closes."""
     of: dict[str, dict[str, Floats]] = {  # means over seeds
         kind: {test: np.mean([np.array(run[test], float) for run in runs], axis=0) for test in _TESTS}
         for kind, runs in trained.items()
     }
     spread = {
         kind: {test: asdict(interval(own, np.random.default_rng(0))) for test, own in tests.items()}
-        for kind, tests in of.items()
+        for kind, tests in (of | {"no force": {test: np.array(own) for test, own in nothing.items()}}).items()
     }
     found: dict[str, Any] = {"errors": {_KEY: spread}}
     for where, name in _PLACES.items():
@@ -281,7 +293,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
         (
             f"**Flow by {flow}; {'. '.join(words)}.**",
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
-            "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error; ': "
+            "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
+            "(a control) on recovered flow with the forces of other sequences; ': "
             f"out of distribution ({found['held_out']}), '': recordings by felupe and Blender's Cycles, "
             "whose ideal flow is that of the contacts alone. "
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "

@@ -29,6 +29,7 @@ from synth.flow.stereo.track import Moved
 from synth.job.types import MembraneState
 
 Case = dict[str, Any]  # input of the methods: `cameras`, and whether the membrane is stated
+_CONTROL = "control: another video's force"
 _STRONG = 0.5  # of the sequence's largest force: bias is measured on frames above it
 
 
@@ -49,6 +50,10 @@ def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, 
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [case | _row(tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
+        others = [
+            one | {"true": other["true"]} for one, other in zip(found, found[1:] + found[:1], strict=True)
+        ]
+        rows.append(case | _row("all", FUSION, others) | {"method": _CONTROL})
     return {"data": status.data(data), "rows": rows}
 
 
@@ -120,7 +125,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         f"{one['sequences']} sequences with an appearance that no network was fitted on; the methods' "
         "constants were set on other sequences of it. The membrane is unknown to the methods (results with "
         "known membrane: in the data). *Force*: root mean square error of the vector relative to that of the "
-        "force. *Bias*: relative to the peak. 95% intervals over sequences.",
+        "force, so no force has 100%. *Bias*: relative to the peak. 95% intervals over sequences.",
     )
     return report.Page("Fusion of network and physics", found, [], [report.Section("", rows)], words)
 
