@@ -88,7 +88,7 @@ def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple
 
 OLDER = dict.fromkeys(
     (
-        *("curves.experiment", "flow.experiment", "flow.foreign", "flow.stability", "gap", "learn.runs"),
+        *("curves.experiment", "gap", "learn.runs"),
         *("learn.shipped", "scoring.fusion", "scoring.pulse", "scoring.stability"),
     ),
     "stored data are older than the code until they are made again: their keys have other names",
