@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from bench.scoring import pool
 from evidence import report
 from synth.errors import UserError
 
@@ -16,18 +17,15 @@ _REFUSED = 2  # exit code of `bench score` for a recording without valid numbers
 def score_and_pool(recordings: Sequence[Path], cameras: int, out: Path) -> None:
     """Scores each recording in FOLDER-score next to it, unless it has been, and writes the page into `out`.
 
-    Raises UserError: a command failed.
+    Raises UserError: a command failed, or no recording has valid numbers.
     """
     model = PRETRAINED[cameras]
     scores = [folder.with_name(f"{folder.name}-score") for folder in recordings]
     for folder, score in zip(recordings, scores, strict=True):
         if not (score / "score.json").is_file():
-            _bench("score", str(folder), "--model", model, "-o", str(score))
+            words = ("score", str(folder), "--model", model, "-o", str(score))
+            code = subprocess.run([sys.executable, "-m", "bench", *words]).returncode
+            if code not in (0, _REFUSED):
+                raise UserError(f"bench score: exit code {code}")
     by = f"{report.command()}\n    bench score RECORDING --model {model}\n    bench pool SCORES"
-    _bench("pool", *map(str, scores), "-o", str(out), "--by", by)
-
-
-def _bench(*words: str) -> None:
-    code = subprocess.run([sys.executable, "-m", "bench", *words]).returncode
-    if code and not (words[0] == "score" and code == _REFUSED):
-        raise UserError(f"bench {words[0]}: exit code {code}")
+    pool.write(pool.pool(pool.read(scores)), out, by)

@@ -9,6 +9,7 @@ from command import run
 
 from bench.cli import app
 from bench.scoring import pool
+from evidence.pooled import score_and_pool
 from synth.errors import UserError
 
 
@@ -66,9 +67,11 @@ def test_recordings_without_scores_are_not_pooled(odd: dict[str, Any], tmp_path:
 
 
 def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> None:
-    both, out = [store(tmp_path / name, score(name, 2.0, name)) for name in "ab"], tmp_path / "out"
+    both, out = [store(tmp_path / f"{name}-score", score(name, 2.0, name)) for name in "ab"], tmp_path / "out"
     run(app, "pool", *both, "-o", out)
     assert {path.name for path in out.iterdir()} == {"pool.json", "README.md"}
+    score_and_pool([tmp_path / name for name in "ab"], 1, tmp_path / "study")
+    assert json.loads((tmp_path / "study" / "pool.json").read_text())["recordings"] == ["a", "b"]
     with pytest.raises(UserError, match="given twice"):
         pool.read([both[0], both[0]])
     with pytest.raises(UserError, match="no readable score"):
