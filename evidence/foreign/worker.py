@@ -87,7 +87,8 @@ def _membrane(mesh: Any, field: Any, top: Any, stiffness: float) -> Any:
 def _pressed(mesh: Any, field: Any, items: list[Any], top: Any, held: Any, contact: Any, levels: int) -> Any:
     """Displacement (levels, nodes, 3) mm at equal steps of the tools' force, each by Hertz's pressure."""
     field[0].values[:] = 0
-    at, whole = mesh.points[top, :2], 0.0
+    at = mesh.points[top, :2]
+    whole: Any = 0.0
     line = _simpson(at[: round(len(top) ** 0.5), 0])
     for tool in contact:
         away = np.linalg.norm(at - tool["at_mm"], axis=1) / tool["radius_mm"]
