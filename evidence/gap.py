@@ -78,6 +78,8 @@ def measure(
     split, own_test = parts(known, others)
     clips = [*known, *others]
     folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
+    if not folders:
+        raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
     tested = (
         [clips[i] for i in own_test],
         [clips[i] for i in split.test],
