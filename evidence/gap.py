@@ -106,7 +106,9 @@ def measure(
 
 def foreign(folder: Path, grid: Grid) -> Clip:
     """A recording of `foreign.recordings` with its true flow, and that recovered by `bench score`."""
-    recording, truth = open_recording(folder), np.load(folder / TRUTH)
+    recording = open_recording(folder)
+    with np.load(folder / TRUTH) as stored:
+        flow, force = stored["flow_px"], stored["force_mn"]
     young, scale = recording.meta.young_kpa or np.nan, find_scale(recording.meta, folder).mm_per_px
     found: dict[int, tuple[Map, Map]] = {}
 
@@ -116,9 +118,9 @@ def foreign(folder: Path, grid: Grid) -> Clip:
     tracked = track_recording(recording, {}, scale, RecordingFlowSettings(), each=add)
     view = GridView(np.asarray(tracked.tissue), scale, grid)
     at = sorted(found)
-    flows = {"ideal": truth["flow_px"][at], "recovered": np.stack([found[k][0] for k in at])}
+    flows = {"ideal": flow[at], "recovered": np.stack([found[k][0] for k in at])}
     density = np.zeros((len(at), 3, grid.size, grid.size), np.float32)
-    density[:, :, grid.size // 2, grid.size // 2] = truth["force_mn"][at] / (young * grid.pitch_mm**2)
+    density[:, :, grid.size // 2, grid.size // 2] = force[at] / (young * grid.pitch_mm**2)
     return Clip(
         name=folder.name,
         content_hash=status.content(folder / TRUTH),
@@ -128,7 +130,7 @@ def foreign(folder: Path, grid: Grid) -> Clip:
         displacement={k: view.mean(scale * v.transpose(0, 3, 1, 2)) * view.mask for k, v in flows.items()},
         confidence=view.mean(np.stack([found[k][1] for k in at])) * view.mask,
         density=density,  # of the sum alone, which is compared
-        force=truth["force_mn"][at],
+        force=force[at],
     )
 
 
@@ -158,10 +160,12 @@ def errors(
     def compute() -> Errors:
         own = list(clips)
         if kind == "S":
-            for k, other in enumerate(clips):
-                own[k - len(clips) // 2] = replace(
-                    clips[k - len(clips) // 2], density=other.density, force=other.force
-                )
+            half = len(clips) // 2
+            others = [*clips[half:], *clips[:half]]
+            own = [
+                replace(clip, density=other.density, force=other.force)
+                for clip, other in zip(clips, others, strict=True)
+            ]
         if kind == "N":
             noise = fit_noise([clips[i] for i in split.fit])
             for k, clip in enumerate(clips):

@@ -76,10 +76,13 @@ class CorrectionNet(nn.Module):
 
 
 def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
-    """Writes a network as ONNX, for pictures of any size, with float16 weights; needs the extra `export`."""
+    """Writes a network of `channels` inputs as ONNX, for pictures of any size, its weights at half precision.
+
+    ONNX Runtime widens them once, when it reads the file. Needs the extra `export`.
+    """
     import onnx
 
-    sides, wide = {2: "height", 3: "width"}, onnx.TensorProto.FLOAT
+    sides = {2: "height", 3: "width"}
     with warnings.catch_warnings(action="ignore"):  # of the exporter that keeps the names of weights
         torch.onnx.export(
             net.cpu().eval(), (torch.zeros(1, channels, 64, 64),), str(file), dynamo=False, opset_version=17,
@@ -87,10 +90,11 @@ def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
             do_constant_folding=False, training=torch.onnx.TrainingMode.PRESERVE,
         )  # fmt: skip
     model = onnx.load(file)
-    for weight in [one for one in model.graph.initializer if one.data_type == wide]:
+    for weight in [one for one in model.graph.initializer if one.data_type == onnx.TensorProto.FLOAT]:
         values, name = onnx.numpy_helper.to_array(weight).astype(np.float16), weight.name
         weight.CopyFrom(onnx.numpy_helper.from_array(values, f"{name} half"))
-        model.graph.node.insert(0, onnx.helper.make_node("Cast", [f"{name} half"], [name], to=wide))
+        cast = onnx.helper.make_node("Cast", [f"{name} half"], [name], to=onnx.TensorProto.FLOAT)
+        model.graph.node.insert(0, cast)
     onnx.save(model, file)
 
 

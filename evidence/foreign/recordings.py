@@ -98,10 +98,7 @@ def record(
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
     young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
-    contacts = [[_contact(young, rng) for _ in range(1 + (kind == "two"))] for _ in range(_CONTACTS)]
-    for one in contacts if kind == "two" else ():
-        for tool, side in zip(one, (-1, 1), strict=True):
-            tool["at_mm"][0] = side * (_APART_MM + tool["at_mm"][0] / 3)
+    contacts = [_tools(young, 1 + (kind == "two"), rng) for _ in range(_CONTACTS)]
     specimen = {
         "block_mm": (90.0, 50.0),
         "elements": (12, 7),
@@ -116,9 +113,9 @@ def record(
         folder = Path(scratch)
         surface = Surface.of(np.load(run(pythons[0], folder, "mechanics", specimen)), rng)
         sensor_s, level, away = tool_motion(seconds, rng)
-        arrays = _scene(surface, level, away, times, contacts, rng)
+        at = np.minimum((times * _SENSOR_HZ).astype(int), len(level) - 1)  # the sensor's sample of each frame
+        arrays = _scene(surface, level[at], away[at], times, contacts, rng)
         camera, focal = first_camera(rng)
-        at = np.minimum((times * _SENSOR_HZ).astype(int), len(level) - 1)
         flow = [projected(surface.rest, surface.at(level[k], 0.0), camera, focal) for k in at]
         pair = camera, right_camera(camera)
         drawn = {
@@ -142,7 +139,12 @@ def record(
     measured = measured + 0.02 * rng.normal(size=(len(sensor_s), 3))
     writer.write_force(part, sensor_s, measured / 1000)
     write_pair(part / "pair.yaml", *pair, focal)
-    about = {
+    writer.write_meta(part, _about(name, young, focal))
+
+
+def _about(name: str, young: float, focal: float) -> dict[str, Any]:
+    """The recording's `meta.yaml`."""
+    return {
         "stereo": {"calibration": "pair.yaml"},
         "scale_mm_per_px": _DISTANCE_MM / focal,
         "young_kpa": young,
@@ -150,7 +152,6 @@ def record(
         "sensor": {"axes": "camera", "acts_on": "tissue", "free_s": [[0.1, _STILL_S - 0.2]]},
         "sync": {"method": "clock"},
     }
-    writer.write_meta(part, about)
 
 
 def run(
@@ -165,6 +166,15 @@ def run(
         last = (done.stderr.strip() or done.stdout.strip() or "no message").splitlines()[-1]
         raise UserError(f"{python}: {work}: {last}")
     return folder / f"{work}.npz"
+
+
+def _tools(young: float, count: int, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """One contact, or two at a time, left and right of the centre."""
+    tools = [_contact(young, rng) for _ in range(count)]
+    if count == 2:
+        for tool, side in zip(tools, (-1, 1), strict=True):
+            tool["at_mm"][0] = side * (_APART_MM + tool["at_mm"][0] / 3)
+    return tools
 
 
 def _contact(young: float, rng: np.random.Generator) -> dict[str, Any]:
@@ -242,7 +252,10 @@ def _scene(
     contacts: list[list[dict[str, Any]]],
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """Renderer input: rest, motion (T, N, N, 3), tips (T, tools, 3), shafts (tools, 3), texture and bumps."""
+    """Renderer input: rest, motion (T, N, N, 3), tips (T, tools, 3), shafts (tools, 3), texture and bumps.
+
+    `level`, `away`: of every frame, see `tool_motion`.
+    """
     phase = rng.uniform(0, 2 * np.pi, 2)
 
     def pulse(time: float) -> float:
@@ -251,13 +264,12 @@ def _scene(
 
     moved, tips = [], []
     shafts = _SHAFTS[-len(contacts[0]) :]
-    for time in times:
-        at = min(int(time * _SENSOR_HZ), len(level) - 1)
-        now = surface.at(level[at], pulse(time) - pulse(0.0))
-        k = int(np.argmin(away[at]))
+    for time, loads, far in zip(times, level, away, strict=True):
+        now = surface.at(loads, pulse(time) - pulse(0.0))
+        k = int(np.argmin(far))
         here = np.array([tool["at_mm"] for tool in contacts[k]])
         column, row = np.rint((here.T / _FIELD_MM + 0.5) * (_SIDE - 1)).astype(int)
-        tips.append(surface.rest[row, column] + now[row, column] + _HOVER_MM * away[at, k] * shafts)
+        tips.append(surface.rest[row, column] + now[row, column] + _HOVER_MM * far[k] * shafts)
         moved.append(now.astype(np.float32))
     albedo, bumps = texture(rng)
     tools = {"tips": np.array(tips), "shafts": shafts}

@@ -32,7 +32,7 @@ def test_coverage_of_constant_units_is_that_of_ranks(units: int, level: float) -
     assert found == pytest.approx(exact, abs=3.5 * error)
 
 
-@pytest.mark.parametrize("own", [0.3, 3.0])
+@pytest.mark.parametrize("own", [0.05, 0.3, 3.0])
 def test_coverage_does_not_depend_on_the_correlation_within_units(own: float) -> None:
     found, error = coverage(19, 6, own, 0.9, seed=1)
     assert found >= 0.9 - 3 * error
