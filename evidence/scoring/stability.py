@@ -1,7 +1,7 @@
 """Recordings degraded in one way at a time, scored by the default command: what leads, and what is found.
 
-Each way is applied to plain tissue, to tissue with a membrane and to pulsating tissue; with two cameras and
-with one; described (tissue, instruments and contact-free span stated) and bare (scale and E only). Silently
+Each way is applied with two cameras and with one, described (tissue, instruments and contact-free span
+stated) and bare (scale and E only); plain, covered and pulsating tissue take turns among these. Silently
 wrong: the force errs by more than a tenth of the peak, its 90% interval holds under 80% of the frames in or
 out of contact, and there is no finding. Undegraded recordings show what each further statement gains.
 """
@@ -92,8 +92,11 @@ def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_K
             case = {"kind": kind, "cameras": cameras, "given": given}
             if not only:  # those that were not tuned on
                 clean.append(case | _point(work, video, lambda same: same, "", kind, seed, k, *case.values()))
-            for what, (change, cause) in CHANGES.items() if k == 0 and (given, cameras) in _CASES else ():
-                if re.search(only, what) and (cameras == 2 or what in MONOCULAR):
+            if k or (given, cameras) not in _CASES:
+                continue
+            for number, (what, (change, cause)) in enumerate(CHANGES.items()):
+                turn = list(_KINDS)[(number + given // 2 + cameras) % len(_KINDS)]
+                if re.search(only, what) and (cameras == 2 or what in MONOCULAR) and kind == turn:
                     row = _point(work, video, change, cause, kind, seed, k, *case.values(), what)
                     rows.append({"change": what, **case, **row})
     return {"seed": seed, "changes": _summary(rows), "undegraded": _undegraded(clean), "points": rows}
@@ -209,14 +212,14 @@ def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:
 
 
 def _summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A line for each change: medians over kinds of tissue, and how many of them are named or held back."""
+    """A line for each change: tissue, errors, and whether the cause is named or the force held back."""
     lines = []
     for (name,), own in report.grouped(rows, "change").items():
         line: dict[str, Any] = {"change": name, "silently wrong": sum(row["silently_wrong"] for row in own)}
         for given, cameras in _CASES:
             of = [row for row in own if (row["given"], row["cameras"]) == (given, cameras)]
             if of:
-                line[f"{'described' if given else 'bare'}, {cameras}"] = _cell(of)
+                line[f"{'described' if given else 'bare'}, {cameras}"] = f"{of[0]['kind']}: {_cell(of)}"
         messages, cause = (one for row in own for one in row["findings"]), CHANGES[name][1] or "$^"
         line["finding"] = max(messages, key=lambda one: bool(re.search(cause, one)), default="")[:90]
         lines.append(line)
@@ -232,8 +235,8 @@ def _cell(rows: list[Mapping[str, Any]]) -> str:
     )
     if rows[0]["named"] is None:
         return text
-    answered = sum(row["named"] or row["error"] is None for row in rows)
-    return f"{text}, named {answered} of {len(rows)}"
+    named = all(row["named"] or row["error"] is None for row in rows)
+    return f"{text}, {'named' if named else 'not named'}"
 
 
 def _undegraded(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -257,9 +260,9 @@ def page(found: Mapping[str, Any]) -> report.Page:
     silent = sum(row["silently wrong"] for row in changes) or "None"
     words = [
         f"**{silent} of {len(found['points'])} recordings, degraded in {len(changes)} ways, had a force "
-        "outside its interval without a finding.** Each cell: median error of the peak force, least share of "
-        "contact frames in the 90% interval, and for how many kinds of tissue the cause was named or the "
-        "force held back.",
+        "outside its interval without a finding.** Each cell: tissue, error of the peak force, share of "
+        "contact frames in the 90% interval, and whether a finding named the cause or the force was held "
+        "back; of undegraded recordings the median and the least.",
         "The force is that of the default command. *Described*: tissue, instruments and the span without "
         "contact are stated; *bare*: scale and Young's modulus only. 2, 1: cameras.",
     ]
