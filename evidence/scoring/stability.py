@@ -1,7 +1,7 @@
 """Recordings degraded in one way at a time, scored by the default command: what leads, and what is found.
 
-Each way is applied with two cameras and with one, described (tissue, instruments and contact-free span
-stated) and bare (scale and E only); plain, covered and pulsating tissue take turns among these. Silently
+Each way is applied to a described recording with two cameras (tissue, instruments and contact-free span
+stated) and to a bare one with one camera (scale and E only); plain, covered and pulsating tissue take turns. Silently
 wrong: the force errs by more than a tenth of the peak, its 90% interval holds under 80% of the frames in or
 out of contact, and there is no finding. Undegraded recordings show what each further statement gains.
 """
@@ -54,7 +54,7 @@ _GIVEN = (
     "the membrane's state",
 )  # and those before
 _DESCRIBED, _BARE = 2, 0  # of degraded recordings
-_CASES = tuple(product((_DESCRIBED, _BARE), (2, 1)))
+_CASES = ((_DESCRIBED, 2), (_BARE, 1))  # statements, cameras
 _CLEAN = 4  # undegraded recordings of each kind
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _LEAST, _COVERED = 0.1, 0.8
