@@ -1,9 +1,10 @@
 """Recordings degraded in one way at a time, scored by the default command: what leads, and what is found.
 
 Each way is applied to a described recording with two cameras (tissue, instruments and contact-free span
-stated) and to a bare one with one camera (scale and E only); plain, covered and pulsating tissue take turns. Silently
-wrong: the force errs by more than a tenth of the peak, its 90% interval holds under 80% of the frames in or
-out of contact, and there is no finding. Undegraded recordings show what each further statement gains.
+stated) and to a bare one with one camera (scale and E only); plain, covered and pulsating tissue take turns.
+Silently wrong: the force errs by more than a tenth of the peak, its 90% interval holds under 80% of the
+frames in or out of contact, and there is no finding. Undegraded recordings show what each further statement
+gains.
 """
 
 import re
