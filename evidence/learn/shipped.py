@@ -56,7 +56,7 @@ def measure(
         rows += [{"model": name} | row for row in own]
         if pack:
             limits = _LIMITS if predictor.card.settings.arch.depth else (*_LIMITS, *_MONOCULAR)
-            pack_model(folder, shipped.MODELS / name, report.commit(), _listed(own), limits)
+            pack_model(folder, shipped.MODELS / name, report.commit(), listed(own), limits)
     return {"data": status.data(*data), "rows": rows}
 
 
@@ -117,7 +117,7 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
     return row | {key: covered[key] for key in _WIDTHS}
 
 
-def _listed(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def listed(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Figures for a model's card, by dataset."""
     listed = {}
     for row in own:
