@@ -10,8 +10,10 @@ import pytest
 
 from evidence import all as everything
 from evidence import report, status, study
+from evidence.learn import shipped
 from evidence.report import Chart, Curve, Page, Panel, bars
 from evidence.steps import run_steps
+from learn.inference.shipped import MODELS, NAMES
 
 PANEL = Panel("cost", "ms", "error [%]", (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("a", "b")),))
 CHART = Chart("error", "mN", bars({"ours": 1.0, "theirs": 2.0}))
@@ -86,18 +88,9 @@ def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple
     assert (one.changed, one.cpu_hours) == (found, 1.5)
 
 
-OLDER = dict.fromkeys(
-    ("curves.experiment", "gap", "learn.runs"),
-    "stored data are older than the code until they are made again: their keys have other names",
-)
-"""Studies whose page can't be drawn from the stored data. When it can, its test fails: remove the entry."""
 DRAWN = [
-    pytest.param(name, marks=pytest.mark.xfail(reason=OLDER[name], strict=True, raises=KeyError))
-    if name in OLDER
-    else name
-    for name in study.names()
-    if name not in ("foreign.recordings", "scoring.exvivo")  # their pages are of `bench pool`
-]
+    name for name in study.names() if name not in ("foreign.recordings", "scoring.exvivo")
+]  # not by `bench pool`
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -109,6 +102,15 @@ def test_the_page_of_a_study_is_drawn_from_its_stored_data(name: str, tmp_path: 
     found = json.loads((report.RESULTS / one.result).read_text("utf-8"))
     one.page(found).write(tmp_path)
     assert (tmp_path / "README.md").read_text("utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_of_a_network_card_are_those_of_the_stored_result(name: str) -> None:
+    rows = json.loads((report.RESULTS / "learn/shipped/shipped.json").read_text("utf-8"))["rows"]
+    shown = (MODELS / name / "README.md").read_text("utf-8")
+    listed = shipped.listed([row for row in rows if row["model"] == name])
+    assert len(listed) == 2
+    assert all(f"| {what} | {figures} |\n" in shown for what, figures in listed.items())
 
 
 def test_every_stored_result_has_its_study() -> None:
