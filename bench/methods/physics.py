@@ -35,7 +35,6 @@ class TissueConstants:
 
     membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
-    unlike: float = 60.0  # nats a frame by which a tissue is excluded; membranes were found 47 below the best
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
     cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
@@ -44,7 +43,7 @@ class TissueConstants:
     strongest: int = 8  # frames that weight the tissues, every third
     stronger: float = 1.3  # motion relative to the last weighting's, from which a map updates the weights
     living_mm: float = 0.4  # own motion of living tissue, half of 0.8 mm peak to peak (Faria 2014)
-    quiet: float = 0.2  # least share of the frames that shows the tissue's own motion
+    quiet: float = 0.2  # least share of the frames, or of a breath, that shows the tissue's own motion
     unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
@@ -73,8 +72,7 @@ class Physics:
         """Starts a video whose displacement has 2 or 3 components."""
         self._scene, self._view = scene, GridView(scene.tissue, scene.scale_mm_per_px, GRID)
         self._frames: list[Observation] = []
-        self._contact_free = 0
-        self._weighed_mm = 0.0  # motion at the last weighting
+        self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, still = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
         self._weights = TissueWeights(first, np.ones(1), still, False)
@@ -105,17 +103,19 @@ class Physics:
         """See `Revising`."""
         assert self._scene is not None
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
-        if contact_free.any() or not self._scene.living or not any(self._trusted):
-            free = [self._frames[k] for k in np.flatnonzero(contact_free)]
-            own_mm = posterior.own_motion(basis, [f for f in free if f.size_mm > 0])  # not the rest frame
-        else:
-            tracked = np.flatnonzero(self._trusted)
+        times, tracked = np.array(self._times), np.flatnonzero(self._trusted)
+        free = [self._frames[k] for k in np.flatnonzero(contact_free) if self._frames[k].size_mm > 0]
+        own_mm = posterior.own_motion(basis, free)
+        breaths = TISSUES.breath_hz * float(np.diff(times)[contact_free[1:] & contact_free[:-1]].sum())
+        if bounded := self._scene.living and len(tracked) > 0 and breaths < 0.5:
             frames = [self._frames[k] for k in tracked]
-            quiet, factor = quietest_frames(np.array(self._times)[tracked], frames)
-            bound = factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)
-            own_mm = bound.clip(-TISSUES.living_mm, TISSUES.living_mm)
-        assumed = not contact_free.any() and bool(own_mm.any())
-        self._weights = weigh_tissues(self._scene, self._frames, own_mm, assumed)
+            quiet, factor = quietest_frames(times[tracked], frames)
+            bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
+            if breaths > TISSUES.quiet:
+                bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
+            least = min(bounds, key=lambda one: float(np.square(one).sum()))
+            own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
+        self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(one, False) for one in self._frames])
 
@@ -128,10 +128,10 @@ class Physics:
         moved = posterior.polynomials(basis.known.points) @ self._weights.own_mm  # (C, P, M)
         sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
         own = f"the tissue's own motion is {sizes} mm along x, y, z"
-        if not self._contact_free:
-            given = "(sensor.free_s, or pulse.free_s where clocks are found by correlation)"
-            own = f"{'by its quietest frames, ' * self._scene.living}{own}"
-            own = f"no span without contact is given on the video's clock {given}: {own}"
+        if self._weights.assumed or not self._contact_free:
+            known = "only part of a breath" if self._contact_free else "no span"
+            own = f"{'at most, ' * self._weights.assumed}{own}"
+            own = f"{known} without contact is stated in video time (sensor.free_s, pulse.free_s): {own}"
         return [describe(self._weights, self._scene), own]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
@@ -159,18 +159,22 @@ class Physics:
 def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list[int], float]:
     """The frames in which the tissue moves least, and the factor from its motion there to that at any time.
 
-    Motion a (1 - cos 2 pi f t) since it turned is below a (1 - cos pi q) in a share q of each period: a
-    large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
+    A large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
     """
     size = np.array([one.signal_mm**2 for one in frames])
     order = np.argsort(size, kind="stable")
     count = np.arange(1, len(frames) + 1)
     share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
-    factor = 1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6)
+    factor = turning_factor(share)
     moved = factor * np.sqrt(size[order] + posterior.MODEL.least_mm**2)
     moved[share < TISSUES.quiet * share[-1]] = np.inf  # the least of many would be too little
     best = int(moved.argmin())
     return [int(k) for k in order[best // 2 : best + 1]], float(factor[best])
+
+
+def turning_factor(share: Floats | float) -> Floats:
+    """1 / (1 - cos pi q): motion a (1 - cos 2 pi f t) is below a (1 - cos pi q) in a share q of a period."""
+    return np.asarray(1 / np.maximum(1 - np.cos(np.pi * np.minimum(share, 0.5)), 1e-6))
 
 
 def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
@@ -221,13 +225,10 @@ def weigh_tissues(
         tissues.append(replace(tissues[best], poisson=nu))
         score.append(score[best] + evidence(tissues[-1]) - first)
     weight = np.maximum(softmax(score), TISSUES.unlikely)
-    # The interval is to hold the most likely tissue with and without a membrane, the one with the stiffest
-    # membrane that is not excluded, and the most likely one with each other Poisson's ratio.
+    # The interval is to hold the most likely tissue with and without a membrane, and each Poisson's ratio.
     known = len(tissues) - len(others)
     parts = [[k for k in range(known) if (tissues[k].membrane > 0) is covered] for covered in (False, True)]
     used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(known, len(tissues))}
-    least = max(score[:known]) - TISSUES.unlike * TISSUES.temper * max(len(strongest), 1)
-    used.add(max((k for k in range(known) if score[k] >= least), key=lambda k: tissues[k].membrane))
     order = sorted(used, key=lambda k: -weight[k])
     weight = weight[order] / weight[order].sum()
     return TissueWeights(tuple(tissues[k] for k in order), weight, own_mm, assumed)

@@ -54,14 +54,12 @@ class TrackedRecording:
     frame: list[int] = field(default_factory=list)  # numbers in the recording
     time_s: list[float] = field(default_factory=list)
     force_mn: dict[str, list[Floats]] = field(default_factory=dict)  # by method: (3,) each
-    # By method: `low_mn` and `high_mn` of each `ForceEstimate`.
-    bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    bounds: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # by method: low, high
     speed: list[float] = field(default_factory=list)  # mean over the tissue since the previous frame [mm/s]
     confidence: list[float] = field(default_factory=list)  # mean over the tissue
     trusted: list[bool] = field(default_factory=list)  # False: the frame is lost, its forces are not valid
     summary: TrackingSummary = field(default_factory=TrackingSummary)
-    # Repeated pictures, see `VideoFaults.repeats`.
-    repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))
+    repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))  # of pictures
     snapshots: list[Snapshot] = field(default_factory=list)
     pictured: str = ""  # method whose force map the snapshots show
     rest: Pixels | None = None  # (h, w, 3) rest frame, downsampled as the snapshots
@@ -120,13 +118,14 @@ def track_recording(
                     turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    assumed_s = forces.finish(recording, free.find())  # of the last pass
+    found_s = free.find()  # of the last pass
+    forces.finish(recording, found_s)
     out = forces.out
     out.stereo, out.turning = pictures.quality, turning if turning.time_s else None
     out.scale_mm_per_px = scale_mm_per_px
     _describe(out, video, recording, methods, pictured)
-    if assumed_s:
-        spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in assumed_s)
+    if found_s:
+        spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in found_s)
         out.notes.append(f"no contact is assumed in {spans} s, where no instrument is over the tissue")
     out.timings |= watch.report()  # of all passes
     return out
@@ -216,9 +215,8 @@ class _Forces:
         if wanted:
             self._snap(position, frame, density)
 
-    def finish(self, recording: Recording, found_s: Sequence[Span]) -> Sequence[Span]:
-        """Computes results that need all frames; returns the contact-free spans, on the video's clock, that
-        are assumed: `found_s` unless some are stated."""
+    def finish(self, recording: Recording, found_s: Sequence[Span]) -> None:
+        """Computes results that need all frames; `found_s`: contact-free spans besides those stated [s]."""
         about = recording.meta
         sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
         stated = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
@@ -228,7 +226,7 @@ class _Forces:
             inside = np.any([(times >= a) & (times <= b) for a, b in spans], axis=0)  # False without spans
             return np.asarray(trusted & inside)
 
-        contact_free = within(stated or found_s)
+        contact_free = within([*stated, *found_s])
         for name, method in self.methods.items():
             if isinstance(method, Revising):
                 with self.watch.stage(name):
@@ -249,7 +247,6 @@ class _Forces:
                     frame.setdefault(name, frame[method.parts[0]])
             self.out.force_mn[name] = [frame[name].force_mn for frame in self.estimates]
             self.out.bounds[name] = [(frame[name].low_mn, frame[name].high_mn) for frame in self.estimates]
-        return () if stated else found_s
 
     def _snap(self, position: int, frame: FrameMotion, density: Map | None) -> None:
         """Adds a snapshot; when the list is full, every other one is removed and the stride doubles."""

@@ -118,7 +118,7 @@ class PulseSearch:
 def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = ()) -> PulseSearch:
     """Searches frames without contact for rhythms of the surface; the rest frame is at `rest_s` [s].
 
-    `free_s`: spans known to be without contact [s]; if empty, frames of smooth and periodic motion are used.
+    `free_s`: spans known to be without contact [s]; if too short, smooth and periodic frames are used, too.
     """
     time_s = np.array(surface.time_s)
     if len(time_s) < Cell.frames:
@@ -127,17 +127,18 @@ def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = (
     usable = (cells.weight > 0).mean(axis=1) > 0.5 if cells.used.any() else np.zeros(len(time_s), bool)
     if len(cells.basis) < 2 * cells.basis.shape[1] or usable.sum() < Cell.frames:
         return PulseSearch(None, time_s[usable], None, "too little of the picture is tracked tissue")
-    if free_s:
-        smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
-    else:
+    smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
+    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
+    stated = rates_hz is not None
+    if not stated:
         # Frames about as smooth as the smoothest fifth: motion by a contact is less smooth.
         misfit = cells.misfit(cells.coefficients)
         most = Cell.smooth * np.quantile(misfit[usable], Cell.smoothest) + Cell.noise_px
-        smooth = usable & (misfit <= most)
-    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
+        smooth |= usable & (misfit <= most)
+        rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
     if rates_hz is None:
         return _too_few(time_s[smooth])
-    rhythms, others, fitted = _least_trimmed(cells, usable, smooth, rounds=1 if free_s else 4)
+    rhythms, others, fitted = _least_trimmed(cells, usable, smooth, rounds=1 if stated else 4)
     if rhythms:
         pulse = _estimate(surface, rhythms, others, fitted, rest_s)
         return PulseSearch(pulse, time_s[fitted], rates_hz)

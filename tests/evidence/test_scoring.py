@@ -1,4 +1,4 @@
-"""Measurements of scoring: ex vivo stand-ins, and a pulsating cortex from pictures to scores."""
+"""Measurements of scoring, from pictures to scores, and of their parts."""
 
 from pathlib import Path
 
@@ -9,18 +9,19 @@ from bench.methods.physics import GRID
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
+from evidence.appearance.features import kernel_distance
+from evidence.datasets import coarser
 from evidence.end_to_end import models
 from evidence.scoring import exvivo
 from evidence.scoring import pulse as experiment
-from learn.data.grid import GridView
+from learn.data.clips import Clip
+from learn.data.grid import Grid, GridView
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.tune.search import changed
 
 
 @pytest.mark.slow
-def test_a_stereo_stand_in_agrees_with_its_calibration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stereo_stand_in_fits_its_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job_of, coarse = exvivo.job_of, {"fem.tets": 600, "anatomy.vertices": 4000}
     monkeypatch.setattr(exvivo, "job_of", lambda plan: changed(job_of(plan), coarse))
     plan = exvivo.Plan(seconds=18.0, fps=0.5, size=(96, 72), cameras=2)
@@ -61,3 +62,19 @@ def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
     peak = float(np.nanmax(sensor))
     assert errors["off"] < errors["still"] + 0.02 * peak
     assert errors["in"] > 1.5 * errors["still"], "the pulse must matter if it is not removed"
+
+
+def test_the_kernel_distance_is_unbiased_and_grows_with_a_shift() -> None:
+    rng = np.random.default_rng(0)
+    found = [kernel_distance(*rng.standard_normal((2, 12, 30))) for _ in range(300)]
+    assert abs(np.mean(found)) < 3 * np.std(found) / 300**0.5
+    shifted = [kernel_distance(one, other + 0.5) for one, other in rng.standard_normal((30, 2, 12, 30))]
+    assert np.mean(shifted) > 5 * np.std(found)
+
+
+def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
+    wide = coarser(clips[2], 2)
+    fine = clips[2].density.sum((2, 3)) * Grid(32).pitch_mm ** 2
+    np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)
+    largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], wide)]
+    assert largest[1] == pytest.approx(largest[0], rel=0.1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bench.methods import force_mixture, physics, posterior
 from bench.methods.compliance import ElasticBlock, TissueKind
 from bench.methods.posterior import LoadBasis, Observation
-from bench.methods.protocol import MethodContext
+from bench.methods.protocol import FrameMotion, MethodContext
 
 Floats = NDArray[np.float64]
 BARE = TissueKind("bonded", 0.0, 0.45)
@@ -170,6 +170,19 @@ def test_the_quietest_frames_bound_the_tissues_own_motion() -> None:
         assert low <= factor * max(of[k].size_mm for k in quiet) <= high
     # A tenth of a second may be where breath turns.
     assert physics.quietest_frames(time_s[:2], still[:2])[1] > 100
+
+
+def test_a_short_span_does_not_exclude_a_breath() -> None:
+    own_mm, shape = list[float](), np.ones((80, 80, 2), np.float32)
+    for living, stated in ((True, 0), (True, 2), (False, 2)):
+        scene = MethodContext(np.ones((80, 80), bool), 0.4, 2.0, "stripped", (0.45, 0.45), living=living)
+        method = physics.Physics()
+        for k in range(10):  # half a second shows little of a breath that has just turned
+            moved = shape * np.float32(0.5 - 0.5 * np.cos(2 * np.pi * 0.23 * k / 2))
+            method(FrameMotion(moved, shape[..., 0], time_s=k / 2), scene, False)
+        method.revise(np.arange(10) < stated)
+        own_mm.append(float(np.abs(method._weights.own_mm).max(initial=0.0)))
+    assert own_mm[0] == own_mm[1] > own_mm[2] > 0
 
 
 def test_an_interval_holds_every_assumption_however_unlikely() -> None:
