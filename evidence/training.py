@@ -36,7 +36,12 @@ def nested(clips: Sequence[Clip], count: int, fold: int, seed: int) -> Split:
 
 
 def fit(
-    name: str, clips: Sequence[Clip], split: Split, settings: TrainingSettings, folder: Path
+    name: str,
+    clips: Sequence[Clip],
+    split: Split,
+    settings: TrainingSettings,
+    folder: Path,
+    device: str = "cpu",
 ) -> Predictor:
     """Network trained on fit and select of a split, stored in `folder`; an interrupted training continues.
 
@@ -44,7 +49,7 @@ def fit(
     """
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
     model = folder / f"{name}-{cache.key(settings.model_dump(), used)}"
-    train(clips, split, settings, model)
+    train(clips, split, settings, model, device=device)
     return load_model(model)
 
 
