@@ -105,7 +105,6 @@ class Physics:
         basis = posterior.load_basis(len(self._frames[0].moved), candidate_tissues(self._scene)[0])
         times, tracked = np.array(self._times), np.flatnonzero(self._trusted)
         free = [self._frames[k] for k in np.flatnonzero(contact_free) if self._frames[k].size_mm > 0]
-        own_mm = posterior.own_motion(basis, free)
         breaths = TISSUES.breath_hz * float(np.diff(times)[contact_free[1:] & contact_free[:-1]].sum())
         if bounded := self._scene.living and len(tracked) > 0 and breaths < 0.5:
             frames = [self._frames[k] for k in tracked]
@@ -115,6 +114,8 @@ class Physics:
                 bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
             least = min(bounds, key=lambda one: float(np.square(one).sum()))
             own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
+        else:
+            own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(one, False) for one in self._frames])
@@ -131,7 +132,7 @@ class Physics:
         if self._weights.assumed or not self._contact_free:
             known = "only part of a breath" if self._contact_free else "no span"
             own = f"{'at most, ' * self._weights.assumed}{own}"
-            own = f"{known} without contact is stated in video time (sensor.free_s, pulse.free_s): {own}"
+            own = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {own}"
         return [describe(self._weights, self._scene), own]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:

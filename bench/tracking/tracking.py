@@ -59,7 +59,7 @@ class TrackedRecording:
     confidence: list[float] = field(default_factory=list)  # mean over the tissue
     trusted: list[bool] = field(default_factory=list)  # False: the frame is lost, its forces are not valid
     summary: TrackingSummary = field(default_factory=TrackingSummary)
-    repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))  # of pictures
+    repeats: tuple[dict[int, int], dict[int, int]] = field(default_factory=lambda: ({}, {}))  # of VideoFaults
     snapshots: list[Snapshot] = field(default_factory=list)
     pictured: str = ""  # method whose force map the snapshots show
     rest: Pixels | None = None  # (h, w, 3) rest frame, downsampled as the snapshots

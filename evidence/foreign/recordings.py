@@ -56,7 +56,7 @@ def measure(
     seconds: float = 8.0,
     fps: float = 3.0,
     spp: int = 24,
-    seed: int = 600,
+    seed: int = 601,
     results: Path = report.RESULTS / "learn/foreign",
 ) -> None:
     """Makes recordings in the folder `recordings`, and scores them into `results`.

@@ -128,14 +128,13 @@ def find_pulse(surface: SurfaceMotion, rest_s: float, free_s: Sequence[Span] = (
     if len(cells.basis) < 2 * cells.basis.shape[1] or usable.sum() < Cell.frames:
         return PulseSearch(None, time_s[usable], None, "too little of the picture is tracked tissue")
     smooth = usable & np.any([(time_s >= start) & (time_s <= stop) for start, stop in free_s], axis=0)
-    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
-    stated = rates_hz is not None
+    stated = smooth.sum() >= Cell.frames and visible_rates(time_s[smooth]) is not None
     if not stated:
         # Frames about as smooth as the smoothest fifth: motion by a contact is less smooth.
         misfit = cells.misfit(cells.coefficients)
         most = Cell.smooth * np.quantile(misfit[usable], Cell.smoothest) + Cell.noise_px
         smooth |= usable & (misfit <= most)
-        rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
+    rates_hz = visible_rates(time_s[smooth]) if smooth.sum() >= Cell.frames else None
     if rates_hz is None:
         return _too_few(time_s[smooth])
     rhythms, others, fitted = _least_trimmed(cells, usable, smooth, rounds=1 if stated else 4)
