@@ -81,9 +81,9 @@ def pack_model(
     line = shipped.describe(card)
     rows = {"data (hash of its sequences)": shipped.hash_data(card), "commit": commit, **metrics}
     table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
-    listed = "\n".join(f"- {one}" for one in limits)
+    bullets = "\n".join(f"- {one}" for one in limits)
     head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
-    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{listed}\n".encode())
+    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
     size = folder_bytes(folder)
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
@@ -119,12 +119,12 @@ def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]
 
 def listed(own: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Figures for a model's card, by dataset."""
-    listed = {}
+    lines = {}
     for row in own:
         errors = [f"{words} {report.percent(row[key])}" for words, key in _LISTED.items() if row[key]]
         coverage = f"coverage of 90% intervals {report.percent(row['covered_size'])}"
-        listed[f"{row['data']}, {row['sequences']} held-out sequences"] = "; ".join([*errors, coverage])
-    return listed
+        lines[f"{row['data']}, {row['sequences']} held-out sequences"] = "; ".join([*errors, coverage])
+    return lines
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
