@@ -35,8 +35,8 @@ _LIMITS = (
 )
 _MONOCULAR = (
     "The force along the line of sight is hardly visible with one camera; its interval is wide.",
-    "On recordings made with another finite-element code and another renderer its error is larger than that "
-    "of physics in `bench score` (docs/results/learn/foreign/monocular).",
+    "On recordings made with another finite-element code and another renderer its error is about that of "
+    "physics in `bench score` (docs/results/learn/foreign/monocular).",
 )
 
 
