@@ -71,7 +71,8 @@ def of_job(job: Job) -> tuple[Pixels, Ints]:
 
     Pictures are scaled to the photograph's mm per px, if they differ by more than a twentieth.
     """
-    drawn = {name: share for name, share in job.randomize.items() if name != "instruments"}
+    # A picture without instruments has neither them nor a field that is drawn to suit them.
+    drawn = {name: share for name, share in job.randomize.items() if name not in ("instruments", "field")}
     bare = changed(job, {"fem.instrument": "none", "sensor.bitrate_mbps": None})
     bare = changed(bare, {"randomize": drawn}) if drawn else bare
     pictures, of = [], []
