@@ -69,12 +69,12 @@ def jackknife(theirs: Floats, ours: Floats, group: Ints) -> tuple[float, float]:
 def of_job(job: Job) -> tuple[Pixels, Ints]:
     """Crops of tissue, without overlap, of each sequence's first frame, and the sequence of each (N,).
 
-    Pictures are scaled to the photograph's mm per px, if they differ by more than a twentieth.
+    Pictures are scaled to the photograph's mm per px, if they differ by more than a twentieth. They have no
+    instruments, and the field of a job that draws it is the default: drawing it sets keys of instruments.
     """
-    # A picture without instruments has neither them nor a field that is drawn to suit them.
     drawn = {name: share for name, share in job.randomize.items() if name not in ("instruments", "field")}
     bare = changed(job, {"fem.instrument": "none", "sensor.bitrate_mbps": None})
-    bare = changed(bare, {"randomize": drawn}) if drawn else bare
+    bare = changed(bare, {"randomize": drawn}) if job.randomize else bare
     pictures, of = [], []
     for index in range(job.sequences):
         rgb, inside, mm_per_px = bare_picture(bare, index)
