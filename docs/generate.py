@@ -131,7 +131,7 @@ the scale, and one camera hardly measures force along its line of sight. What ea
 | 0.1 to 0.4 s without contact | 7; 23; 15 | 13; 34; 11 |
 | whether the membrane is intact | 7; 18; 15 | 13; 31; 11 |
 
-So short a span shows nothing of a breath and gains nothing. Hence the three breaths below.
+A span this short shows too little of a breath, and gains nothing. Hence the three breaths below.
 
 ## Steps
 
