@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 from evidence import report
 from evidence.study import Study
@@ -61,12 +60,11 @@ def overhead(name: str, count: int) -> dict[str, float | int]:
 
 
 def _render_alone(job: Job, processes: int = 1) -> float:
-    """Wall time of `render_bare` of a job, in so many processes at once."""
+    """Wall time of a job's stages alone, in so many processes at once."""
     known = filter(None, [str(report.CHECKOUT), os.environ.get("PYTHONPATH")])
-    path = {"PYTHONPATH": os.pathsep.join(known)}  # this module is found in any working directory
+    path = {"PYTHONPATH": os.pathsep.join(known)}  # the module is found in any working directory
     threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    program = "import sys; from evidence.engine.speed import render_bare; render_bare(sys.argv[1])"
-    words = [sys.executable, "-c", program, job.model_dump_json()]
+    words = [sys.executable, "-m", "evidence.engine.bare", job.model_dump_json()]
     how: dict[str, Any] = {
         "env": os.environ | path | child.environment(job, 1) | threads,
         "stdout": subprocess.DEVNULL,
@@ -77,25 +75,6 @@ def _render_alone(job: Job, processes: int = 1) -> float:
         if any([one.wait() for one in started]):
             raise RuntimeError("the stages alone failed")
     return time.perf_counter() - began
-
-
-class _Nowhere:
-    """Accepts every call of a store and stores nothing."""
-
-    def __init__(self, *_: Any, **__: Any) -> None: ...
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *_, **__: None
-
-
-def render_bare(described: str) -> None:
-    """The stages in one process and nothing else: no engine, no store, no index, no card."""
-    from synth.sequence import pipeline
-
-    job = Job.model_validate_json(described)
-    with mock.patch.object(pipeline, "Writer", _Nowhere):
-        for index in range(job.sequences):
-            pipeline.render_sequence(job, index, Path("."), lambda *_: None)
 
 
 def workers(name: str, count: int, alone: int) -> dict[str, float | int]:

@@ -18,7 +18,7 @@ from evidence.study import Study
 from synth.arrays import Floats, Pixels
 from synth.errors import UserError
 
-_PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 0.3
+_PERIOD_S, _PEAK_PX, _PX_A_MN = 4.0, 9.0, 1.0  # a force that such a motion of soft tissue may take
 _SENSOR_HZ, _FPS, _SIZE = 200.0, 30.0, (680, 480)
 
 
@@ -32,7 +32,7 @@ def measure(model: Path, seconds: float = 60.0) -> dict[str, Any]:
         done = subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
         wall = time.perf_counter() - began
         if done.returncode:
-            raise UserError(f"the scoring failed: {done.stderr.strip().splitlines()[-1]}")
+            raise UserError(f"the scoring failed: {done.stderr or done.stdout}")
         scored = json.loads(Path(scratch, "score.json").read_text())
     about = {"seconds": seconds, "fps": _FPS, "size": list(_SIZE), "frames": scored["frames"]}
     return {"data": status.data(model), **about, "wall_s": wall, "timings": scored["timings"]}
