@@ -20,6 +20,9 @@ PYTEST := $(BIN)/python -m pytest -n 2
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
 UNREACHABLE := { echo "the packages could not be installed: check the connection to an index of Python packages" >&2; exit 2; }
 
+# Containers often set it; then each of a hundred processes would compile every package again, for seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test trials quick docs weights evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
