@@ -4,6 +4,7 @@
 #   make test    lint, types, all tests but trials: six minutes on two cores
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
+#   make guard   by how much this checkout's values differ from the stored ones, a minute; ACCEPT=1 stores them
 #   make docs    the pages in site/; open site/index.html
 #   make weights  trains the networks again, from nothing, into runs/weights/made: of motion, then of force; many hours
 #   make evidence    repeats all measurements, into runs/evidence and docs/results; PHOTO=cortex.jpg for the appearance
@@ -23,7 +24,7 @@ UNREACHABLE := { echo "the packages could not be installed: check the connection
 # Containers often set it; then each of a hundred processes would compile every package again, for seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test trials quick docs weights evidence setup lint types slurm clean
+.PHONY: demo test trials quick guard docs weights evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
 setup: .venv/developed .venv/llvm
@@ -82,6 +83,9 @@ slurm:
 
 quick: setup lint types
 	$(PYTEST) -m "not slow and not trial"
+
+guard: setup
+	$(BIN)/python -m evidence guard $(if $(ACCEPT),--accept)
 
 docs: setup
 	$(BIN)/python docs/generate.py

@@ -1,13 +1,14 @@
-"""`python -m evidence STUDY`, `python -m evidence all`, `python -m evidence status`."""
+"""`python -m evidence STUDY`, and `all`, `status`, `guard`."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from evidence import all as everything
 from evidence import report, study
-from evidence.status import gather
+from evidence import status as states
+from evidence.guard import guard
 
 
 class _Studies(TyperGroup):
@@ -29,11 +30,17 @@ def main() -> None:
     """This project's own measurements."""
 
 
+app.command("guard")(guard.main)
+
+
 @app.command()
-def status() -> None:
-    """For each stored result: current or stale, commit, CPU-hours to make it again, command."""
-    modules = {study.load(name).result: f"evidence.{name}" for name in study.names()}
-    typer.echo(report.markdown([one.row() for one in gather(report.RESULTS, modules)]))
+def status(
+    write: Annotated[bool, typer.Option(help="Writes each state on the page of its result.")] = False,
+) -> None:
+    """Whether each stored result stands, or by how much what it depends on has moved; and how it was made."""
+    if write:
+        states.write_states()
+    typer.echo(report.markdown([one.row() for one in states.gather()]))
 
 
 if __name__ == "__main__":

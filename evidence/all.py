@@ -1,22 +1,28 @@
-"""All stored results, made again at one commit; the studies share datasets.
+"""All stored results, made again; the studies share datasets.
 
 Run: make evidence PHOTO=CORTEX.jpg MECHANICS_PYTHON=A/bin/python PICTURES_PYTHON=B/bin/python
 
-Steps that have passed at this commit are skipped. The pretrained networks are files of the commit and are not
-trained here.
+An interrupted run goes on with --moved, which leaves out results that stand. The pretrained networks are
+files of the checkout and are not trained here.
 """
 
 import os
 import re
 import shlex
-from collections.abc import Mapping
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from evidence import report, study
-from evidence.steps import Step, run_steps
+from evidence import report, status, study
+
+Step = tuple[str, Sequence[str]]
+"""Its name, and the arguments after `python`."""
 
 DATASETS: Mapping[str, tuple[str, ...]] = {
     "mission": ("mission", "sequences=240"),
@@ -33,31 +39,66 @@ def main(
     mechanics_python: Annotated[Path | None, typer.Option(help="A Python with felupe, pypardiso.")] = None,
     pictures_python: Annotated[Path | None, typer.Option(help="A Python with bpy.")] = None,
     only: Annotated[str, typer.Option(help="Only studies whose name contains this.")] = "",
+    moved: Annotated[bool, typer.Option(help="Only results that no longer stand.")] = False,
 ) -> None:
-    """Makes all stored results again. Exit code 1 if a step fails; its log is WORK/COMMIT/logs/STEP.log."""
-    work = work / (report.commit() or "unknown")
+    """Makes all stored results again. Exit code 1 if a step fails; its log is WORK/logs/STEP.log."""
     options = {"photo": photo, "mechanics_python": mechanics_python, "pictures_python": pictures_python}
-    steps, left_out = plan(work, {name: path for name, path in options.items() if path is not None}, only)
+    steps, left_out = plan(
+        work,
+        {name: path for name, path in options.items() if path is not None},
+        only,
+        standing() if moved else set(),
+    )
     for line in left_out:
         typer.echo(line, err=True)
     # With several threads on small matrices, waiting costs the physics twenty times its CPU time.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    rows = run_steps(steps, work / "steps.json", work / "logs")
+    rows = run_steps(steps, work / "logs")
     typer.echo(f"{report.markdown(rows)}\n{sum(row['cpu_s'] for row in rows) / 3600:.1f} CPU-hours")
     # A dataset may lack a scene whose load exceeded the law's range; steps that need it fail themselves.
     raise typer.Exit(int(any(row["exit_code"] for row in rows if row["name"] not in DATASETS)))
 
 
-def plan(work: Path, given: Mapping[str, Path], only: str = "") -> tuple[list[Step], list[str]]:
+def standing() -> set[str]:
+    """Names of the studies all of whose results stand."""
+    state = {str(one.file.relative_to(report.RESULTS)): one.stands for one in status.gather()}
+    results = {name: study.load(name).result for name in study.names()}
+    files = {name: [file for file in state if fnmatch(file, result)] for name, result in results.items()}
+    return {name for name, mine in files.items() if mine and all(state[file] for file in mine)}
+
+
+def run_steps(steps: Sequence[Step], logs: Path) -> list[dict[str, Any]]:
+    """Runs steps in order, each in a process of its own; one that fails does not stop the next.
+
+    `logs`: folder of NAME.log. Returns `name`, `exit_code`, `wall_s` and `cpu_s` of each.
+    """
+    logs.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, arguments in steps:
+        begin, before = time.perf_counter(), os.times()
+        with (logs / f"{name.replace(' ', '-')}.log").open("wb") as log:
+            code = subprocess.run([sys.executable, *arguments], stdout=log, stderr=log).returncode
+        after = os.times()
+        cpu = after.children_user + after.children_system - before.children_user - before.children_system
+        spent = time.perf_counter() - begin
+        rows.append({"name": name, "exit_code": code, "wall_s": round(spent, 1), "cpu_s": round(cpu, 1)})
+        typer.echo(f"{name}: exit code {code}, {spent:.0f} s, {cpu:.0f} of the CPU", err=True)
+    return rows
+
+
+def plan(
+    work: Path, given: Mapping[str, Path], only: str = "", left: Sequence[str] | set[str] = ()
+) -> tuple[list[Step], list[str]]:
     """Steps of the studies whose name contains `only`, after those that render their datasets.
 
-    `given`: files by the name of their option. Returns also a message for each step that lacks one.
+    `given`: files by the name of their option; `left`: studies that are left out. Returns also a message for
+    each step that lacks a file.
     """
     known = {"work": work, **given, **{name: work / name for name in DATASETS}}
     steps: list[Step] = []
     left_out, needed = [], set[str]()
     for name in study.names():
-        lines = study.load(name).steps if only in name else ()
+        lines = study.load(name).steps if only in name and name not in left else ()
         for k, line in enumerate(lines, 1):
             words = set(re.findall(r"\{([\w-]+)\}", line))
             if missing := sorted(words - set(known)):

@@ -1,28 +1,44 @@
-"""Results and packed clips, cached in a folder by a key of all inputs: an interrupted run continues."""
+"""Results and packed clips, cached in a folder by a key of all inputs: an interrupted run continues.
+
+Code enters by the integers of `synth.formats`, which are raised when a probe of the guard moves: a comment or
+a new name makes nothing stale.
+"""
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from evidence.guard import guard
 from learn.data.clips import Clip, pack, unpack
-from synth.dataset import provenance
+from synth import formats
 from synth.dataset.folder import write_whole
 from synth.job import identity
+from synth.system import packages
+
+SCENES = ("MESH", "CONTENT", "MOTION")
+"""Versions that rendered sequences depend on."""
 
 
 @cache
-def code() -> str:
-    """Hash of this project's source files and of the packages' versions, PyTorch's included."""
-    return f"{provenance.source('synth', 'learn', 'bench', 'evidence')} {version('torch')}"
+def libraries() -> dict[str, str]:
+    """Versions of the packages that compute, PyTorch's included."""
+    known = packages.versions()
+    return {name: known[name] for name in packages.COMPUTING if name in known} | {"torch": version("torch")}
 
 
-def key(*parts: Any) -> str:
-    """Key of the code and of settings and content hashes that JSON can hold."""
-    return hashlib.blake2b(identity.canonical([code(), *parts]), digest_size=8).hexdigest()
+def key(*parts: Any, versions: Sequence[str] = ()) -> str:
+    """Key of settings and content hashes that JSON can hold, of the packages, and of versions of our code.
+
+    `versions`: names of `synth.formats` that the value depends on; all of them if none is named.
+    """
+    known = guard.versions()
+    ours = {name: known[name] for name in versions or known}
+    described = [formats.motion_version(), libraries(), ours, *parts]
+    return hashlib.blake2b(identity.canonical(described), digest_size=8).hexdigest()
 
 
 def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any:

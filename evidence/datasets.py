@@ -18,8 +18,8 @@ from synth.sequence import pipeline
 
 
 def folder_of(job: Job, name: str, work: Path) -> Path:
-    """Folder in `work` of a job's sequences, by the job and the code."""
-    return work / f"{name}-{job.seed}-{cache.key(identity.identify_job(job))}"
+    """Folder in `work` of a job's sequences, by the job and the versions of what renders it."""
+    return work / f"{name}-{job.seed}-{cache.key(identity.identify_job(job), versions=cache.SCENES)}"
 
 
 def render(job: Job, index: int, folder: Path) -> Sequence:

@@ -326,5 +326,9 @@ def _closed(found: Mapping[str, Any] | None) -> str | None:
 
 
 STUDY = Study(
-    measure, "gap/results.json", page, ("{mission} {mission-ood} {work}/foreign --work {work}/gap",)
+    measure,
+    "gap/results.json",
+    page,
+    ("{mission} {mission-ood} {work}/foreign --work {work}/gap",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
 )

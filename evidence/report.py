@@ -5,6 +5,7 @@ A study (`evidence.study`) measures, and draws a `Page` from its data alone.
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import json
 import math
@@ -136,6 +137,7 @@ def save(
     made = {
         "command": command(),
         "commit": commit(),
+        "date": datetime.date.today().isoformat(),
         "machine": machine(),
         "cpu_hours": float(f"{sum(times[:4]) / 3600:.2g}"),
     }

@@ -1,74 +1,84 @@
-"""What made every stored result, whether that has changed since, and what making it again costs."""
+"""Whether stored results still stand: how far the probes that they depend on have moved since then.
 
-import ast
+A result holds the sketches of the probes that its study needs (`evidence.guard`), as they were when it was
+made. They are always compared with the guard of today, so that small changes of many commits add up.
+"""
+
 import hashlib
 import json
 import re
-import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatch
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from evidence.report import CHECKOUT
+from evidence.guard import guard
+from evidence.guard.guard import Change, Sketches
+from evidence.report import CHECKOUT, RESULTS
+from synth.dataset.folder import write_whole
 
-_OURS = re.compile(r"(synth|learn|bench|evidence)(\.\w+)+")
-_SCORED = re.compile(r"^\s*bench score", re.M)
+_STATE = re.compile(r"^\*State: .*\*\n\n", re.M)
+_TITLE = re.compile(r"\A# .*\n\n")
 
 
 @dataclass(frozen=True)
 class Status:
     """One stored result."""
 
-    file: str
+    file: Path
     command: str
     commit: str
-    changed: tuple[str, ...] | None
-    """Files imported by its study, and data of the checkout that it read, that differ from those that made
-    it; None where study or commit are unknown."""
+    date: str
     cpu_hours: float | None
+    timed: bool
+    """Whether it holds times: they are of a date and a machine, and no change of code makes them wrong."""
+    needs: tuple[str, ...]
+    """The probes whose sketches it holds; empty: none are known."""
+    moved: tuple[Change, ...]
+    """Those that have moved since."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether it is what a run of today would measure, within the probes' tolerances."""
+        return bool(self.needs) and not self.moved
+
+    def describe(self) -> str:
+        """`stands`, `moved: flow 0.8% (confidence)` or `old`, and `times of DATE`."""
+        state = "stands" if self.stands else "old: made before the guard, or without probes"
+        if self.moved:
+            state = "moved since it was made: " + ", ".join(change.text() for change in self.moved)
+        return f"{state}; times are of {self.date or 'an unknown date'}" if self.timed else state
 
     def row(self) -> dict[str, Any]:
         """Cells of a table."""
-        state = "unknown" if self.changed is None else "current"
-        if self.changed:
-            state = f"stale: {len(self.changed)} files"
-        made = {"commit": self.commit, "CPU-hours": self.cpu_hours, "command": self.command.split("\n")[0]}
-        return {"result": self.file, "state": state, **made}
+        name = str(self.file.relative_to(CHECKOUT)) if self.file.is_relative_to(CHECKOUT) else self.file.name
+        made = {"made": self.date, "commit": self.commit, "CPU-hours": self.cpu_hours}
+        return {"result": name, "state": self.describe(), **made, "command": self.command.split("\n")[0]}
 
 
-def gather(results: Path, modules: Mapping[str, str], home: Path = CHECKOUT) -> list[Status]:
-    """Status of every JSON file of a folder in the checkout `home`, sorted by name.
-
-    `modules`: the study that makes the files of a pattern, relative to the folder.
-    """
-
-    def module(name: str) -> str:
-        return next((one for pattern, one in modules.items() if fnmatch(name, pattern)), "")
-
-    files = sorted(results.rglob("*.json"))
-    return [_status(file, module(str(file.relative_to(results))), home) for file in files]
+def gather(results: Path = RESULTS, today: Sketches | None = None) -> list[Status]:
+    """Status of every JSON file of a folder but the guard, by name; `today`: sketches to compare with."""
+    today = guard.stored() if today is None else today
+    files = sorted(path for path in results.rglob("*.json") if path.name != guard.FILE.name)
+    return [_read(file, today) for file in files]
 
 
-def closure(module: str, home: Path = CHECKOUT) -> set[Path]:
-    """Files of a module and of all modules of this project that it imports, directly or indirectly.
+def stamp(needs: Iterable[str], timed: bool = False) -> dict[str, Any]:
+    """What a result stores about what it depends on: the sketches of its probes, from the stored guard."""
+    today = guard.stored()
+    return {"timed": timed, "needs": {name: today[name] for name in needs}}
 
-    Module names in strings count too: they are imported by other processes. Flow estimators are found by
-    name, so that a module which imports one of them depends on all.
-    """
-    found: set[Path] = set()
-    waiting = [module]
-    while waiting:
-        file = _file(waiting.pop(), home)
-        if file is None or file in found:
-            continue
-        found.add(file)
-        waiting += _imported(file, file.stat().st_mtime_ns)
-        if file.parent == home / "synth/flow":
-            waiting += [f"synth.flow.{other.stem}" for other in file.parent.glob("*.py")]
-    return found
+
+def write_states(results: Path = RESULTS) -> None:
+    """Writes the state of each result below the title of its page."""
+    for status in gather(results):
+        page = status.file.with_name("README.md")
+        if page.is_file():
+            text = _STATE.sub("", page.read_text("utf-8"))
+            line = f"*State: {status.describe()}.*\n\n"
+            title = _TITLE.match(text)
+            end = title.end() if title else 0
+            write_whole(page, text[:end] + line + text[end:], durable=False)
 
 
 def content(path: Path) -> str:
@@ -88,41 +98,19 @@ def data(*paths: Path, home: Path = CHECKOUT) -> dict[str, str]:
     }
 
 
-def _status(file: Path, module: str, home: Path) -> Status:
-    found = json.loads(file.read_text("utf-8"))
-    found = found if isinstance(found, dict) else {}
-    name, command = str(file.relative_to(home)), str(found.get("command", ""))
-    commit = str(found.get("commit") or _git(home, "log", "-1", "--format=%h", "--", name)).strip()
-    changed = None
-    base = commit.rstrip("+")
-    if module and _git(home, "cat-file", "-t", base):
-        files = closure(module, home) | (closure("bench.cli", home) if _SCORED.search(command) else set())
-        ours = {str(one.relative_to(home)) for one in files}
-        read = {path: word for path, word in found.get("data", {}).items() if (home / path).exists()}
-        other = {path for path, word in read.items() if content(home / path) != word}
-        new = _git(home, "ls-files", "--others", "--exclude-standard")
-        differing = {*_git(home, "diff", "--name-only", base).splitlines(), *new.splitlines()}
-        changed = tuple(sorted(ours & differing | other))
-    return Status(name, command, commit, changed, found.get("cpu_hours"))
-
-
-@cache
-def _imported(file: Path, _changed_ns: int) -> list[str]:
-    names = []
-    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.Constant) and (known := _OURS.match(str(node.value))):
-            names.append(known[0])
-    return names
-
-
-def _file(module: str, home: Path) -> Path | None:
-    at = home.joinpath(*module.split("."))
-    return next((one for one in (at.with_suffix(".py"), at / "__init__.py") if one.is_file()), None)
-
-
-def _git(home: Path, *words: str) -> str:
-    return subprocess.run(["git", "-C", str(home), *words], capture_output=True, text=True).stdout
+def _read(file: Path, today: Mapping[str, Any]) -> Status:
+    stored = json.loads(file.read_text("utf-8"))
+    stored = stored if isinstance(stored, dict) else {}
+    before: Sketches = stored.get("needs", {})
+    moved = tuple(change for change in guard.compare(before, today) if change.moved)
+    about = {key: str(stored.get(key) or "") for key in ("command", "commit", "date")}
+    # A probe that no longer exists can't vouch for anything.
+    needs = tuple(before) if set(before) <= set(today) else ()
+    return Status(
+        file,
+        **about,
+        cpu_hours=stored.get("cpu_hours"),
+        timed=bool(stored.get("timed")),
+        needs=needs,
+        moved=moved,
+    )

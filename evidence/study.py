@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import typer
 
-from evidence import report
+from evidence import report, status
 from learn.training.threads import set_threads
 
 _HOME = Path(__file__).parent
@@ -36,6 +36,11 @@ class Study:
     steps: tuple[str, ...] = ("",)
     """Arguments of each run by `all`: by default one run without any. {NAME} stands for a dataset, an option
     of `all` (without it the step is left out), or `work`, the folder of intermediate results."""
+    needs: tuple[str, ...] = ()
+    """Probes of `evidence.guard` whose change would move its figures: those of the product's packages that it
+    uses, also through data that it renders."""
+    timed: bool = False
+    """Whether it holds times: these are of a date and a machine."""
 
 
 def names() -> list[str]:
@@ -67,7 +72,9 @@ def command(name: str) -> Any:
             study.measure(**options)
             return
         folder = options.pop("out")
-        report.save(folder, result.name, study.measure(**options) or {}, study.page)
+        data = dict(study.measure(**options) or {}) | status.stamp(study.needs, study.timed)
+        report.save(folder, result.name, data, study.page)
+        status.write_states(folder)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     app = typer.Typer(add_completion=False)

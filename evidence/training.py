@@ -45,10 +45,10 @@ def fit(
 ) -> Predictor:
     """Network trained on fit and select of a split, stored in `folder`; an interrupted training continues.
 
-    `name`: part of the key, next to code, settings and the clips' hashes.
+    `name`: part of the key, next to settings and the clips' hashes.
     """
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
-    model = folder / f"{name}-{cache.key(settings.model_dump(), used)}"
+    model = folder / f"{name}-{cache.key(settings.model_dump(), used, versions=('CLIPS', 'TRAINING'))}"
     train(clips, split, settings, model, device=device)
     return load_model(model)
 

@@ -11,6 +11,10 @@ STORE, FOLDER, MODEL, SCORE = 2, 4, 2, 2
 MOTION = 4
 """Of recovered motion: raised when flow, masks or stereo recover another motion from the same pictures, since
 networks learn the errors of the motion that they were trained on."""
+MESH, CONTENT, COMPLIANCE, CLIPS, TRAINING, SCORING = 1, 1, 1, 1, 1, 1
+"""Of computed values, on which caches and datasets depend next to their inputs: the volume mesh; what a job
+renders (mechanics, pictures, labels); the matrices of physics; packed clips; what a training returns; what
+`bench score` returns. Each is raised with a change that moves its probe of the guard (`make guard`)."""
 MOTION_WEIGHTS = Path(__file__).with_name("flow")  # folder of the networks on which motion depends
 FIRST = 2  # written by 0.2, the first release: nothing older is read
 

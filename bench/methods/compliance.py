@@ -9,20 +9,19 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import Delaunay
 
 from synth.arrays import Floats, Map
-from synth.dataset import provenance
 from synth.fem import surface_embedding
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble
+from synth.formats import COMPLIANCE, MESH
 from synth.job import schema
 from synth.system import cache
 
@@ -110,8 +109,7 @@ def build(components: int, tissue: TissueKind) -> Compliance:
 @lru_cache(maxsize=4)
 def _stored(tissue: TissueKind) -> Map:
     """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
-    code = provenance.source("synth/fem", "synth/job").encode() + Path(__file__).read_bytes()
-    key = code + f"{tissue}".encode()
+    key = f"{MESH} {COMPLIANCE} {_TETS} {_POINT_MM} {_NODE_MM} {OPENING_MM} {tissue}".encode()
     faults = ValueError, EOFError  # of files that were cut off by a full disk: they are computed again
     return cache.cached("compliance/npy", key, lambda: _solved(tissue), _dump, _load, faults, _STORED)
 

@@ -233,4 +233,4 @@ def embedded(pictures: Pixels) -> Floats:
     return np.asarray(torch.cat(parts).double().numpy())
 
 
-STUDY = Study(measure, "render/appearance/classifier.json", page, ("{photo}",))
+STUDY = Study(measure, "render/appearance/classifier.json", page, ("{photo}",), needs=("mesh", "picture"))

@@ -170,4 +170,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
 
 _STEP = "{photo} --job default --job randomized --frames 60"
-STUDY = Study(measure, "render/features/features.json", page, (_STEP,))
+STUDY = Study(measure, "render/features/features.json", page, (_STEP,), needs=("mesh", "picture"))

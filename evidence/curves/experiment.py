@@ -256,4 +256,10 @@ def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]
     ]
 
 
-STUDY = Study(measure, "learn/curves/curves.json", page, ("{mission} {mission-ood} --work {work}/curves",))
+STUDY = Study(
+    measure,
+    "learn/curves/curves.json",
+    page,
+    ("{mission} {mission-ood} --work {work}/curves",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network"),
+)

@@ -281,4 +281,11 @@ def _cells(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-STUDY = Study(measure, "end-to-end/pareto.json", page, ("--work {work}/end-to-end",))
+STUDY = Study(
+    measure,
+    "end-to-end/pareto.json",
+    page,
+    ("--work {work}/end-to-end",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
+    timed=True,
+)

@@ -100,4 +100,4 @@ def _cpu() -> float:
     return sum(os.times()[:4])  # of this process and its children
 
 
-STUDY = Study(measure, "engine/speed.json", page)
+STUDY = Study(measure, "engine/speed.json", page, needs=("mechanics", "picture", "flow"), timed=True)

@@ -182,4 +182,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Discs on the half-space", found, panels)
 
 
-STUDY = Study(measure, "fem/half-space/half-space.json", page)
+STUDY = Study(measure, "fem/half-space/half-space.json", page, needs=("mesh", "mechanics"))

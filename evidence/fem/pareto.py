@@ -147,4 +147,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(title, found, panels, sections)
 
 
-STUDY = Study(measure, "fem/pareto/pareto.json", page)
+STUDY = Study(measure, "fem/pareto/pareto.json", page, needs=("mesh", "mechanics"), timed=True)

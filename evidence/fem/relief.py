@@ -84,4 +84,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(title, found, [panel], [report.Section("Summary", found["summary"])])
 
 
-STUDY = Study(measure, "fem/relief/relief.json", page)
+STUDY = Study(measure, "fem/relief/relief.json", page, needs=("mesh", "mechanics"))

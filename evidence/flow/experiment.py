@@ -132,4 +132,10 @@ def _time(seed: int) -> Iterator[Row]:
     yield row("CPU warm", on, mean_errors(create("tvl1"), some, warm=0.9)["cpu_s"], 0.2, "CPU-s")
 
 
-STUDY = Study(measure, "flow/benchmark/results.json", page)
+STUDY = Study(
+    measure,
+    "flow/benchmark/results.json",
+    page,
+    needs=("mesh", "mechanics", "picture", "truth", "flow"),
+    timed=True,
+)

@@ -116,4 +116,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Flow: videos not made by our renderer", found, charts, sections, words)
 
 
-STUDY = Study(measure, "flow/recordings/recordings.json", page)
+STUDY = Study(measure, "flow/recordings/recordings.json", page, needs=("flow", "score"))

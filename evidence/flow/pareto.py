@@ -75,4 +75,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Flow: error against time", found, panels, [report.Section("", rows)], words)
 
 
-STUDY = Study(measure, "flow/pareto/pareto.json", page)
+STUDY = Study(
+    measure,
+    "flow/pareto/pareto.json",
+    page,
+    needs=("mesh", "mechanics", "picture", "truth", "flow"),
+    timed=True,
+)

@@ -99,4 +99,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Flow: limits", found, panels, sections, words)
 
 
-STUDY = Study(measure, "flow/stability/stability.json", page)
+STUDY = Study(measure, "flow/stability/stability.json", page, needs=("flow",))

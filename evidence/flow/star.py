@@ -120,4 +120,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(panel.title, found, [panel], [report.Section("", rows)], words)
 
 
-STUDY = Study(measure, "flow/star/star.json", page)
+STUDY = Study(measure, "flow/star/star.json", page, needs=("flow",))

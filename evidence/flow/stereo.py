@@ -97,4 +97,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Stereo: motion in three dimensions", found, charts, sections, words)
 
 
-STUDY = Study(measure, "flow/stereo/stereo.json", page, ("{stereo-640} {stereo-320}",))
+STUDY = Study(
+    measure,
+    "flow/stereo/stereo.json",
+    page,
+    ("{stereo-640} {stereo-320}",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo"),
+)

@@ -369,4 +369,5 @@ STUDY = Study(
     measure,
     "learn/foreign/*/pool.json",
     steps=("{work}/foreign {mechanics_python} {pictures_python}",),
+    needs=("score", "score-stereo"),
 )

@@ -208,4 +208,11 @@ def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
     return report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True)
 
 
-STUDY = Study(measure, "learn/pareto/pareto.json", page, ("--dataset {mission} --cache {work}/networks",))
+STUDY = Study(
+    measure,
+    "learn/pareto/pareto.json",
+    page,
+    ("--dataset {mission} --cache {work}/networks",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "network"),
+    timed=True,
+)

@@ -136,4 +136,10 @@ def _split(run: Run, clips: Sequence[Clip]) -> Split:
     return training.nested(clips, 3, run.fold, 0)
 
 
-STUDY = Study(measure, "learn/losses/losses.json", page, ("{mission} --cache {work}/losses",))
+STUDY = Study(
+    measure,
+    "learn/losses/losses.json",
+    page,
+    ("{mission} --cache {work}/losses",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "network"),
+)

@@ -177,4 +177,10 @@ _ERRORS_ARE = (
 _COVERED_IS = "Share of frames whose true force lies inside, mean over sequences; nominal 90%."
 
 
-STUDY = Study(measure, "learn/shipped/shipped.json", page, ("{mission} {mission-ood} --cache {work}/clips",))
+STUDY = Study(
+    measure,
+    "learn/shipped/shipped.json",
+    page,
+    ("{mission} {mission-ood} --cache {work}/clips",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network"),
+)

@@ -124,4 +124,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Rendering: flow error and noise against time", found, panels, tables)
 
 
-STUDY = Study(measure, "render/pareto/pareto.json", page)
+STUDY = Study(
+    measure,
+    "render/pareto/pareto.json",
+    page,
+    needs=("mesh", "mechanics", "picture", "truth", "flow"),
+    timed=True,
+)

@@ -94,4 +94,6 @@ CASES: dict[str, tuple[Changes, Callable[[Case], Changes] | None]] = {
 }
 
 
-STUDY = Study(measure, "render/stability/stability.json", page)
+STUDY = Study(
+    measure, "render/stability/stability.json", page, needs=("mesh", "mechanics", "picture", "truth")
+)

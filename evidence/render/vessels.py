@@ -69,4 +69,4 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Vessels", found, [], [report.Section("", found["statistics"])], [words])
 
 
-STUDY = Study(measure, "render/vessels/vessels.json", page, ("{photo}",))
+STUDY = Study(measure, "render/vessels/vessels.json", page, ("{photo}",), needs=("mesh", "picture"))

@@ -92,4 +92,4 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     return report.Page("Scoring: time and memory", tree, [chart], (report.Section("", rows),), words)
 
 
-STUDY = Study(measure, "scoring/results.json", page, ("learn/models/mono",))
+STUDY = Study(measure, "scoring/results.json", page, ("learn/models/mono",), needs=("score",), timed=True)

@@ -260,4 +260,5 @@ STUDY = Study(
         f"{{work}}/exvivo-{folder} --photo {{photo}} --cameras {cameras}"
         for cameras, folder in FOLDERS.items()
     ),
+    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
 )

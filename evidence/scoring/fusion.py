@@ -130,4 +130,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page("Fusion of network and physics", found, [], [report.Section("", rows)], words)
 
 
-STUDY = Study(measure, "scoring/fusion/fusion.json", page, ("{mission-ood} --work {work}/fusion",))
+STUDY = Study(
+    measure,
+    "scoring/fusion/fusion.json",
+    page,
+    ("{mission-ood} --work {work}/fusion",),
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score", "score-stereo"),
+)

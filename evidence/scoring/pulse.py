@@ -165,4 +165,9 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     )
 
 
-STUDY = Study(measure, "pulse/results.json", page)
+STUDY = Study(
+    measure,
+    "pulse/results.json",
+    page,
+    needs=("mesh", "mechanics", "picture", "truth", "flow", "score", "score-stereo"),
+)

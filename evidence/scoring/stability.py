@@ -574,4 +574,10 @@ STEREO: dict[str, tuple[Change, str]] = {
 CHANGES = MONOCULAR | STEREO
 
 
-STUDY = Study(measure, "scoring/stability/stability.json", page, ("{work}/degraded",))
+STUDY = Study(
+    measure,
+    "scoring/stability/stability.json",
+    page,
+    ("{work}/degraded",),
+    needs=("mesh", "mechanics", "picture", "truth", "score", "score-stereo"),
+)

@@ -15,10 +15,10 @@ from safetensors.numpy import save_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
 from synth.arrays import Array, Floats, Map
-from synth.dataset import provenance
 from synth.dataset.split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError, as_user_error
+from synth.formats import CLIPS
 from synth.job import identity
 from synth.job.types import MembraneState
 from synth.system import checked_file
@@ -177,25 +177,24 @@ def load_clips(
     """All sealed sequences of a dataset, in order.
 
     `cache`: folder of packed arrays, written on first use and memory-mapped after; keyed by content hash,
-    grid and packing code, so it can be shared and is never stale. Raises UserError for an empty dataset, and
-    for a sequence whose attributes or values don't match their seal.
+    grid and the version of packing (`synth.formats.CLIPS`), so it can be shared. Raises UserError for an
+    empty dataset, and for a sequence whose attributes or values don't match their seal.
     """
     wanted = tuple(wanted)
     dataset = Dataset(root)
     clips = []
-    code = provenance.source("synth", "learn/data") if cache else ""
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
-        packed = cache and _packed(sequence, grid, wanted, cache, code)
+        packed = cache and _packed(sequence, grid, wanted, cache)
         clips.append(packed or read_clip(sequence, grid, wanted))
     report(len(dataset), len(dataset))
     return clips
 
 
-def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path, code: str) -> Clip:
+def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
-    key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, code]
+    key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, CLIPS]
     file = cache / f"{identity.digest(key)}.safetensors"
     if not file.is_file():
         pack(read_clip(sequence, grid, wanted), file)

@@ -192,10 +192,11 @@ def _makers(folder: Folder, mix: bool) -> list[dict[str, str]]:
     """The versions that created the dataset, including this one. UserError if they may not be mixed."""
     now, count = provenance.generator(), len(folder.sealed()) if folder.root.is_dir() else 0
     before: list[dict[str, str]] = folder.described()["generators"] if count else []
-    if mix or not count or before == [now]:
-        return [*before, *([] if now in before else [now])]
-    last = before[-1] if before else {}
-    changed = (key for key in now if last.get(key) != now[key])
+    if mix or not count or [*map(provenance.word, before)] == [provenance.word(now)]:
+        known = {provenance.word(one) for one in before}
+        return [*before, *([] if provenance.word(now) in known else [now])]
+    last = provenance.compared(before[-1]) if before else {}
+    changed = (key for key in provenance.compared(now) if last.get(key) != now[key])
     changes = [f"{key} {last.get(key, 'unknown')}, now {now[key]}" for key in changed]
     what = "; ".join(changes) or "several versions"
     raise UserError(

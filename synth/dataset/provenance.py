@@ -1,4 +1,8 @@
-"""The provenance of a sequence: a hash of the code and the packages that determine its values."""
+"""The provenance of a sequence: versions of what determines its values, and the source that ran.
+
+Versions are compared, source is only recorded: a comment changes no value. That a change of values raises a
+version is held by the guard (`make guard`).
+"""
 
 from __future__ import annotations
 
@@ -7,33 +11,37 @@ import json
 from functools import cache
 from pathlib import Path
 
-from synth.formats import STORE
+from synth.formats import CONTENT, MESH, STORE, motion_version
 from synth.system import packages
 
 HOME = Path(__file__).parents[2]
+_RECORDED = "source"  # key of what is not compared
 _MAKING = tuple(f"synth/{name}" for name in ("job", "geometry", "fem", "render", "video", "flow", "sequence"))
 
 
 @cache
 def generator() -> dict[str, str]:
-    """`{"format", "code", package: version}`; `code` is a hash of the packages that create a sequence."""
-    return {"format": str(STORE), "code": code(*_MAKING), **_computing()}
+    """`{"format", "content", "motion", package: version, "source"}`, all that a sequence's values depend on.
 
-
-@cache
-def source(*folders: str) -> str:
-    """A hash of the code in folders such as `synth/fem`, and of the versions of numerical packages."""
-    return word({"code": code(*folders), **_computing()})
+    `content`: versions of meshes and of what a job renders; `source`: a hash of the code, for the record.
+    """
+    versions = {"format": str(STORE), "content": f"{MESH}.{CONTENT}", "motion": motion_version()}
+    return {**versions, **_computing(), _RECORDED: code(*_MAKING)}
 
 
 def fingerprint() -> str:
-    """The hash of `generator()`."""
+    """The hash of what is compared of `generator()`."""
     return word(generator())
 
 
+def compared(made_by: dict[str, str]) -> dict[str, str]:
+    """The part of a `generator()` that decides whether two versions give the same values."""
+    return {name: value for name, value in made_by.items() if name != _RECORDED}
+
+
 def word(made_by: dict[str, str]) -> str:
-    """The hash of a `generator()`, of this or another version."""
-    described = json.dumps(made_by, sort_keys=True).encode()
+    """The hash of what is compared of a `generator()`, of this or another version."""
+    described = json.dumps(compared(made_by), sort_keys=True).encode()
     return hashlib.blake2b(described, digest_size=8).hexdigest()
 
 

@@ -14,6 +14,7 @@ from evidence.curves import experiment
 from evidence.curves.experiment import GRID, SAME, Estimator
 from evidence.end_to_end import models
 from learn.data.clips import Clip
+from synth import formats
 from synth.errors import UserError
 
 N, T = 16, 6
@@ -77,15 +78,20 @@ def test_orientations_transform_places_and_vectors_alike() -> None:
     assert len({tuple(arrow(turn)) for turn in turns}) == 8
 
 
-def test_cached_results_depend_on_inputs_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_results_depend_on_inputs_and_versions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     computed: list[int] = []
 
     def count(*parts: object) -> int:
-        cache.result(tmp_path, "x", cache.key(*parts), lambda: computed.append(1) or len(computed))
+        key = cache.key(*parts, versions=("MESH",))
+        cache.result(tmp_path, "x", key, lambda: computed.append(1) or len(computed))
         return len(computed)
 
     assert [count("a", ["b"]), count("a", ["b"]), count("a", ["c"]), count("a", ["b"])] == [1, 1, 2, 2]
-    monkeypatch.setattr(cache, "code", lambda: "another")
+    monkeypatch.setattr(formats, "SCORING", formats.SCORING + 1)
+    assert count("a", ["b"]) == 2
+    monkeypatch.setattr(formats, "MESH", formats.MESH + 1)
     assert count("a", ["b"]) == 3
 
 

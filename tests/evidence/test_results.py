@@ -1,7 +1,6 @@
 """Stored results: their provenance and charts, whether they are up to date, making all of them again."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,10 +8,11 @@ from xml.etree import ElementTree
 import pytest
 
 from evidence import all as everything
-from evidence import report, status, study
+from evidence import report, study
+from evidence.all import run_steps
+from evidence.guard import guard
 from evidence.learn import shipped
 from evidence.report import Chart, Curve, Page, Panel, bars
-from evidence.steps import run_steps
 from learn.inference.shipped import MODELS, NAMES
 
 PANEL = Panel("cost", "ms", "error [%]", (Curve("P2 <fast>", (1.0, 10.0), (4.0, float("nan")), ("a", "b")),))
@@ -29,7 +29,7 @@ def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pyte
         lambda found: Page("Title", found, [PANEL, CHART]),
     )
     found = json.loads((tmp_path / "found.json").read_text())
-    assert list(found) == ["command", "commit", "machine", "cpu_hours", "third", "rows"]
+    assert list(found) == ["command", "commit", "date", "machine", "cpu_hours", "third", "rows"]
     assert found["command"].endswith("where.csv --cache=b --seeds 3")
     assert found["third"] == 0.333333
     again = found | {"commit": "1234567"}
@@ -42,50 +42,6 @@ def test_data_are_stored_with_their_provenance(tmp_path: Path, monkeypatch: pyte
 
 def test_pareto_front() -> None:
     assert report.front([(2.0, 1.0), (1.0, 3.0), (3.0, 2.0), (1.0, 2.0)]) == [3, 0]
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    """A checkout with a script, an imported module, another module, data, and the script's result."""
-    files = {
-        "evidence/flow/pareto.py": "from synth import flow",
-        "synth/__init__.py": "",
-        "synth/flow.py": "import synth.job",
-        "synth/job.py": "SIZE = 1",
-        "synth/other.py": "",
-        "data/job.yaml": "frames: 3",
-    }
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    git(tmp_path, "init", "-q")
-    git(tmp_path, "add", "-A")
-    git(tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "first")
-    found = {
-        "command": "python -m evidence.flow.pareto --seeds 3",
-        "commit": git(tmp_path, "rev-parse", "--short", "HEAD").strip(),
-        "cpu_hours": 1.5,
-        "data": status.data(tmp_path / "data/job.yaml", home=tmp_path),
-    }
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results/pareto.json").write_text(json.dumps(found))
-    return tmp_path
-
-
-def git(folder: Path, *words: str) -> str:
-    return subprocess.run(["git", "-C", folder, *words], check=True, capture_output=True, text=True).stdout
-
-
-@pytest.mark.parametrize(
-    ("changed", "found"),
-    [("synth/other.py", ()), *((name, (name,)) for name in ("synth/job.py", "data/job.yaml"))],
-)
-def test_stale_if_imports_or_data_changed(home: Path, changed: str, found: tuple[str, ...]) -> None:
-    modules = {"*.json": "evidence.flow.pareto"}
-    assert [one.changed for one in status.gather(home / "results", modules, home)] == [()]
-    (home / changed).write_text((home / changed).read_text() + "\n")
-    (one,) = status.gather(home / "results", modules, home)
-    assert (one.changed, one.cpu_hours) == (found, 1.5)
 
 
 POOLED = "foreign.recordings", "scoring.exvivo"  # their pages are of `bench pool`
@@ -116,7 +72,7 @@ def test_every_stored_result_has_its_study() -> None:
     results = [study.load(name).result for name in study.names()]
     found = [{*report.RESULTS.glob(result)} for result in results if result]
     assert all(found)
-    assert set.union(*found) == {*report.RESULTS.rglob("*.json")}
+    assert set.union(*found) == {*report.RESULTS.rglob("*.json")} - {guard.FILE}
     assert sum(map(len, found)) == len(set.union(*found))
 
 
@@ -134,12 +90,13 @@ def test_every_study_accepts_the_arguments_of_its_steps(tmp_path: Path) -> None:
     assert len(left_out) == 1  # it needs a photograph
 
 
-def test_only_failed_steps_are_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evidence.report.commit", lambda: "abc")
-    write = "open('{}', 'a').write('x'){}"
-    steps = [("good", ("-c", write.format("good", ""))), ("bad", ("-c", write.format("bad", "; 1 / 0")))]
-    monkeypatch.chdir(tmp_path)
-    for _ in range(2):
-        rows = run_steps(steps, tmp_path / "steps.json", tmp_path)
-    assert [row["exit_code"] for row in sorted(rows, key=lambda row: row["name"])] == [1, 0]
-    assert [(tmp_path / name).read_text() for name in ("good", "bad")] == ["x", "xx"]
+def test_a_failed_step_does_not_stop_the_next(tmp_path: Path) -> None:
+    steps = [("bad", ("-c", "print('why'); 1 / 0")), ("good", ("-c", ""))]
+    rows = run_steps(steps, tmp_path)
+    assert [(row["name"], row["exit_code"]) for row in rows] == [("bad", 1), ("good", 0)]
+    assert "why" in (tmp_path / "bad.log").read_text()
+
+
+def test_only_results_that_moved_are_made_again(tmp_path: Path) -> None:
+    steps, _ = everything.plan(tmp_path, {}, "fem", left={"fem.pareto"})
+    assert {name for name, _ in steps} == {"fem.half_space", "fem.relief"}

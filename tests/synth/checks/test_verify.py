@@ -112,7 +112,7 @@ def edited_axes(root: Path) -> None:
 
 def unnamed_version(root: Path) -> None:
     described = json.loads((root / "dataset.json").read_text())
-    described["generators"][0]["code"] = "another"
+    described["generators"][0]["content"] = "another"
     (root / "dataset.json").write_text(json.dumps(described))
 
 

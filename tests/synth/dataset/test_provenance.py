@@ -1,4 +1,4 @@
-"""The provenance of a sequence includes its code, networks and packages."""
+"""The provenance of a sequence: versions and packages are compared, source is only recorded."""
 
 from pathlib import Path
 
@@ -9,7 +9,14 @@ from synth import formats
 from synth.dataset import provenance
 
 
-def test_a_change_of_what_determines_values_changes_the_hash(tmp_path: Path) -> None:
+def test_source_is_recorded_and_not_compared() -> None:
+    made_by = provenance.generator()
+    assert provenance.word(made_by | {"source": "other"}) == provenance.fingerprint()
+    for name in ("format", "content", "motion", "numpy"):
+        assert provenance.word(made_by | {name: "other"}) != provenance.fingerprint(), name
+
+
+def test_the_recorded_source_follows_code_and_networks(tmp_path: Path) -> None:
     files = dict.fromkeys(("engine/run.py", "flow/README.md"), False)
     files |= dict.fromkeys(("flow/tvl1.py", "flow/segmentation.onnx", "fem/mesh/lattice.py"), True)
     for name in files:
@@ -36,7 +43,7 @@ def test_the_version_of_motion_follows_its_weights(tmp_path: Path, monkeypatch: 
     assert formats.motion_version.__wrapped__() != before
 
 
-def test_packages_that_a_sequence_is_made_with_are_hashed_or_have_no_effect_on_values() -> None:
+def test_packages_that_a_sequence_is_made_with_are_recorded_or_have_no_effect_on_values() -> None:
     made = {
         "/".join(name.split(".")[:2])
         for package in provenance._MAKING

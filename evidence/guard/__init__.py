@@ -1,0 +1,1 @@
+"""The guard: nine short probes of the product, and by how much each has moved since a result was stored."""

@@ -1,0 +1,332 @@
+"""Nine small runs of the product, each returning arrays whose change would move stored results.
+
+Flow, stereo and the scores read recordings that are stored beside this file, and the network reads fields of
+closed form, so that a change upstream doesn't move what follows it: a probe that moves names the stage.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import synth
+from bench.cli import app as bench_app
+from learn.data.clips import Clip
+from learn.settings import preset
+from learn.split import Split
+from synth.arrays import Mask, Pixels
+from synth.fem import surface_embedding
+from synth.flow.segmentation import segment
+from synth.flow.stereo import track as stereo_track
+from synth.flow.stereo.calibration import read_rig
+from synth.sequence.fem_mechanics import build_volume
+
+Arrays = dict[str, Any]
+"""Name of an array -> its values."""
+
+RECORDINGS = Path(__file__).with_name("recordings")
+"""`mono` and `stereo`: recording folders of rendered sequences, made once by `store_recordings`."""
+
+_SMALL = ["sequences=1", "frames=4", "anatomy.vertices=1500", "fem.tets=400", "render.size=[64,48]"]
+_MECHANICS: dict[str, list[str]] = {
+    "linear": ["fem.law=linear", "fem.load=[0.02,0.04]"],
+    "co-rotational": ["fem.law=corotational", "fem.load=[0.05,0.1]"],
+    "neo-hookean": ["fem.law=neo-hookean", "fem.load=[0.1,0.2]", "fem.poisson=[0.45,0.45]"],
+    "membrane": ["fem.membrane.probability=1.0", "fem.load=[0.1,0.2]"],
+    "pulse": ["fem.pulse.heart_mm=[0.2,0.2]", "fem.pulse.breath_mm=[0.3,0.3]", "fem.load=[0.1,0.2]"],
+    "slip": ["fem.skull=slip", "fem.load=[0.1,0.2]"],
+}
+_PICTURES: dict[str, list[str]] = {
+    "stereo": [
+        "seed=3",
+        "render.stereo_mm=24",
+        "render.drift_mm=[0.8,0.8]",
+        "store.extra=[shadow]",
+        "fem.load=[0.1,0.3]",
+    ],
+    "randomized": ["seed=4", "randomize.texture=1", "randomize.surroundings=1", "randomize.light=1"],
+}
+_TRUTH = ("flow", "visible", "tool", "glare", "depth", "traction", "motion", "shadow", "force")
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One probe and what may be read from its change."""
+
+    run: Callable[[], Arrays]
+    tolerance: float
+    """Relative change of an array above which it has moved: below, another order of sums explains it."""
+    versions: tuple[str, ...]
+    """Integers of `synth.formats` of which one has to be raised when it moves, as caches depend on them."""
+    packages: tuple[str, ...]
+    """Packages of the product whose behaviour it covers."""
+
+
+def probe_mesh() -> Arrays:
+    """The volume's nodes and elements, the fine surface, and its embedding in the volume."""
+    scene = synth.simulate(_load("tiny", *_SMALL, "seed=1"))
+    volume = build_volume(scene)
+    embedding = surface_embedding.embed(volume, scene.surface.vertices)
+    smooth = np.sin(volume.points / 7.0)
+    return {
+        "nodes": volume.points,
+        "elements": volume.cells,
+        "surface": scene.surface.vertices,
+        "faces": scene.surface.faces,
+        "embedded": embedding.move(smooth),
+    }
+
+
+def probe_mechanics() -> Arrays:
+    """Motion, traction and energy under three laws, a membrane, a pulse, and slip at the skull."""
+    arrays: Arrays = {}
+    for name, keys in _MECHANICS.items():
+        motion = synth.simulate(_load("tiny", *_SMALL, "seed=2", *keys)).motion
+        arrays[f"{name}: displacement"] = motion.displacement
+        arrays[f"{name}: traction"] = motion.traction
+        arrays[f"{name}: tips"] = motion.tip[0]
+        arrays[f"{name}: motion of the tips"] = motion.tip - motion.tip[0]
+        if motion.energy is not None:
+            arrays[f"{name}: energy"] = motion.energy
+    return arrays
+
+
+def probe_picture() -> Arrays:
+    """Pictures of both cameras, of a usual and of a randomised scene."""
+    arrays: Arrays = {}
+    for name, keys in _PICTURES.items():
+        frames = _frames(keys)
+        arrays[f"{name}: left"] = np.stack([frame.rgb for frame in frames])
+        if frames[0].rgb_right is not None:
+            arrays[f"{name}: right"] = np.stack([np.asarray(frame.rgb_right) for frame in frames])
+    return arrays
+
+
+def probe_truth() -> Arrays:
+    """Labels on the pixels of a scene with two cameras, and the poses of the camera."""
+    frames = _frames(_PICTURES["stereo"])
+    arrays: Arrays = {}
+    for name in _TRUTH:
+        values = np.stack([getattr(frame, name) for frame in frames]).astype(np.float64)
+        # No value where a ray meets nothing; how many there are is part of `visible` and `depth` itself.
+        arrays[name] = np.where(np.isfinite(values), values, -1.0)
+    arrays["depth"] -= arrays["depth"].max()  # the relief, not the distance of the camera
+    poses = np.stack([frame.camera.pose for frame in frames])
+    arrays["camera"], arrays["motion of the camera"] = poses[0], poses - poses[0]
+    return arrays
+
+
+def probe_flow() -> Arrays:
+    """Masks and recovered flow of a stored recording."""
+    left, blocked, tissue = _stored_pictures("stereo", "frames")
+    track = synth.recover_flow(left, blocked, tissue)
+    classes = [segment(left[0], picture) for picture in left]
+    return {
+        "flow": track.flow,
+        "confidence": track.confidence,
+        "instrument": np.stack([one.instrument for one in classes]),
+        "highlight": np.stack([one.highlight for one in classes]),
+    }
+
+
+def probe_stereo() -> Arrays:
+    """Motion in three dimensions of a stored recording, given a flow of closed form."""
+    left, blocked, tissue = _stored_pictures("stereo", "frames")
+    right, unseen, _ = _stored_pictures("stereo", "right")
+    height, width = tissue.shape
+    rig = read_rig(RECORDINGS / "stereo/stereo.yaml", (width, height))
+    tracker = stereo_track.StereoTracker(rig, left[:1], right[:1], blocked[0], unseen[0], tissue)
+    y, x = np.mgrid[:height, :width] / height
+    shape = np.stack([np.sin(3 * x) * np.cos(2 * y), np.cos(2 * x + y)], axis=-1).astype(np.float32)
+    moved = [
+        tracker.step(
+            left[t],
+            right[t],
+            blocked[t],
+            unseen[t],
+            np.float32(0.2 * t) * shape,
+            0.9 * tissue.astype(np.float32),
+        )
+        for t in range(1, len(left))
+    ]
+    return {
+        "motion": np.stack([frame.motion for frame in moved]),
+        "deviation": np.stack([frame.deviation for frame in moved]),
+        "disparity": tracker.rest.disparity,
+    }
+
+
+def probe_network() -> Arrays:
+    """Losses of four epochs by two loss functions, and the networks' answers, on clips of closed form."""
+    from learn.training.train import train  # PyTorch is loaded by training alone
+
+    clips = [_clip(k) for k in range(6)]
+    split = Split(fit=(0, 1, 2, 3), select=(4,), test=(5,))
+    arrays: Arrays = {}
+    for loss in ("antighost", "off-target"):
+        settings = preset("tiny", size=16, loss=loss, epochs=4, batch=4, extent_mm=36.0)
+        settings = settings.model_copy(
+            update={"arch": settings.arch.model_copy(update={"width": 4, "levels": 2})}
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "model"
+            train(clips, split, settings, out)
+            history = [json.loads(line) for line in (out / "history.jsonl").read_text("utf-8").splitlines()]
+            arrays[f"{loss}: losses"] = [epoch["loss"] for epoch in history]
+            arrays[f"{loss}: answer"] = _answer(out)
+    return arrays
+
+
+def probe_score() -> Arrays:
+    """The score of a stored recording with one camera of which scale and stiffness are stated."""
+    return _score("mono")
+
+
+def probe_score_stereo() -> Arrays:
+    """The score of a stored recording with two cameras."""
+    return _score("stereo")
+
+
+PROBES: Mapping[str, Probe] = {
+    "mesh": Probe(probe_mesh, 1e-4, ("MESH",), ("synth/fem/mesh", "synth/geometry", "synth/render/anatomy")),
+    "mechanics": Probe(probe_mechanics, 1e-4, ("CONTENT",), ("synth/fem", "synth/sequence", "synth/job")),
+    "picture": Probe(probe_picture, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
+    "truth": Probe(probe_truth, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
+    "flow": Probe(probe_flow, 1e-2, ("MOTION",), ("synth/flow",)),
+    "stereo": Probe(probe_stereo, 1e-2, ("MOTION",), ("synth/flow/stereo",)),
+    "network": Probe(probe_network, 1e-2, ("TRAINING",), ("learn",)),
+    "score": Probe(
+        probe_score,
+        3e-2,
+        ("SCORING", "COMPLIANCE", "MOTION"),
+        ("bench", "synth/recording_flow", "synth/video", "learn/inference"),
+    ),
+    "score-stereo": Probe(
+        probe_score_stereo,
+        3e-2,
+        ("SCORING", "COMPLIANCE", "MOTION"),
+        ("bench", "synth/recording_flow", "synth/video", "learn/inference"),
+    ),
+}
+"""By name; the order is that of the pipeline."""
+
+
+def store_recordings() -> None:
+    """Renders the recordings that probes read. They are input: only another kind needs new ones."""
+    from bench.recording.from_sequence import export_recording
+
+    size = ["sequences=1", "render.size=[128,96]", "anatomy.vertices=4000", "fem.tets=800"]
+    jobs = {
+        "mono": [*size, "seed=5", "frames=8", "fps=8"],
+        "stereo": [*size, "seed=3", "frames=6", "fps=6", "render.stereo_mm=24", *_MECHANICS["pulse"][:2]],
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        for name, keys in jobs.items():
+            job = synth.load_job("tiny", [*keys, "fem.load=[0.1,0.3]"])
+            with synth.open_dataset(Path(folder) / name, job) as root:
+                stored = synth.write_scene(synth.simulate(job), root)
+            export_recording(synth.open_sequence(stored), RECORDINGS / name)
+
+
+def _load(name: str, *keys: str) -> synth.Job:
+    return synth.load_job(name, [*keys])
+
+
+def _frames(keys: Sequence[str]) -> list[synth.Frame]:
+    scene = synth.simulate(_load("tiny", *_SMALL, *keys))
+    return [scene.frame(t) for t in range(len(scene))]
+
+
+def _stored_pictures(name: str, folder: str) -> tuple[Pixels, Mask, Mask]:
+    """Pictures (T, H, W, 3), instruments (T, H, W) of the left camera and tissue (H, W) of a recording."""
+    home = RECORDINGS / name
+    files = sorted((home / folder).glob("*.png"))
+    pictures = np.stack([_read(file) for file in files])
+    masks = np.zeros(pictures.shape[:3], bool)
+    for file in (home / "masks").glob("*.png") if folder == "frames" else ():
+        masks[int(file.stem)] = _read(file)[..., 0] > 0
+    return pictures, masks, _read(home / "tissue.png")[..., 0] > 0
+
+
+def _read(file: Path) -> Pixels:
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    if picture is None:
+        raise FileNotFoundError(file)
+    return np.asarray(picture, np.uint8)
+
+
+def _clip(number: int) -> Clip:
+    """Displacement and force of closed form on 16 × 16 cells: a push, of another size for each number."""
+    size, frames, pitch = 16, 4, 36.0 / 16
+    y, x = np.mgrid[:size, :size] + 0.5 - size / 2
+    place = 3.0 * np.array([np.cos(1.7 * number), np.sin(2.3 * number)])
+    bump = np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (4.0 + number))
+    load = np.linspace(0.0, 1.0, frames)[:, None, None]
+    toward = np.stack([x - place[0], y - place[1]]) * bump / 8
+    displacement = (load[:, None] * toward * (0.2 + 0.05 * number)).astype(np.float32)
+    pressing = np.array([0.2, -0.1, 0.9])[:, None, None] * bump
+    density = (load[:, None] * pressing).astype(np.float32)
+    mask = (np.hypot(x, y) < 7).astype(np.float32)
+    density *= mask
+    return Clip(
+        name=f"{number:06d}",
+        content_hash=f"{number:032x}",
+        group=f"anatomy {number}",
+        young_kpa=1.0 + 0.2 * number,
+        mask=mask,
+        displacement={"ideal": displacement},
+        confidence=np.ones((frames, size, size), np.float32),
+        density=density,
+        force=density.sum((2, 3), dtype=np.float64) * pitch**2 * (1.0 + 0.2 * number),
+    )
+
+
+def _answer(model: Path) -> Any:
+    """Answer (1, C, 16, 16) to a ramp, in every channel."""
+    import torch
+
+    from learn import checkpoint
+
+    network, _ = checkpoint.read_model(model)
+    channels = next(network.parameters()).shape[1]
+    ramp = torch.linspace(-1, 1, 16 * 16).reshape(1, 1, 16, 16)
+    with torch.no_grad():
+        return network(ramp.repeat(1, channels, 1, 1)).numpy()
+
+
+def _score(name: str) -> Arrays:
+    """Forces by every method of `bench score`, and their errors, with nothing from the user's cache."""
+    from typer.testing import CliRunner
+
+    with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
+        done = CliRunner().invoke(bench_app, ["score", str(RECORDINGS / name), "-o", f"{folder}/out"])
+        if done.exit_code:
+            raise RuntimeError(f"bench score {name}: {done.output} {done.exception!r}")
+        score = json.loads(Path(folder, "out/score.json").read_text("utf-8"))
+    curve = score["curve"]
+    arrays: Arrays = {f"force, {method}": force for method, force in curve["predicted_mn"].items()}
+    arrays["sensor"] = curve["sensor_mn"]
+    arrays["errors"] = [method["scores"]["mae_mn"] for method in score["methods"].values()]
+    return arrays
+
+
+@contextmanager
+def _environment(**values: str) -> Any:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
