@@ -1,11 +1,12 @@
 """For every test: one thread a process, and what lies in tests/slow is slow."""
 
+import os
 from pathlib import Path
 
 import pytest
-import torch
 
-torch.set_num_threads(1)
+# Numerical libraries read it when they are loaded, and so do the processes that tests start.
+os.environ["OMP_NUM_THREADS"] = "1"
 pytest_plugins = ["clip_fixtures"]
 
 SLOW = Path(__file__).parent / "slow"
