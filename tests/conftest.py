@@ -1,4 +1,4 @@
-"""For every test: one thread a process, and what lies in tests/slow is slow."""
+"""For every test: one thread a process; tests/slow is slow; modules with slow tests come first."""
 
 import os
 from pathlib import Path
@@ -16,3 +16,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if SLOW in item.path.parents:
             item.add_marker(pytest.mark.slow)
+    # A module is one process's: if a long one were the last, the other process would wait for it.
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)

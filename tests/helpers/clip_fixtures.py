@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from made_once import made_once
 
 if TYPE_CHECKING:
     from learn.data.clips import Clip
@@ -13,13 +14,15 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight sequences of six anatomies: two pairs share one."""
+    """Eight sequences of six anatomies: two pairs share one; not to be modified."""
+    return made_once(tmp_path_factory, "phantoms", write_phantoms)
+
+
+def write_phantoms(folder: Path) -> None:
     import phantom
 
-    folder = tmp_path_factory.mktemp("dataset")
     for index, anatomy in enumerate((1, 1, 2, 3, 3, 4, 5, 6)):
         phantom.write(folder, index, anatomy_seed=anatomy, family="pale" if anatomy == 6 else "healthy")
-    return folder
 
 
 @pytest.fixture(scope="session")
