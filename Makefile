@@ -16,7 +16,8 @@ PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	  $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 BIN := .venv/bin
 DEMO := runs/demo
-PYTEST := $(BIN)/python -m pytest -n 2
+# The tests of a module share a process, and so what its fixtures make; modules start in the order of tests/conftest.py.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder
 # Python compiles a module when it is imported; compiling all packages would double the time of installing.
 INSTALL := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt
 UNREACHABLE := { echo "the packages could not be installed: check the connection to an index of Python packages" >&2; exit 2; }
@@ -70,8 +71,12 @@ demo: .venv/installed .venv/llvm
 	    --title "Force from video: a sequence unseen in training"
 	@echo && echo "done: open $(DEMO)/report.html"
 
-test: setup lint types
-	$(PYTEST) -m "not trial"
+# Types are checked while tests run, and reported after them; the target fails if either does.
+WITH_TYPES = @log=$$(mktemp) && { $(BIN)/mypy >$$log 2>&1 & types=$$!; $(1); tests=$$?; \
+	  wait $$types; types=$$?; cat $$log; rm -f $$log; exit $$((tests || types)); }
+
+test: setup lint
+	$(call WITH_TYPES,$(PYTEST) -m "not trial")
 
 trials: setup slurm
 	$(PYTEST) -m trial
@@ -81,8 +86,8 @@ slurm:
 	@if [ "$$CI" = true ] && ! command -v slurmctld >/dev/null && [ "$$(id -u)" = 0 ]; then \
 	  (apt-get -qq update && apt-get -qq install -y slurm-wlm) >/dev/null 2>&1 || echo "no SLURM: its test is skipped"; fi
 
-quick: setup lint types
-	$(PYTEST) -m "not slow and not trial"
+quick: setup lint
+	$(call WITH_TYPES,$(PYTEST) -m "not slow and not trial")
 
 guard: setup
 	$(BIN)/python -m evidence guard $(if $(ACCEPT),--accept)

@@ -50,8 +50,11 @@ class Registry:
 
     def check_name(self, name: str, info: Any) -> str:
         """Returns `name` if it is known or `info.context` is STORED, else raises InvalidValue."""
+        # Every job passes here: listing the installed packages takes 12 ms, so it comes last.
+        if name in self.own or name in self._further or info.context is STORED:
+            return name
         known = (*self._further, *self.names())
-        if name not in known and info.context is not STORED:
+        if name not in known:
             hint = did_you_mean(name, known)
             raise InvalidValue(f"there is no {self._noun} {name!r}; there are {', '.join(known)}{hint}")
         return name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -14,6 +15,11 @@ COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "onnxruntime", "numb
 
 def versions() -> dict[str, str]:
     """`{package: version}` of the installed packages that affect a sequence, and of Python."""
+    return dict(_versions())
+
+
+@cache  # reading them takes 45 ms, and every sequence states them
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in ("sulcus", "zarr", "torch", *COMPUTING):
         try:

@@ -8,7 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -29,8 +29,6 @@ PAGES = [
     for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
     if page.relative_to(ROOT).parts[:2] not in (("docs", "results"), ("docs", "reference"))
 ]
-GENERATED = generate.pages()
-COMMANDS = {command.words: command for command in generate.commands()}
 PLUG_INS = ("flow", "law", "method")
 OURS = re.compile(r"(?<![\w./@-])(?:synth|learn|bench|evidence|tests|examples)/[\w/]+(?:\.[a-z0-9]+)*")
 
@@ -42,21 +40,29 @@ def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
         yield title[1] if title else "", found[2]
 
 
-@pytest.mark.parametrize("page", GENERATED, ids=lambda page: page.stem)
-def test_generated_pages_are_current(page: Path) -> None:
-    assert page.read_text("utf-8") == GENERATED[page], "out of date: run `make docs`"
+@pytest.fixture(scope="module")
+def commands() -> dict[tuple[str, ...], generate.Command]:
+    """Every command, by its words."""
+    return {command.words: command for command in generate.commands()}
+
+
+def test_generated_pages_are_current() -> None:
+    stale = [page.name for page, text in generate.pages().items() if page.read_text("utf-8") != text]
+    assert not stale, "out of date: run `make docs`"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_commands_keys_and_files_that_a_page_names_exist(page: Path) -> None:
+def test_commands_keys_and_files_that_a_page_names_exist(
+    page: Path, commands: dict[tuple[str, ...], generate.Command]
+) -> None:
     text = page.read_text("utf-8")
     for line in re.sub(r" *\\\n +", " ", text).splitlines():
         if not re.match(r"(    )+(\.venv/bin/)?(synth|learn|bench) ", line):
             continue
         words = shlex.split(line.strip().removeprefix(".venv/bin/"), comments=True)
-        depth = next((k for k in (3, 2) if len(words) >= k and tuple(words[:k]) in COMMANDS), 0)
+        depth = next((k for k in (3, 2) if len(words) >= k and tuple(words[:k]) in commands), 0)
         assert depth, f"{line}: there is no such command"
-        command = COMMANDS[tuple(words[:depth])]
+        command = commands[tuple(words[:depth])]
         if "--help" not in words and not command.group:
             command.click.make_context(words[depth - 1], words[depth:])
     for title, block in blocks(page, "yaml"):
@@ -69,17 +75,19 @@ def test_commands_keys_and_files_that_a_page_names_exist(page: Path) -> None:
     assert not lost, f"{page.name} names {lost}"
 
 
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=lambda command: "-".join(command.words))
-def test_every_command_has_help_and_examples_that_parse(command: generate.Command) -> None:
-    assert command.click.help
-    assert all(one.help for one in command.click.params), "a parameter has no help"
-    assert command.examples or command.group, 'has no example: epilog="Example: ..." of the command'
-    for line in command.examples:
-        typed = shlex.split(line)
-        assert tuple(typed[: len(command.words)]) == command.words
-        end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
-        if not command.group:
-            command.click.make_context(command.words[-1], typed[len(command.words) : end])
+def test_every_command_has_help_and_examples_that_parse(
+    commands: dict[tuple[str, ...], generate.Command],
+) -> None:
+    for words, command in commands.items():
+        assert command.click.help, words
+        assert all(param.help for param in command.click.params), f"{words}: a parameter has no help"
+        assert command.examples or command.group, f'{words} has no example: epilog="Example: ..."'
+        for line in command.examples:
+            typed = shlex.split(line)
+            assert tuple(typed[: len(words)]) == words
+            end = next((k for k, word in enumerate(typed) if word in (">", "|")), len(typed))
+            if not command.group:
+                command.click.make_context(words[-1], typed[len(words) : end])
 
 
 METHODS = "network and physics", "physics", "mean |flow|"  # columns of the README's table
@@ -132,6 +140,19 @@ shipped.MODELS = Path("packed")
 }
 """What the blocks of a page assume: the user's own pictures; a folder for models outside the checkout."""
 
+READER = """
+import json, runpy, sys
+exports, scripts = json.loads(sys.argv[1]), sys.argv[2:]
+if exports:
+    from synth.cli import app
+for words in exports:
+    assert not app(words, standalone_mode=False), words
+for script in scripts:
+    sys.argv = [script]
+    runpy.run_path(script, run_name="__main__")
+"""
+"""Runs the commands of a page and then its scripts, in one interpreter: starting costs more than running."""
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -149,19 +170,20 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
     export_recording(Dataset(out)[0], tmp_path / "recordings/000000")
     write_model(tmp_path / "model")
 
-    def run(words: Sequence[str], path: str = "") -> None:
+    def run(words: Iterable[str], path: str = "") -> None:
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{path}"}
         done = subprocess.run([sys.executable, *words], cwd=tmp_path, stderr=-1, text=True, env=environment)
         assert done.returncode == 0, f"{page.stem}: {words}: {done.stderr[-2000:]}"
 
-    for line in re.findall(r"^    synth (export out .*)", page.read_text("utf-8"), re.M):
-        run(["-m", "synth", *shlex.split(line)])
-    for title, text in blocks(page, "python"):
+    exports = re.findall(r"^    synth (export out .*)", page.read_text("utf-8"), re.M)
+    scripts = []
+    for k, (title, text) in enumerate(blocks(page, "python")):
         packages = re.findall(r"^(?:from|import) (\w+)", text, re.M)
         if all(map(importlib.util.find_spec, packages)):  # LeRobot's may not be there
-            script = tmp_path / Path(title or "block.py").name
-            script.write_text(GIVEN.get(page.stem, "") + text)
-            run([script.name])
+            scripts.append(Path(title or f"block{k}.py").name)
+            (tmp_path / scripts[-1]).write_text(GIVEN.get(page.stem, "") + text)
+    (tmp_path / "reader.py").write_text(READER)
+    run(["reader.py", json.dumps([*map(shlex.split, exports)]), *scripts])
     for title, text in blocks(page, "toml"):
         (tmp_path / title).write_text(text)
         run(pip.split())

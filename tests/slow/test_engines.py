@@ -83,7 +83,9 @@ def test_motion_and_force_are_the_engines_in_any_unit(solve: Any, example: Any, 
 
 def test_a_series_in_sofas_layout(tmp_path: Path) -> None:
     given = {**sofa_layout.JOB, "render": {"size": (160, 120)}, "mechanics": sofa_layout.write(tmp_path)}
-    synth.render_job(synth.Job.model_validate(given), tmp_path / "out", workers=1)
+    job = synth.Job.model_validate(given)
+    with synth.open_dataset(tmp_path / "out", job) as folder:
+        synth.write_scene(synth.simulate(job, 0), folder)
     assert verify_dataset(tmp_path / "out").good
     force = synth.open_sequence(tmp_path / "out" / "000000.zarr")["force"][:]
     true = sofa_layout.FORCE_MN * np.sin(np.pi * np.arange(sofa_layout.STATES) / 8) ** 2

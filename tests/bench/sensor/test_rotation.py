@@ -26,10 +26,10 @@ def _pressed(seed: int, flat: float = 0.6) -> tuple[Floats, Floats, Floats, Rota
     return moved, np.ones(moved.shape[:2]), turn.inv().apply(camera), turn
 
 
-@pytest.mark.slow
-def test_rotation_is_found_within_its_stated_error() -> None:
+@pytest.mark.parametrize("videos", [4, pytest.param(12, marks=pytest.mark.trial)])
+def test_rotation_is_found_within_its_stated_error(videos: int) -> None:
     errors, deviations = [], []
-    for seed in range(12):
+    for seed in range(videos):
         moved, visible, force, turn = _pressed(seed)
         found = find_rotation(moved, visible, force)
         assert found.refused == ""

@@ -3,12 +3,14 @@
 import json
 import signal
 import threading
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 from command import run as command
 from fake_run import Silent, options, start, wait_for
+from forked_workers import Forkserver
 
 from synth.cli import app
 from synth.dataset import index, provenance, size_forecast
@@ -28,6 +30,18 @@ JOB = Job(seed=2, sequences=6, frames=3, render={"size": (32, 24)}, flow={"backe
 
 def run(root: Path, work: str = "sequence", job: Job = JOB, **more: object) -> Summary:
     return engine.run_job(job, root, options(work, **more), Silent())
+
+
+@pytest.fixture(scope="module")
+def forkserver() -> Iterator[Forkserver]:
+    with closing(Forkserver()) as server:
+        yield server
+
+
+@pytest.fixture
+def forked(forkserver: Forkserver, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that start at once; without it, and in what `start` starts, they are as in use."""
+    monkeypatch.setattr(child, "subprocess", forkserver.subprocess)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +66,7 @@ def test_a_dataset_is_extended_by_any_number_of_workers(tmp_path: Path, undistur
         run(root, job=fewer)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_another_versions_dataset_is_continued_only_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,14 +83,14 @@ def test_another_versions_dataset_is_continued_only_on_request(
         run(root, job=JOB.model_copy(update={"sequences": 7}), mix_versions=False)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_a_sequence_sealed_by_a_lost_attempt_is_not_computed_again(tmp_path: Path) -> None:
     run(tmp_path / "made", job=JOB.model_copy(update={"sequences": 1}))
     with closing(Child(Setup(JOB.model_dump(mode="json"), tmp_path / "made", "no:such"))) as process:
         assert process.run(0, lambda *_: None, threading.Event()).kind == "done"
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_workers_take_gpus_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
     run(tmp_path, "seeing", JOB.model_copy(update={"sequences": 2}), workers=2, gpus="4,7")
@@ -94,7 +108,7 @@ def test_gpus_are_those_left_visible(monkeypatch: pytest.MonkeyPatch) -> None:
     assert child.choose_gpus("auto", True) is None, "no driver"
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_a_fault_costs_only_its_own_sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "_TRIES", 2)
     job = JOB.model_copy(update={"sequences": 9})
@@ -124,14 +138,14 @@ def test_a_fault_costs_only_its_own_sequence(tmp_path: Path, monkeypatch: pytest
     assert (healed.done, healed.failed) == (6, {})
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_a_hanging_sequence_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child, "_STALL_S", 1.0)
     job = JOB.model_copy(update={"sequences": 1})
     assert "reported nothing for 1 s" in run(tmp_path / "out", "hanging", job).failed[0]
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_a_full_disk_stops_the_run_and_sealed_sequences_stay(tmp_path: Path, undisturbed: str) -> None:
     with pytest.raises(UserError, match="No space left"):
         run(tmp_path / "out", "full")
@@ -140,7 +154,7 @@ def test_a_full_disk_stops_the_run_and_sealed_sequences_stay(tmp_path: Path, und
     assert run(tmp_path / "out").content_hash == undisturbed
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_another_jobs_dataset_and_other_files_are_never_touched(tmp_path: Path) -> None:
     run(tmp_path / "out")
     before = sorted(path for path in tmp_path.rglob("*"))
@@ -170,6 +184,7 @@ def test_two_runs_on_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
 def test_killed_and_resumed_equals_undisturbed(tmp_path: Path, kill: int, undisturbed: str) -> None:
     victim = start(tmp_path / "out", JOB, "stuck")
@@ -217,7 +232,7 @@ def test_the_time_left_is_estimated_from_the_latest_sequences(tmp_path: Path) ->
     assert left(1, 50, *slow, *fast) == pytest.approx(100)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
 def test_an_unusual_name_changes_nothing(tmp_path: Path, undisturbed: str) -> None:
     assert run(tmp_path / "größe μm 脳 'out'").content_hash == undisturbed
 

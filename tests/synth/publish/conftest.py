@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from fake_run import in_process
 from fake_work import consistent
+from made_once import made_once
 
 from synth.dataset import index, split
 from synth.dataset.folder import Folder
@@ -16,9 +17,12 @@ ABOUT = {"title": "Pulls: a test", "licence": "cc-by-4.0", "summary": "A test.",
 @pytest.fixture(scope="session")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six stereo sequences, with sides, card and description; not to be modified."""
-    out = tmp_path_factory.mktemp("publish") / "out"
+    return made_once(tmp_path_factory, "published", publish) / "out"
+
+
+def publish(folder: Path) -> None:
     render = {"size": (48, 36), "stereo_mm": 24.0}
     job = Job(sequences=6, frames=3, render=render, flow={"backend": "ideal"}, card=ABOUT)
-    in_process(job, out, consistent)
-    index.write_index(Folder(out), split.parse_rule("anatomy", "0.5,0.25,0.25", [], False))
-    return out
+    in_process(job, folder / "out", consistent)
+    rule = split.parse_rule("anatomy", "0.5,0.25,0.25", [], False)
+    index.write_index(Folder(folder / "out"), rule)

@@ -118,7 +118,9 @@ def test_instruments_follow_their_table(source: Path) -> None:
 
 @pytest.mark.slow
 def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path) -> None:
-    synth.render_job(job_of(source), tmp_path / "a", workers=1)
+    job = job_of(source)
+    with synth.open_dataset(tmp_path / "a", job) as folder:
+        synth.write_scene(synth.simulate(job, 0), folder)
     assert verify_dataset(tmp_path / "a").good
     sequence = synth.open_sequence(tmp_path / "a" / "000000.zarr")
     assert not {"force", "traction"} & set(sequence.fields)
