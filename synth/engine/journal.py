@@ -35,6 +35,9 @@ class Watcher:
     def begin(self, total: int, already: int, failed: int) -> None:
         """A run begins."""
 
+    def prepare(self, text: str) -> None:
+        """Something is done first that takes time, as `text` says."""
+
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         """A sequence is at a stage."""
 
@@ -104,6 +107,9 @@ class RunBars(ProgressBars, Watcher):
         if already or failed:
             hint = f", {failed} failed (`--retry` computes them again)" if failed else ""
             self._print(f"{already} of {total} sequences are done already{hint}")
+
+    def prepare(self, text: str) -> None:
+        self._print(text)
 
     def stage(self, index: int, stage: str, done: int, of: int) -> None:
         if index not in self._bars:

@@ -17,6 +17,7 @@ from synth.arguments import checked
 from synth.dataset import index, size_forecast
 from synth.dataset.folder import Folder, claim
 from synth.engine.child import Attempt, Child, Setup, choose_gpus, environment, share_of_memory
+from synth.engine.compilation import compile_once
 from synth.engine.journal import Journal, RunBars, Watcher
 from synth.errors import UserError, as_positive
 from synth.job.reader import as_job
@@ -115,6 +116,8 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             environment=environment(job, workers),
             turn=folder.turn,
         )
+        if todo and options.engine == "local" and options.work == Options.work:
+            compile_once(setup.environment, workers, watcher.prepare)
         try:
             with _slots(options.engine, setup, workers, gpus) as slots:
                 done = _Pool(folder, slots[: max(1, len(todo))], todo).work(watchers)

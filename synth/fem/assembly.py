@@ -7,9 +7,10 @@ import scipy.sparse as sp
 
 from synth.arrays import Floats, Indices
 from synth.fem.mesh.element import Quadrature, degrees_of_freedom, scatter
-from synth.system.jit import compiled
+from synth.system.jit import argument_types, compiled
 
 
+@argument_types("i4[:,::1], f8[:,:,:,::1], f8[:,::1], f8[:,:,::1]")
 @compiled
 def gradient(cells: Indices, slope: Floats, u: Floats, out: Floats) -> None:
     """Displacement gradient at every quadrature point: writes `out[p, i, j]` = du_i/dx_j, (M * Q, 3, 3).
@@ -30,6 +31,7 @@ def gradient(cells: Indices, slope: Floats, u: Floats, out: Floats) -> None:
                 g[i, 0], g[i, 1], g[i, 2] = a, b, c
 
 
+@argument_types("i4[:,::1], f8[:,:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,::1]")
 @compiled
 def divergence(cells: Indices, slope: Floats, weight: Floats, stress: Floats, out: Floats) -> None:
     """Nodal forces `out` (N, 3) mN that balance a stress (M * Q, 3, 3) kPa: the transpose of `gradient`.
@@ -49,39 +51,19 @@ def divergence(cells: Indices, slope: Floats, weight: Floats, stress: Floats, ou
                     out[at, i] += p[i, 0] * a + p[i, 1] * b + p[i, 2] * c
 
 
-@compiled
-def _local(slope: Floats, weight: Floats, moduli: Floats, out: Floats) -> None:
-    """Stiffness of every element, (M, n, 3, n, 3), from dP/dF at every point (or one for all)."""
-    elements, points, nodes, _ = slope.shape
-    half = np.empty((3, 3, 3))
-    out[:] = 0.0
-    for e in range(elements):
-        for q in range(points):
-            d, a = slope[e, q], moduli[(e * points + q) % len(moduli)]
-            for n in range(nodes):
-                for i in range(3):
-                    for k in range(3):
-                        for m in range(3):
-                            half[i, k, m] = weight[e, q] * (
-                                d[n, 0] * a[i, 0, k, m] + d[n, 1] * a[i, 1, k, m] + d[n, 2] * a[i, 2, k, m]
-                            )
-                for o in range(nodes):
-                    for i in range(3):
-                        for k in range(3):
-                            out[e, n, i, o, k] += (
-                                half[i, k, 0] * d[o, 0] + half[i, k, 1] * d[o, 1] + half[i, k, 2] * d[o, 2]
-                            )
-
-
 def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> sp.csr_array:
     """Tangent stiffness (3N, 3N) mN/mm of a mesh, degrees of freedom node by node.
 
     `moduli` (M * Q, 3, 3, 3, 3) kPa: dP/dF at every point; or (1, 3, 3, 3, 3), one for all. `along` (M, n, 3)
     sqrt(mN/mm): its outer products with itself are added to the elements' stiffness.
     """
-    elements, n = mesh.cells.shape
-    local = np.empty((elements, n, 3, n, 3))
-    _local(mesh.slope, mesh.weight, moduli, local)
+    (elements, n), points = mesh.cells.shape, mesh.weight.shape[1]
+    # By n, j -> n, (i, k, m); then, with points and m as one axis, by n, i, k -> o.
+    tangent = np.moveaxis(moduli, 2, 1).reshape(-1, 1 if len(moduli) == 1 else points, 3, 27)
+    half = (mesh.weight[:, :, None, None] * mesh.slope) @ tangent  # (M, Q, n, 27)
+    half = half.reshape(elements, points, n * 9, 3).swapaxes(1, 2).reshape(elements, n * 9, points * 3)
+    slopes = mesh.slope.swapaxes(2, 3).reshape(elements, points * 3, n)
+    local = (half @ slopes).reshape(elements, n, 3, 3, n).swapaxes(3, 4)
     if along is not None:
         local += along[:, :, :, None, None] * along[:, None, None]
     return scatter(local, degrees_of_freedom(mesh.cells), 3 * mesh.nodes)

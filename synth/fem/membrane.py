@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from synth.arrays import Floats, Indices
 from synth.fem.mesh.element import degrees_of_freedom, scatter, shape_slope
 from synth.fem.mesh.tetrahedra import Tets, boundary
-from synth.system.jit import compiled
+from synth.system.jit import compiled, inlined
 
 _POINTS = np.full((3, 3), 1 / 6) + 0.5 * np.eye(3)
 """Barycentric quadrature points of degree 2, of equal weight: exact at small strain for flat faces."""
@@ -116,7 +116,8 @@ def _pull(
     moved, bent = np.empty((3, 2)), np.empty((3, 2))
     for f in range(count):
         for q in range(points):
-            moved[:] = 0.0
+            for i in range(3):
+                moved[i, 0] = moved[i, 1] = 0.0
             for n in range(nodes):
                 a, b = slope[f, q, n, 0], slope[f, q, n, 1]
                 for i in range(3):
@@ -124,9 +125,9 @@ def _pull(
                     moved[i, 0] += v * a
                     moved[i, 1] += v * b
             if linear:
-                bent[:] = tangent[f, q]
                 xx, yy, xy = 0.0, 0.0, 0.0
                 for i in range(3):
+                    bent[i, 0], bent[i, 1] = tangent[f, q, i, 0], tangent[f, q, i, 1]
                     xx += bent[i, 0] * moved[i, 0]
                     yy += bent[i, 1] * moved[i, 1]
                     xy += 0.5 * (bent[i, 0] * moved[i, 1] + bent[i, 1] * moved[i, 0])
@@ -153,7 +154,7 @@ def _pull(
     return energy
 
 
-@compiled
+@inlined
 def _stretched(xx: float, yy: float, xy: float) -> tuple[float, float, float, float]:
     """Energy and second Piola-Kirchhoff stress (xx, yy, xy) at the metric C, for S = 1."""
     det = xx * yy - xy * xy

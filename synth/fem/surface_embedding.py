@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from synth.arrays import Floats, Ints
 from synth.fem.mesh.element import gradients, shape
 from synth.fem.mesh.tetrahedra import FACES, Tets, outer_faces
-from synth.system.jit import compiled
+from synth.system.jit import argument_types, as_constant, compiled, inlined
 
 _EVEN_MM = 2.0  # length over which rotation is averaged
 
@@ -63,7 +63,8 @@ def embed(tets: Tets, vertices: Floats) -> Embedding:
     owner, off = outer_faces(tets.cells)
     faces = FACES[off]
     nodes = tets.cells[owner[:, None], faces]
-    face, on_face = nearest(np.ascontiguousarray(tets.points[nodes]), np.ascontiguousarray(vertices))
+    corner = np.ascontiguousarray(tets.points[nodes])
+    face, on_face = nearest(corner, as_constant(np.ascontiguousarray(vertices)))
     bary = np.zeros((len(vertices), 4))
     np.put_along_axis(bary, faces[face], on_face, axis=1)
     value = sparse_rows(shape(bary), tets.cells[owner[face]], len(tets.points))
@@ -132,6 +133,7 @@ def vertex_area(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
     return np.bincount(faces.ravel(), np.repeat(area / 3, 3), len(vertices)).astype(np.float64)
 
 
+@argument_types("f8[:,:,::1], Array(f8, 2, 'C', readonly=True)")
 @compiled
 def nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
     """For each vertex the nearest triangle of (F, 3, 3) mm, and the barycentrics of the nearest point."""
@@ -160,12 +162,13 @@ def nearest(corner: Floats, vertices: Floats) -> tuple[Ints, Floats]:
             if distance < best:
                 best = distance
                 owner[v] = t
-                bary[v] = trial
+                for d in range(3):
+                    bary[v, d] = trial[d]
         last = owner[v]
     return owner, bary
 
 
-@compiled
+@inlined
 def _on_triangle(a: Floats, b: Floats, c: Floats, x: Floats, w: Floats) -> float:
     """Squared distance of x from a triangle; `w` receives the nearest point's barycentrics.
 

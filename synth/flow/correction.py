@@ -19,7 +19,7 @@ import numpy as np
 from synth.arrays import Array, Map, Mask, Pixels
 from synth.flow import kernels, onnx_network
 from synth.flow.image import GREY
-from synth.system.jit import vectorised
+from synth.system.jit import argument_types, vectorised
 
 WEIGHTS = Path(__file__).with_name("correction.onnx")
 CELL = 4  # px, side of a cell
@@ -144,8 +144,8 @@ def _steps(products: Map, side: int) -> Map:
 
     Returns (2, 3, h, w), from greys and from colours: x and y [px], and a measure of their certainty.
     """
-    around = np.empty_like(products)
-    kernels.box_into(products, (0,) * side, around)
+    around = np.empty(products.shape, np.float32)
+    kernels.box_into(products, side, around)
     around = around.reshape(2, _PRODUCTS, *products.shape[1:]).swapaxes(0, 1)
     inside = cv2.boxFilter(np.ones_like(products[0]), -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     # Windows with less than one usable pixel per cell have less weight.
@@ -159,6 +159,7 @@ def _steps(products: Map, side: int) -> Map:
     return np.concatenate([_FARTHEST_PX * np.tanh(step / _FARTHEST_PX), known[:, None]], 1)
 
 
+@argument_types("u1[:,:,:,::1], f4[:,:,::1], f4[:,::1], f4[:,:,::1]")
 @vectorised
 def sum_cells(colours: Pixels, greys: Map, mask: Map, sums: Map) -> None:
     """Sums products of two aligned pictures (2, 3, H, W) and their greys (2, H, W) over cells.

@@ -56,8 +56,8 @@ def flags(mask: Array) -> Map:
 
 def box(planes: Map, radius: int) -> Map:
     """Mean of (C, H, W) over squares of 2 radius + 1 pixels; over fewer at the border."""
-    out = np.empty_like(planes)
-    kernels.box_into(planes, (0,) * (2 * radius + 1), out)
+    out = np.empty(planes.shape, np.float32)
+    kernels.box_into(planes, 2 * radius + 1, out)
     return out
 
 

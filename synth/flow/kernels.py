@@ -1,27 +1,39 @@
-"""Compiled loops over pixels for warping, derivatives and means; all arrays are float32."""
+"""Warping, derivatives and means of pictures; all arrays are float32."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from synth.arrays import Map
-from synth.system.jit import vectorised
+from synth.arrays import Ints, Map
+from synth.system.jit import argument_types, vectorised
 
-_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_EIGHT, _TWELFTH = np.float32(8), np.float32(1 / 12)
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+_SLOPE = np.array([1, -8, 0, 8, -1], np.float32) / np.float32(12)
+_SAME = np.ones(1, np.float32)
+_BORDER = 4  # px around a picture that is sampled, so that no sample needs a test
 _VISIBLE = np.float32(0.9)  # least interpolated weight of the pixels read, relative to the largest
 _CUBIC = np.float32(-0.75)  # free parameter of bicubic interpolation, as in PyTorch and OpenCV
 
 
-@vectorised
 def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> None:
     """See `image.warp`: now, usable (H, W), flow (2, H, W) px; writes warped and visible (H, W)."""
-    height, width = now.shape
-    a, border = _CUBIC, 4
-    picture, known = _padded(now, border), np.zeros((height + 2 * border, width + 2 * border), np.float32)
-    known[border : height + border, border : width + border] = usable
+    picture = cv2.copyMakeBorder(now, *(_BORDER,) * 4, cv2.BORDER_REPLICATE)
+    known = cv2.copyMakeBorder(usable, *(_BORDER,) * 4, cv2.BORDER_CONSTANT)
+    width = now.shape[1]
     weights, share = np.empty((2, 4, width), np.float32), np.empty((2, width), np.float32)
-    whole, last = np.empty((2, width), np.uint32), (width + 1, height + 1)
+    _sample(picture, known, flow, weights, share, np.empty((2, width), np.uint32), warped, visible)
+
+
+@argument_types("f4[:,::1], f4[:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,::1], u4[:,::1], f4[:,::1], f4[:,::1]")
+@vectorised
+def _sample(
+    picture: Map, known: Map, flow: Map, weights: Map, share: Map, whole: Ints, warped: Map, visible: Map
+) -> None:
+    """Samples padded pictures; `weights` (2, 4, W), `share` and `whole` (2, W) are space for a row."""
+    height, width = warped.shape
+    a, border = _CUBIC, _BORDER
+    last = (width + 1, height + 1)
     for y in range(height):
         # Weights are computed in a loop of their own, because it vectorises and the sampling does not.
         for c in range(2):
@@ -49,68 +61,31 @@ def warp_into(now: Map, usable: Map, flow: Map, warped: Map, visible: Map) -> No
             visible[y, x] = most if some > _VISIBLE * most else _ZERO
 
 
-@vectorised
 def differentiate(field: Map, dx: Map, dy: Map) -> None:
     """Fourth-order central differences of field (H, W) by x and y into dx and dy (H, W)."""
-    padded = _padded(field, 2)
-    height, width = dx.shape
-    for y in range(height):
-        for x in range(width):
-            right, left = padded[y + 2, x + 3], padded[y + 2, x + 1]
-            dx[y, x] = (_EIGHT * (right - left) - (padded[y + 2, x + 4] - padded[y + 2, x])) * _TWELFTH
-            below, above = padded[y + 3, x + 2], padded[y + 1, x + 2]
-            dy[y, x] = (_EIGHT * (below - above) - (padded[y + 4, x + 2] - padded[y, x + 2])) * _TWELFTH
+    cv2.sepFilter2D(field, cv2.CV_32F, _SLOPE, _SAME, dst=dx, borderType=cv2.BORDER_REPLICATE)
+    cv2.sepFilter2D(field, cv2.CV_32F, _SAME, _SLOPE, dst=dy, borderType=cv2.BORDER_REPLICATE)
 
 
-@vectorised
-def _padded(field: Map, border: int) -> Map:
-    """`field` (H, W) padded by `border` repeated pixels on every side."""
-    height, width = field.shape
-    padded = np.empty((height + 2 * border, width + 2 * border), np.float32)
-    for y in range(height + 2 * border):
-        row = field[min(max(y - border, 0), height - 1)]
-        padded[y, :border], padded[y, border : width + border] = row[0], row
-        padded[y, width + border :] = row[width - 1]
-    return padded
+def box_into(field: Map, side: int, out: Map) -> None:
+    """See `image.box`: means of field (N, H, W) over squares of `side` pixels, into `out`."""
+    window = np.full(side, 1 / side, np.float32)
+    for plane, mean in zip(field, out, strict=True):
+        cv2.sepFilter2D(plane, cv2.CV_32F, window, window, dst=mean, borderType=cv2.BORDER_CONSTANT)
+    radius = side // 2
+    for whole in (out.swapaxes(1, 2), out):  # along columns, then along rows
+        size = whole.shape[2]
+        for x in (*range(min(radius, size)), *range(max(size - radius, radius), size)):
+            inside = min(x, radius) + 1 + min(size - 1 - x, radius)
+            whole[:, :, x] *= np.float32(side / inside)
 
 
-@vectorised
-def box_into(field: Map, across: tuple[int, ...], out: Map) -> None:
-    """See `image.box`: means of field (N, H, W) over squares of `len(across)` pixels, into `out`.
-
-    The length of a tuple is a compile-time constant, so sums over it are unrolled: six times as fast.
-    """
-    count, height, width = field.shape
-    radius = len(across) // 2
-    column, share = np.zeros(width + 2 * radius, np.float32), np.empty(width, np.float32)
-    for x in range(width):
-        share[x] = _ONE / np.float32(min(x, radius) + min(width - 1 - x, radius) + 1)
-    for n in range(count):
-        for y in range(height):
-            part = _ONE / np.float32(min(y, radius) + min(height - 1 - y, radius) + 1)
-            for x in range(width):
-                total = _ZERO
-                for k in range(len(across)):
-                    row = y + k - radius
-                    total += np.float32(0 <= row < height) * field[n, min(max(row, 0), height - 1), x]
-                column[radius + x] = total * part
-            for x in range(width):
-                total = _ZERO
-                for k in range(len(across)):
-                    total += column[x + k]
-                out[n, y, x] = total * share[x]
-
-
-@vectorised
 def halve_into(field: Map, out: Map) -> None:
     """See `image.halved`: means of field (N, H, W) over 2 x 2 pixels, fewer at an odd border, into `out`."""
-    count, height, width = field.shape
-    for n in range(count):
-        for y in range(out.shape[1]):
-            top, below = 2 * y, min(2 * y + 1, height - 1)
-            for x in range(width // 2):
-                upper = field[n, top, 2 * x] + field[n, top, 2 * x + 1]
-                lower = field[n, below, 2 * x] + field[n, below, 2 * x + 1]
-                out[n, y, x] = (upper + lower) * np.float32(0.25)
-            if width % 2:
-                out[n, y, width // 2] = (field[n, top, width - 1] + field[n, below, width - 1]) * _HALF
+    height, width = out.shape[1:]
+    spare = 2 * height - field.shape[1], 2 * width - field.shape[2]
+    for plane, half in zip(field, out, strict=True):
+        even = (
+            cv2.copyMakeBorder(plane, 0, spare[0], 0, spare[1], cv2.BORDER_REPLICATE) if any(spare) else plane
+        )
+        cv2.resize(even, (width, height), dst=half, interpolation=cv2.INTER_AREA)

@@ -25,7 +25,7 @@ import numpy as np
 from synth.arrays import Map, Mask, Pixels
 from synth.flow import confidence, correction, image, kernels
 from synth.flow.image import Level
-from synth.system.jit import vectorised
+from synth.system.jit import argument_types, vectorised
 
 _BETTER = 1.025  # factor in agreement by which the guess for large motion must exceed that for small motion
 _AGREED = 0.6  # agreement below which the confidence of the network is lowered
@@ -231,6 +231,7 @@ def steepness(flow: Map) -> Map:
     return found
 
 
+@argument_types("f4[:,:,::1], f4[:,:,::1], f4[:,::1], f4[:,::1], f4[:,:,::1], f4[::1], f4[:,:,::1]")
 @vectorised
 def linearise(before: Map, after: Map, mask: Map, weight: Map, flow: Map, numbers: Map, state: Map) -> None:
     """Computes the proximal map of the data term, affine in (v_x, v_y), and the factor 1 / (1 + sigma h).
@@ -282,7 +283,6 @@ def new_state(height: int, width: int) -> Map:
     return state
 
 
-@vectorised
 def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
     """`steps` of Chambolle and Pock's algorithm 1 on a flow (2, H, W) px, in place.
 
@@ -291,13 +291,19 @@ def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
     see `new_state`; `tau`: primal step; the dual step sigma is 1 / (8 tau).
     """
     height, width = flow.shape[1:]
-    wide = state.shape[2] - _LANES
     sigma = _ONE / (_EIGHT * tau)
-    sigma_x = np.full(wide, sigma)  # the dual of the last column stays 0: no gradient crosses the border
-    sigma_x[width - 1 :] = _ZERO
+    sigma_x = np.full(state.shape[2] - _LANES, sigma)
+    sigma_x[width - 1 :] = _ZERO  # the dual of the last column stays 0: no gradient crosses the border
+    state[:2, :height, :width] = state[2:4, :height, :width] = flow
+    _descend(state, height, tau, sigma, sigma_x, steps)
+    flow[:] = state[:2, :height, :width]
+
+
+@argument_types("f4[:,:,::1], i8, f4, f4, f4[::1], i8")
+@vectorised
+def _descend(state: Map, height: int, tau: np.float32, sigma: np.float32, sigma_x: Map, steps: int) -> None:
+    wide = len(sigma_x)
     now, ahead, px, py, prox, shrink = state[:2], state[2:4], state[4:6], state[6:8], state[8:13], state[13]
-    now[:, :height, :width] = flow
-    ahead[:, :height, :width] = flow
     for sweep in range(height + steps - 1):
         for k in range(max(0, sweep - height + 1), min(steps, sweep + 1)):
             y = sweep - k
@@ -319,7 +325,6 @@ def primal_dual(flow: Map, state: Map, tau: np.float32, steps: int) -> None:
                 new_v = prox[1, y, x] * b + prox[2, y, x] * a - prox[4, y, x]
                 now[0, y, x], now[1, y, x] = new_u, new_v
                 ahead[0, y, x], ahead[1, y, x] = _TWO * new_u - u, _TWO * new_v - v
-    flow[:] = now[:, :height, :width]
 
 
 def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float) -> float:
@@ -329,6 +334,7 @@ def noise_weight(before: Map, after: Map, mask: Map, gamma: float, noise: float)
     return noise**2 / max(float(np.partition(square, middle)[middle]), 1e-12) if len(square) else 1.0
 
 
+@argument_types("f4[:,:,::1], f4[:,:,::1], f4[:,::1], f4")
 @vectorised
 def _squares(before: Map, after: Map, mask: Map, gamma: np.float32) -> Map:
     """|r|^2 at every other pixel of every other row, inside the mask."""

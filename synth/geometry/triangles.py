@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from synth.arrays import Array, Floats, Indices
-from synth.system.jit import compiled
+from synth.system.jit import argument_types, as_constant, compiled
 
 
 class Shape(NamedTuple):
@@ -57,7 +57,7 @@ def normals(shape: Shape) -> Floats:
 
     Summed in the order of the faces: the renderer's own sum over threads is not reproducible.
     """
-    total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), shape.faces)
+    total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), as_constant(shape.faces))
     length = lengths(total)[:, None]
     flat = length[:, 0] < 1e-12
     total[flat] = [0.0, 0.0, 1.0]
@@ -65,6 +65,7 @@ def normals(shape: Shape) -> Floats:
     return np.asarray(total / length)
 
 
+@argument_types("f8[:,::1], Array(i4, 2, 'C', readonly=True)")
 @compiled
 def _area_weighted(vertices: Floats, faces: Indices) -> Floats:
     total = np.zeros_like(vertices)

@@ -23,7 +23,6 @@ from synth.render.materials import Body, Metal, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
-from synth.system.jit import vectorised
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -275,7 +274,10 @@ class Renderer:
         normal = normals(Shape(state.vertices, tissue.faces))
         irradiance = np.zeros((len(normal), 3))  # as radiance of a white diffuser at vertices, unshadowed
         for lamp in self.content.lamps:
-            _add_light(state.vertices, normal, lamp.position, lamp.intensity, irradiance)
+            ray = lamp.position - state.vertices
+            square = np.einsum("vc,vc->v", ray, ray)
+            facing = np.maximum(np.einsum("vc,vc->v", normal, ray) / np.sqrt(square), 0)
+            irradiance += (facing / (np.pi * square))[:, None] * lamp.intensity
         light_in = truth.blend(tissue.faces, face, bary, state.power * irradiance)
         spot = self._spot(state.camera or self.camera).ravel()[on]
         diffuse = spot * _mean(albedo * light_in)
@@ -288,15 +290,3 @@ class Renderer:
 def _mean(colour: Array) -> Array:
     """Mean (N,) of colours (N, 3), in their type; over so short an axis `np.mean` takes ten times as long."""
     return np.asarray((colour[:, 0] + colour[:, 1] + colour[:, 2]) / colour.dtype.type(3))
-
-
-@vectorised
-def _add_light(vertices: Floats, normal: Floats, lamp: Floats, intensity: Floats, total: Floats) -> None:
-    """Adds a white diffuser's radiance by a lamp at vertices to `total` (V, 3), in NumPy's order of sums."""
-    for n in range(len(vertices)):
-        x, y, z = lamp[0] - vertices[n, 0], lamp[1] - vertices[n, 1], lamp[2] - vertices[n, 2]
-        distance = np.sqrt(x * x + y * y + z * z)
-        facing = max((normal[n, 0] * x + normal[n, 2] * z + normal[n, 1] * y) / distance, 0.0)
-        share = facing / (np.pi * (distance * distance))
-        for k in range(3):
-            total[n, k] += share * intensity[k]

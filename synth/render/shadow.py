@@ -8,7 +8,6 @@ storage ray/triangle intersection", 1997).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from synth.arrays import Array, Floats, Indices, Ints, Map
 from synth.geometry.triangles import Shape, joined, normals
 from synth.render.materials import Lamp
 from synth.render.truth import Hits, Size, blend
-from synth.system.jit import compiled
+from synth.system.jit import compiled, inlined
 
 _RAYS = 32  # per lamp
 _GOLDEN = np.pi * (3 - np.sqrt(5))
@@ -86,33 +85,56 @@ def _add_light(
                 light[i, 1] += share
 
 
-@compiled
 def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) -> Array:
     """Bits (N,) of the rays from points on a window (S, 2) to points (N, 3) that faces stop, lamp axes.
 
     All is projected from the window's middle onto a plane across the lamp's axis, where points are sorted
     into cells. There a ray to a point at depth z is, at depth d, within radius (1/d - 1/z) of the point.
     """
-    count, start_x, start_y = len(points), start[:, 0].copy(), start[:, 1].copy()
-    every = (np.uint64(1) << np.uint64(len(start))) - np.uint64(1)
-    bits = np.zeros(count, np.uint64)
-    ahead = points[:, 2] > _NEAR_MM
-    if not ahead.any():
+    bits, ahead = np.zeros(len(points), np.uint64), np.flatnonzero(points[:, 2] > _NEAR_MM)
+    if not len(ahead):
         return bits
     plane = points[ahead, 2].mean()
     radius = plane * np.sqrt((start * start).sum(axis=1).max()) * 1.0001
-    x, y = points[:, 0] * plane / points[:, 2], points[:, 1] * plane / points[:, 2]
-    left, top = x[ahead].min(), y[ahead].min()
-    wide, high = x[ahead].max() - left, y[ahead].max() - top
-    cell = max(_CELL * np.sqrt(wide * high / count), max(wide, high) / 2000, 1e-9)
-    columns, rows = int(wide / cell) + 1, int(high / cell) + 1
-    number = np.full(count, -1)
+    flat = points[:, :2] * plane / points[:, 2:]
+    low, size = flat[ahead].min(axis=0), np.ptp(flat[ahead], axis=0)
+    cell = max(_CELL * np.sqrt(size.prod() / len(points)), size.max() / 2000, 1e-9)
+    columns, rows = (size / cell).astype(np.int64) + 1
+    column, row = ((flat[ahead] - low) / cell).astype(np.int64).T
+    number = row * columns + column
     deepest = np.full(columns * rows, _NEAR_MM)
-    for i in range(count):
-        if ahead[i]:
-            number[i] = int((y[i] - top) / cell) * columns + int((x[i] - left) / cell)
-            deepest[number[i]] = max(deepest[number[i]], points[i, 2])
-    order, first = _sorted(number, columns * rows)
+    np.maximum.at(deepest, number, points[ahead, 2])
+    order = ahead[np.argsort(number, kind="stable")]
+    first = np.append(0, np.cumsum(np.bincount(number, minlength=columns * rows)))
+    view, cells = np.array([plane, radius, *low, *size, cell]), (deepest, order, first)
+    space = np.ascontiguousarray(start.T), points, np.ascontiguousarray(flat.T), vertices, faces
+    _stop(*space, view, *cells, columns, bits)
+    return bits
+
+
+@compiled
+def _stop(
+    start: Floats,
+    points: Floats,
+    flat: Floats,
+    vertices: Floats,
+    faces: Indices,
+    view: Floats,
+    deepest: Floats,
+    order: Ints,
+    first: Ints,
+    columns: int,
+    bits: Array,
+) -> None:
+    """Sets the bits of the rays that faces stop.
+
+    `start` (2, S), `flat` (2, N): points on the window, and on the plane; `view`: the plane's depth, the
+    radius, and the cells' left, top, whole width, whole height and side; `deepest` of each cell, `order` of
+    the points and `first` of each cell's among them.
+    """
+    plane, radius, left, top, wide, high, cell = view
+    start_x, start_y, x, y = start[0], start[1], flat[0], flat[1]
+    every = (np.uint64(1) << np.uint64(len(start_x))) - np.uint64(1)
     last = deepest.max()
     for f in range(len(faces)):
         a, b, c = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
@@ -134,30 +156,15 @@ def _blocked(start: Floats, points: Floats, vertices: Floats, faces: Indices) ->
                 away = x1 < x2 or x0 > x2 + cell + 2 * reach or y1 < y2 or y0 > y2 + cell + 2 * reach
                 if away or deepest[n] <= nearest:
                     continue
-                for i in order[first[n] : first[n + 1]]:
+                for k in range(first[n], first[n + 1]):
+                    i = order[k]
                     reach = radius * (1 / nearest - 1 / points[i, 2]) + _HAIR_MM
                     across = x0 - reach <= x[i] <= x1 + reach and y0 - reach <= y[i] <= y1 + reach
                     if across and points[i, 2] > nearest and bits[i] != every:
                         bits[i] |= _stopped(start_x, start_y, points[i], a, b, c)
-    return bits
 
 
-@compiled
-def _sorted(number: Ints, cells: int) -> tuple[Ints, Ints]:
-    """Indices of points in the order of their cells (N,), -1 for none, and where each cell begins."""
-    first = np.zeros(cells + 1, np.int64)
-    for one in number:
-        first[one + 1] += one >= 0
-    first = np.cumsum(first)
-    order, filled = np.empty(first[-1], np.int64), first[:-1].copy()
-    for i in range(len(number)):
-        if number[i] >= 0:
-            order[filled[number[i]]] = i
-            filled[number[i]] += 1
-    return order, first
-
-
-@partial(compiled, inline="always")
+@inlined
 def _stopped(x: Floats, y: Floats, point: Floats, a: Floats, b: Floats, c: Floats) -> np.uint64:
     """Bits of the rays from points x, y (S,) on a window to a point (3,) that a triangle stops."""
     e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]

@@ -17,7 +17,7 @@ from synth.arrays import Array, Floats, Indices, Ints, Map, Mask
 from synth.geometry.triangles import Shape, joined, lengths, normals
 from synth.render.camera import camera as cameras
 from synth.render.camera.camera import Camera
-from synth.system.jit import compiled
+from synth.system.jit import argument_types, as_constant, compiled
 
 Size = tuple[int, int]
 """Width, height [px]."""
@@ -169,7 +169,7 @@ def at_rest_pixels(rest: RestFrame, faces: Indices, nodal: Floats) -> Map:
 def blend(faces: Indices, face: Indices, bary: Floats, nodal: npt.NDArray[np.floating]) -> Floats:
     """A quantity of vertices (V, C) at points on triangles: indices (N,), weights (N, 3); 0 where `face` is
     negative or beyond `faces`."""
-    return _blend(faces, face, bary, np.ascontiguousarray(nodal, np.float64))
+    return _blend(as_constant(faces), face, bary, np.ascontiguousarray(nodal, np.float64))
 
 
 def _picture(on: Mask, values: Array, camera: Camera, kind: type = np.float32) -> Array:
@@ -195,6 +195,7 @@ def _footprint(camera: Camera, corners: Floats, directions: Floats, on: Mask, al
     return np.asarray(np.linalg.norm(np.cross(one, other), axis=1))
 
 
+@argument_types("f8[:,::1], f8[:,::1], i4[:,::1], f8[:,::1], i8[::1], i8[::1], UniTuple(i8, 2)")
 @compiled
 def _cast(
     points: Floats, flat: Floats, faces: Indices, directions: Floats, order: Ints, start: Ints, size: Size
@@ -256,6 +257,7 @@ def _cast(
     return face, bary, best
 
 
+@argument_types("Array(i4, 2, 'C', readonly=True), i4[::1], f8[:,::1], f8[:,::1]")
 @compiled
 def _blend(faces: Indices, face: Indices, bary: Floats, nodal: Floats) -> Floats:
     found = np.zeros((len(face), nodal.shape[1]))

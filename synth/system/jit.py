@@ -1,4 +1,8 @@
-"""Compilation of hot loops by numba, cached on disk where possible."""
+"""Compilation of hot loops by numba, cached on disk where possible.
+
+What a loop costs to compile is mostly numba's own typing of it: 0.2 to 1.5 s. Slices that are assigned
+(`a[:] = b`) cost 0.6 to 2 s more, since the message for wrong shapes is compiled with them: write a loop.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,19 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from llvmlite import binding
+from numba.core.sigutils import normalize_signature
 
+from synth.arrays import Array
 from synth.system import cache
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+LOOPS: list[tuple[Any, str]] = []
+"""Loops and the types of their arguments, of the modules that are imported, see `argument_types`."""
+
+_TARGET = "x86-64-v3"
+_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")  # of it, beyond those of v2
 
 
 def compiled(function: F, **how: str) -> F:
@@ -36,3 +49,53 @@ def compiled(function: F, **how: str) -> F:
 def vectorised(function: F) -> F:
     """As `compiled`, for loops over pixels: x / 0 is inf or nan; Python's exception would prevent vectors."""
     return compiled(function, error_model="numpy")
+
+
+def inlined(function: F) -> F:
+    """A part of the compiled functions in its file: written into them, so that it isn't compiled itself."""
+    return numba.njit(inline="always")(function)  # type: ignore[no-any-return]
+
+
+def argument_types(types: str) -> Callable[[F], F]:
+    """Decorates a compiled function that every dataset needs: `compile_loops` compiles it for these types."""
+
+    def note(function: F) -> F:
+        LOOPS.append((function, types))
+        return function
+
+    return note
+
+
+def as_constant(array: Array) -> Array:
+    """A view that can't be written to. A loop is compiled for both kinds of arrays unless it gets one."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def compile_loops(part: int, parts: int) -> None:
+    """Compiles one of `parts` of equal work of `LOOPS`, or loads them if they are in the cache."""
+    largest_first = sorted(LOOPS, key=lambda loop: -len(loop[0].py_func.__code__.co_code))
+    for function, types in largest_first[part::parts]:
+        # As a tuple of types: numba's cache takes what it is given as the key.
+        function.compile(normalize_signature(f"({types})")[0])
+
+
+def target() -> str:
+    """The processor that loops are compiled for.
+
+    It is x86-64-v3 where that runs, so that such machines compute the same bits and can share a cache; as
+    fast as the host's own name here. `NUMBA_CPU_NAME` overrides it.
+    """
+    name: str | None = numba.config.CPU_NAME
+    return name or str(binding.get_host_cpu_name())
+
+
+def _choose_target() -> None:
+    with suppress(RuntimeError):  # LLVM doesn't know this processor
+        has = binding.get_host_cpu_features()
+        if numba.config.CPU_NAME is None and all(has.get(name) for name in _FEATURES):
+            numba.config.CPU_NAME, numba.config.CPU_FEATURES = _TARGET, ""
+
+
+_choose_target()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.arrays import Array, Floats, Ints
-from synth.system.jit import compiled
+from synth.system.jit import compiled, inlined
 
 _LEAF = 24
 _FAR = 2.5  # cluster radii from which a dipole is accurate: the error stays below 0.01 of a turn
@@ -84,7 +84,7 @@ def _number(
     return out
 
 
-@compiled
+@inlined
 def _solid_angle(t: Floats, x: float, y: float, z: float) -> float:
     """Solid angle of a triangle at a point (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 1983)."""
     ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z

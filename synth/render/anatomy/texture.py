@@ -21,7 +21,6 @@ from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance.family import Appearance
 from synth.render.materials import Coat
 from synth.system import checked_file
-from synth.system.jit import vectorised
 
 Tubes = dict[str, tuple[Map, Map]]
 Random = np.random.Generator
@@ -114,20 +113,8 @@ def normals(height: Map, extent_mm: float) -> Map:
     pixel = extent_mm / height.shape[0]
     dx = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * pixel))
     dy = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * pixel))
-    found = np.empty((*height.shape, 3), np.float32)
-    _tilt(dx, dy, found)
-    return found
-
-
-@vectorised
-def _tilt(dx: Map, dy: Map, normal: Map) -> None:
-    """Unit normals (n, n, 3) of slopes dx, dy (n, n)."""
-    one = np.float32(1)
-    for y in range(dx.shape[0]):
-        for x in range(dx.shape[1]):
-            a, b = dx[y, x], dy[y, x]
-            length = np.sqrt(one + a * a + b * b)
-            normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = -a / length, -b / length, one / length
+    up = 1 / np.sqrt(1 + dx * dx + dy * dy)
+    return np.asarray(cv2.merge([-dx * up, -dy * up, up]), np.float32)
 
 
 def thickness(tube: tuple[Map, Map]) -> Map:

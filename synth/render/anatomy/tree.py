@@ -13,12 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Ints
-from synth.system.jit import compiled
 
 _ROUNDS = 3  # of routing; more change little
 _WAYS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))  # to neighbours on the lattice
@@ -72,7 +71,7 @@ def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floa
         found = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
         distance, before = found[0], found[1].astype(np.int64)
         order = np.argsort(distance, kind="stable")
-        through = _gathered(order, before, cubes)
+        through = _gathered(before, cubes)
         shared = cost / (1 + sharing * np.cbrt(through) / finest)
     used = order[through[order] > 0]
     number = np.full(count + 1, -1)
@@ -81,13 +80,14 @@ def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floa
     return Tree(way.points[used], parent, np.cbrt(through[used]))
 
 
-@compiled
-def _gathered(order: Ints, before: Ints, cubes: Floats) -> Floats:
-    """Sums (N,) of the cubes at a point and at all that come after it."""
-    total = cubes.copy()
-    for k in range(len(order) - 1, -1, -1):
-        if before[order[k]] >= 0:
-            total[before[order[k]]] += total[order[k]]
+def _gathered(before: Ints, cubes: Floats) -> Floats:
+    """Sums (N,) of the cubes at a point and at all that come after it; `before`: negative at a root."""
+    total, point = cubes.copy(), np.flatnonzero(cubes)
+    amount = cubes[point]
+    while len(point):  # all ends go up together, a point at a time
+        inner = before[point] >= 0
+        point, amount = before[point[inner]], amount[inner]
+        np.add.at(total, point, amount)
     return total
 
 
@@ -101,44 +101,35 @@ def halved(tree: Tree) -> Tree:
     return Tree(between, parent, np.repeat(tree.radius, 2))
 
 
-@compiled
 def relaxed(nodes: Floats, parent: Ints, radius: Floats, stiff: float, rounds: int) -> Floats:
     """Nodes (N, 2) mm drawn to their neighbours' mean by springs r^2.
 
     Vessels of radius `stiff` mm and wider move fully in each round, finer ones in proportion; ends stay.
     """
-    x, y, count = nodes[:, 0].copy(), nodes[:, 1].copy(), len(nodes)
-    free = np.zeros(count, np.bool_)
-    for k in range(count):
-        free[parent[k]] |= parent[k] >= 0 and parent[parent[k]] >= 0
+    count, child = len(nodes), np.flatnonzero(parent >= 0)
+    up, tension = parent[child], radius[child] ** 2
+    ends = np.concatenate([child, up]), np.concatenate([up, child])
+    springs: csr_array = coo_array((np.tile(tension, 2), ends), shape=(count, count)).tocsr()
+    weight = springs.sum(axis=1)
+    free = (parent >= 0) & (np.bincount(up, minlength=count) > 0)
+    rate = np.where(free, 0.5 * np.minimum(1, radius / stiff) / np.where(free, weight, 1), 0)
+    move = (diags_array(rate) @ (springs - diags_array(weight))).tocsr()
     for _ in range(rounds):
-        pull_x, pull_y, weight = np.zeros(count), np.zeros(count), np.zeros(count)
-        for k in range(count):
-            p = parent[k]
-            if p >= 0:
-                tension = radius[k] * radius[k]
-                pull_x[k] += tension * (x[p] - x[k])
-                pull_y[k] += tension * (y[p] - y[k])
-                pull_x[p] += tension * (x[k] - x[p])
-                pull_y[p] += tension * (y[k] - y[p])
-                weight[k] += tension
-                weight[p] += tension
-        for k in range(count):
-            if free[k]:
-                rate = 0.5 * min(1.0, radius[k] / stiff) / weight[k]
-                x[k] += rate * pull_x[k]
-                y[k] += rate * pull_y[k]
-    return np.stack((x, y), axis=1)
+        nodes = nodes + move @ nodes
+    return nodes
 
 
-@compiled
 def remaining(nodes: Floats, parent: Ints, beyond: Floats) -> Floats:
     """Length (N,) mm from each node to the farthest end that it supplies, `beyond` (N,) mm longer there."""
-    left = beyond.copy()
-    for k in range(len(nodes) - 1, -1, -1):
-        p = parent[k]
-        if p >= 0:
-            left[p] = max(left[p], left[k] + np.hypot(nodes[k, 0] - nodes[p, 0], nodes[k, 1] - nodes[p, 1]))
+    left, length = beyond.copy(), np.hypot(*(nodes - nodes[parent]).T)
+    waiting = np.bincount(parent[parent >= 0], minlength=len(nodes))  # children that aren't done
+    done = np.flatnonzero(waiting == 0)
+    while len(done := done[parent[done] >= 0]):
+        up = parent[done]
+        np.maximum.at(left, up, left[done] + length[done])
+        np.subtract.at(waiting, up, 1)
+        up = np.unique(up)
+        done = up[waiting[up] == 0]
     return left
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from synth.arrays import Floats, Ints, Map
 from synth.render.anatomy.tree import Tree
-from synth.system.jit import vectorised
+from synth.system.jit import argument_types, vectorised
 
 
 def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float = 0.5) -> tuple[Map, Map]:
@@ -19,6 +19,7 @@ def raster(tree: Tree, pixels: int, extent_mm: float, margin_mm: float = 0.5) ->
     return distance, radius
 
 
+@argument_types("f8[:,::1], i8[::1], f8[::1], f8, f8, f4[:,::1], f4[:,::1]")
 @vectorised
 def _draw(
     at: Floats, parent: Ints, wide: Floats, scale: float, margin: float, distance: Map, radius: Map

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 
 from synth.arrays import Map, Pixels
 from synth.render.camera.colour_processing import KNOTS, PLAIN, Curve, Curves, Matrix, encoded
-from synth.system.jit import vectorised
+from synth.system.jit import argument_types, vectorised
 
 _HEADROOM = KNOTS[-1]  # saturation of the sensor, in full scales
 _STEPS = 4096  # of the tabulated tone curves per full scale
@@ -99,6 +99,7 @@ def _table(curve: Curve) -> Map:
     return np.asarray(curve_of(levels), np.float32)
 
 
+@argument_types("f4[:,:,::1], f4, f4, f4, f4[::1], f4[:,:,::1]")
 @vectorised
 def _convert(
     light: Map, well: np.float32, read: np.float32, steps: np.float32, white: Map, noise: Map
@@ -146,6 +147,7 @@ def _scatter(light: Map, share: float) -> Map:
     return np.asarray((1 - share) * light + share * halo, np.float32)
 
 
+@argument_types("f4[:,:,::1], f4[:,::1], f4[::1], f4[::1], f4[::1], f4[:,:,::1]")
 @vectorised
 def _look_up(linear: Map, matrix: Map, red: Map, green: Map, blue: Map, video: Map) -> None:
     """Writes to `video` a matrix (3, 3) on linear (H, W, 3), then tabulated curves."""

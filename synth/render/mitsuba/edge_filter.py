@@ -13,7 +13,7 @@ import numpy as np
 
 from synth.arrays import Map
 from synth.render.mitsuba.direct_light import Light
-from synth.system.jit import vectorised
+from synth.system.jit import argument_types, vectorised
 
 _REACH, _STEPS = 4, 4  # px along an edge at least, and steps to either side
 _ALONG, _ACROSS = 0.5, 0.2  # added reach, and standard deviation of an average, in radii of confusion
@@ -81,18 +81,10 @@ def _smooth(planes: Map, radius: Map) -> Map:
     found = np.zeros_like(planes)
     for k in range(int(np.ceil(level.max())) + 1):
         size = sizes[k], sizes[k]
-        _mix(found, planes if k == 0 else cv2.blur(cv2.blur(planes, size), size), level, k)
+        mean = planes if k == 0 else cv2.blur(cv2.blur(planes, size), size)
+        near = np.abs(level - k) < 1
+        found[near] += (1 - np.abs(level[near] - k))[:, None] * mean[near]
     return found
-
-
-@vectorised
-def _mix(found: Map, planes: Map, level: Map, k: int) -> None:
-    for y in range(level.shape[0]):
-        for x in range(level.shape[1]):
-            weight = 1 - abs(level[y, x] - k)
-            if weight > 0:
-                for c in range(planes.shape[2]):
-                    found[y, x, c] += np.float32(weight) * planes[y, x, c]
 
 
 def _along(share: Map, radius: Map) -> Map:
@@ -104,35 +96,34 @@ def _along(share: Map, radius: Map) -> Map:
     x, y = cv2.Sobel(share, -1, 1, 0, scale=0.125), cv2.Sobel(share, -1, 0, 1, scale=0.125)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _SIGMA_PX) for product in (x * x, x * y, y * y))
     along = np.zeros((2, *share.shape), np.float32)
-    _point(xx, xy, yy, radius, along)
+    whole = xx + yy
+    y, x = np.nonzero(whole > _FLAT / (1 + radius) ** 2)
+    radius, whole, xx, xy, yy = (plane[y, x] for plane in (radius, whole, xx, xy, yy))
+    # The average ends at the picture's border.
+    border = np.minimum(np.minimum(x, share.shape[1] - 1 - x), np.minimum(y, share.shape[0] - 1 - y))
+    reach = np.minimum(_REACH + _ALONG * radius, border) * np.hypot(xx - yy, 2 * xy) / whole
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
+    along[:, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
     return along
 
 
-@vectorised
-def _point(xx: Map, xy: Map, yy: Map, radius: Map, along: Map) -> None:
-    height, width = xx.shape
-    for y in range(height):
-        for x in range(width):
-            whole = xx[y, x] + yy[y, x]
-            if whole > _FLAT / (1 + radius[y, x]) ** 2:
-                apart = np.sqrt((xx[y, x] - yy[y, x]) ** 2 + 4 * xy[y, x] ** 2)
-                turn = 0.5 * np.arctan2(2 * xy[y, x], xx[y, x] - yy[y, x])
-                # The average ends at the picture's border.
-                most = _REACH + _ALONG * radius[y, x]
-                reach = min(most, x, y, width - 1 - x, height - 1 - y) * apart / whole
-                along[0, y, x], along[1, y, x] = -np.sin(turn) * reach, np.cos(turn) * reach
-
-
-@vectorised
 def _averaged(planes: Map, along: Map) -> Map:
     """Planes (H, W, C) averaged over vectors (2, H, W) px and their opposites."""
+    found = planes.copy()
+    _average(planes, along, np.empty(planes.shape[2], np.float32), found)
+    return found
+
+
+@argument_types("f4[:,:,::1], f4[:,:,::1], f4[::1], f4[:,:,::1]")
+@vectorised
+def _average(planes: Map, along: Map, total: Map, found: Map) -> None:
     height, width, count = planes.shape
-    found, total = planes.copy(), np.zeros(count, np.float32)
     for y in range(height):
         for x in range(width):
             if along[0, y, x] == 0 and along[1, y, x] == 0:
                 continue
-            total[:] = 0
+            for k in range(count):
+                total[k] = 0
             for step in range(-_STEPS, _STEPS + 1):
                 u = min(max(x + along[0, y, x] * step / _STEPS, 0), width - 1.001)
                 v = min(max(y + along[1, y, x] * step / _STEPS, 0), height - 1.001)
@@ -142,5 +133,5 @@ def _averaged(planes: Map, along: Map) -> Map:
                         weight = (1 - abs(u - left - i)) * (1 - abs(v - top - j)) * (_STEPS + 1 - abs(step))
                         for k in range(count):
                             total[k] += np.float32(weight) * planes[top + j, left + i, k]
-            found[y, x] = total / np.float32((_STEPS + 1) ** 2)
-    return found
+            for k in range(count):
+                found[y, x, k] = total[k] / np.float32((_STEPS + 1) ** 2)
