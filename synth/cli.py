@@ -27,7 +27,8 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
-Source = Annotated[str, Argument(help="A job file, or a named job: tiny, demo, paper.")]
+_NAMED = "tiny, demo, mission, randomized, stereo, in-vivo, ex-vivo-calf, endoscope, paper"
+Source = Annotated[str, Argument(help=f"A job file, or a named job: {_NAMED}.")]
 Overrides = Annotated[list[str] | None, Argument(help="Changes to the job, as section.key=value.")]
 Out = Annotated[Path, Argument(help="A dataset's folder.")]
 Index = Annotated[int, Option("--sequence", "-s", help="Which sequence, by its index.")]
@@ -122,7 +123,12 @@ def schema() -> None:
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Annotated[str, Argument(help="A job file, a named job, or a brain (OBJ, STL, GIfTI, lh.pial...).")],
+    job: Annotated[
+        str,
+        Argument(
+            help="A job file, a named job (see `synth render`), or a brain (OBJ, STL, GIfTI, lh.pial...)."
+        ),
+    ],
     overrides: Overrides = None,
     out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
@@ -311,6 +317,7 @@ def export(
     """Exports a dataset to the format of another library, or as videos."""
     from synth.publish.export.registry import export_dataset
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which removes what is half-written
     options = {}
     if to == "video":
         drawn = overlay and [name for name in overlay if name != "none"]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import math
 import os
 import shutil
 import stat
 import tempfile
+import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -29,6 +31,7 @@ LARGEST_PICTURE, LARGEST_YAML = 512 << 20, 200_000  # bytes
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
 _LARGEST_HEAD = 10_000  # bytes of an array's header, NumPy's own limit
+_OLD_S = 86_400.0  # after which an unfinished folder has been left, where locks can't tell
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
@@ -242,12 +245,53 @@ def part_of(
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[Path]:
-    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created."""
+    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created.
+
+    What an earlier process left of it when it was killed is deleted.
+    """
     if os.path.lexists(path):
         raise UserError(f"{path}: exists already")
     make_folder(path.absolute().parent)
+    _sweep_parts(path)
     with part_of(path, Path.mkdir) as part:
-        yield part
+        descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            _lock(descriptor)  # tells that a process writes to it
+            yield part
+        finally:
+            os.close(descriptor)
+
+
+def _sweep_parts(path: Path) -> None:
+    """Deletes the unfinished folders of `path` that no process writes to any more."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.????????{PART}"):
+        if part.is_symlink() or not part.is_dir():
+            continue
+        with suppress(OSError):
+            descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                free = _lock(descriptor)
+                if free is None:  # no locks here: another machine may write to it
+                    free = (
+                        time.time() - max(one.lstat().st_mtime for one in (part, *part.rglob("*"))) > _OLD_S
+                    )
+                if free:
+                    shutil.rmtree(part)
+            finally:
+                os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether no other process held the lock of a folder, which this one now holds; None without locks."""
+    try:
+        import fcntl  # not on Windows
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return None
+    return True
 
 
 def make_folder(path: Path, space_bytes: int = 0) -> None:
