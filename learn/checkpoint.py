@@ -41,6 +41,7 @@ _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequenc
 _LARGEST_WEIGHTS = 64 << 30
 _WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
+_GAINS, _MODULI, _SCALES = (0.01, 100.0), (1e-3, 1e4), (1e-9, 1e9)  # limits of a card's numbers
 USED = ("fit", "select", "intervals", "start")  # parts of `ModelCard.split` that it must not be scored on
 
 
@@ -122,11 +123,27 @@ def read_card(folder: Path) -> ModelCard:
         if tree.pop("format") != _FORMAT:
             raise UserError(f"{file}: not a Sulcus model")
         check_format(tree.pop("format_version", 1), MODEL, str(file))
-        return _CARD.validate_json(json.dumps(tree), strict=True)
+        card = _CARD.validate_json(json.dumps(tree), strict=True)
+        _refuse_absurd(card, file)
+        return card
     except ValidationError as error:
         raise UserError(f"{file}: damaged or of another version ({first_mistake(error)})") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{file}: corrupt model configuration ({str(error)[:200]})") from None
+
+
+def _refuse_absurd(card: ModelCard, file: Path) -> None:
+    """Raises UserError for a number that no training gives, and that would make every force infinite or 0."""
+    numbers = {
+        "force_gain": (card.force_gain, _GAINS),
+        "typical_young_kpa": (card.typical_young_kpa, _MODULI),
+    }
+    numbers |= {f"scales.{name}": (value, _SCALES) for name, value in vars(card.scales).items()}
+    if card.intervals is not None:
+        numbers["intervals.force_unit"] = card.intervals.force_unit, _SCALES
+    for name, (value, (low, high)) in numbers.items():
+        if not low <= value <= high:
+            raise UserError(f"{file}: {name} {value:g}: must be from {low:g} to {high:g}")
 
 
 def read_tensors(path: Path) -> dict[str, Any]:

@@ -302,13 +302,14 @@ def export_command(
 def models_command(json: Json = False) -> None:
     """List the pretrained networks."""
     from learn.checkpoint import read_card
-    from learn.inference.shipped import MODELS, NAMES, describe, hash_data
+    from learn.inference.shipped import LICENCE, MODELS, NAMES, describe, hash_data
     from synth.system.checked_file import folder_bytes
 
     found = {name: (MODELS / name, read_card(MODELS / name)) for name in NAMES}
     if json:
         rows = [
             {"name": name, "folder": str(folder), "bytes": folder_bytes(folder), "data": hash_data(card)}
+            | {"licence": LICENCE}
             | {"cameras": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
             for name, (folder, card) in found.items()
         ]
@@ -316,3 +317,4 @@ def models_command(json: Json = False) -> None:
         return
     for name, (folder, card) in found.items():
         print(f"{name}: {describe(card)}, {folder_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
+    print(f"licence of the weights: {LICENCE}")

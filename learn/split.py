@@ -80,13 +80,22 @@ def keep_back(clips: Sequence[Clip], split: Split, seed: int) -> Split:
 
 
 def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> tuple[list[Clip], Split]:
-    """All clips, `labels` in the fit part but for copies and for those with a brain of another part."""
+    """All clips, `labels` in the fit part but for copies and for those with a brain of another part.
+
+    UserError: none of them is left.
+    """
     known = {clip.content_hash for clip in clips}
     new = [one for one in labels if one.content_hash not in known]
+    if labels and not new:
+        raise UserError("--labels: holds the training data itself; give a dataset of other sequences")
     every = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
     number = groups(every)
     other = {number[i] for part in (split.select, split.test, split.intervals) for i in part}
-    more = (i for i in range(len(clips), len(every)) if number[i] not in other)
+    more = [i for i in range(len(clips), len(every)) if number[i] not in other]
+    if labels and not more:
+        raise UserError(
+            "--labels: all of its brains are on the other sides of the dataset's split; render others"
+        )
     return every, replace(split, fit=(*split.fit, *more))
 
 

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json as json_
 import signal
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands
+
+if TYPE_CHECKING:
+    from synth.job.schema import Job
 
 app = typer.Typer(
     name="synth",
@@ -23,7 +27,8 @@ app = typer.Typer(
     rich_markup_mode=None,  # "[kPa]" is a unit, not markup
 )
 
-Source = Annotated[str, Argument(help="A job file, or a named job: tiny, demo, paper.")]
+_NAMED = "tiny, demo, mission, randomized, stereo, in-vivo, ex-vivo-calf, endoscope, paper"
+Source = Annotated[str, Argument(help=f"A job file, or a named job: {_NAMED}.")]
 Overrides = Annotated[list[str] | None, Argument(help="Changes to the job, as section.key=value.")]
 Out = Annotated[Path, Argument(help="A dataset's folder.")]
 Index = Annotated[int, Option("--sequence", "-s", help="Which sequence, by its index.")]
@@ -118,7 +123,12 @@ def schema() -> None:
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
 def preview(
-    job: Annotated[str, Argument(help="A job file, a named job, or a brain (OBJ, STL, GIfTI, lh.pial...).")],
+    job: Annotated[
+        str,
+        Argument(
+            help="A job file, a named job (see `synth render`), or a brain (OBJ, STL, GIfTI, lh.pial...)."
+        ),
+    ],
     overrides: Overrides = None,
     out: Annotated[Path, Option("--out", "-o", help="The PNG to write.")] = Path("sheet.png"),
     count: Annotated[int, Option("--count", "-n", min=1, max=100, help="Scenarios to show.")] = 9,
@@ -164,6 +174,26 @@ def preview(
     )
 
 
+def _read_series(job: Job) -> tuple[str, ...]:
+    """Reads the first series of a job with `mechanics.source`, says what it is, and what is doubtful."""
+    if job.mechanics.source is None:
+        return ()
+    from synth.fem.external.read import forget, read_job_series
+
+    series = read_job_series(job, 0)
+    print(f"mechanics.source: {series.summary}", file=sys.stderr)
+    _print_doubts({text: [0] for text in series.cautions})
+    forget()
+    return series.cautions
+
+
+def _print_doubts(cautions: Mapping[str, Sequence[int]]) -> None:
+    """Prints what is doubtful about another program's series, each with the sequences of which it is."""
+    for text, those in cautions.items():
+        of = "" if len(those) == 1 and those[0] == 0 else f" ({len(those)} sequences, first {those[0]:06d})"
+        print(f"warning: mechanics.source: {text}{of}", file=sys.stderr)
+
+
 @app.command(epilog="Example: synth render demo --out out render.spp=8 sequences=100")
 def render(
     job: Source,
@@ -175,23 +205,29 @@ def render(
     ] = "local",
     gpus: Annotated[str, Option(help="GPUs shared by the workers: auto, none, or numbers as 0,1.")] = "auto",
     memory: Annotated[float | None, Option(help="Of each process [GB]; default: its share.")] = None,
+    part: Annotated[
+        str | None, Option(help="One of several runs into a folder, as 3/40 of an array.")
+    ] = None,
     mix_versions: Annotated[bool, Option("--mix-versions", help="Continue another version's data.")] = False,
     retry: Annotated[bool, Option("--retry", help="Compute sequences again that failed before.")] = False,
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 if some of its sequences failed."""
-    from synth.dataset.folder import Folder
+    from synth.dataset.folder import Folder, parse_part
     from synth.engine.journal import RunBars
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends it as Ctrl-C does
     read = load_job(job, overrides or [])
+    doubts = _read_series(read)
+    of = None if part is None else parse_part(part)
     if retry:
-        Folder(out).clear_failures()
-    options = Options(engine=engine, workers=workers, gpus=gpus, memory_gb=memory, mix_versions=mix_versions)
+        Folder(out, of).clear_failures()
+    options = Options(engine, workers, gpus, memory, mix_versions=mix_versions, part=of)
     with RunBars() as bars:
         summary = run_job(read, out, options, bars)
+    _print_doubts({text: those for text, those in summary.cautions.items() if text not in doubts})
     if json:
         print(json_.dumps({**vars(summary), "out": str(out)}))
     else:
@@ -281,6 +317,7 @@ def export(
     """Exports a dataset to the format of another library, or as videos."""
     from synth.publish.export.registry import export_dataset
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # which removes what is half-written
     options = {}
     if to == "video":
         drawn = overlay and [name for name in overlay if name != "none"]

@@ -94,6 +94,10 @@ _TABLE = (
     Field("flow_next", (*_VIDEO, "xy"), "float32", "px",
           "true motion from this frame to the next, on this frame's pixels; 0 off tissue, and at the "
           "end", length=2, stored="extra", half=True, packed=0.4, low=-1e4, high=1e4),
+    Field("flow_next_all", (*_VIDEO, "xy"), "float32", "px",
+          "as flow_next, of all that the pixel shows: tissue, instruments, and what is around the opening; 0 "
+          "where nothing is hit, and at the end",
+          length=2, stored="extra", half=True, packed=0.4, low=-1e4, high=1e4),
     Field("normals", (*_VIDEO, "xyz"), "float32", "-",
           "unit normal of the surface at each pixel of this frame, camera axes; 0 where nothing is hit",
           length=3, stored="extra", packed=0.6, low=-1.001, high=1.001),

@@ -79,7 +79,9 @@ def pack_model(
     shutil.rmtree(folder, ignore_errors=True)
     card = checkpoint.write_model(folder, card, net.state_dict())
     line = shipped.describe(card)
-    rows = {"data (hash of its sequences)": shipped.hash_data(card), "commit": commit, **metrics}
+    licence = f"{shipped.LICENCE}, as of the code: trained on this project's renders alone"
+    rows = {"data (hash of its sequences)": shipped.hash_data(card), "licence": licence, "commit": commit}
+    rows |= metrics
     table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
     bullets = "\n".join(f"- {one}" for one in limits)
     head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"

@@ -10,6 +10,8 @@ from synth.job import identity
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("mono", "stereo")
+LICENCE = "Apache-2.0"
+"""Of the shipped weights, as of the code: they were trained on this project's renders alone."""
 
 
 def find_model(named: Path | str) -> Path:

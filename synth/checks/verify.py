@@ -98,6 +98,8 @@ class VerifyReport:
     sequences: int
     fast: bool
     checks: list[Check]
+    cautions: dict[str, list[int]] = field(default_factory=dict)
+    """What is doubtful about the mechanics of another program, each with the sequences of which it is."""
 
     @property
     def good(self) -> bool:
@@ -109,6 +111,11 @@ class VerifyReport:
         bad = [check.name for check in self.checks if check.bad]
         done = sum(check.count > 0 for check in self.checks)
         found = f"good: {done} checks"
+        if self.cautions:
+            several = "are doubts" if len(self.cautions) > 1 else "is a doubt"
+            found = (
+                f"doubtful: {done} checks hold, but there {several} about the mechanics.source, listed above"
+            )
         if bad:
             found = f"not good: {len(bad)} of {done} checks failed: {', '.join(bad)}"
         for what, some in ("nothing", False), ("in some sequences nothing", True):
@@ -134,7 +141,11 @@ class VerifyReport:
             front = "".join(f"{cell:<{wide}}  " for cell, wide in zip(cells, widths, strict=False))
             table += hang(front, where)
         failures = [f"{check.name}: {failure}" for check in self.checks for failure in check.failures]
-        return [*table, *failures, self.verdict]
+        doubts = [
+            f"doubtful in {len(those)} sequences, first {those[0]}: {text}"
+            for text, those in self.cautions.items()
+        ]
+        return [*table, *failures, *doubts, self.verdict]
 
 
 def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
@@ -161,7 +172,9 @@ def verify_dataset(root: Path, *, fast: bool = False) -> VerifyReport:
             check.add(
                 Nothing("not with --fast" if fast and name == "checksum" else "no sequence is readable"), ""
             )
-    return VerifyReport(str(root), len(sealed), fast, list(checks.values()))
+    return VerifyReport(
+        str(root), len(sealed), fast, list(checks.values()), index.list_cautions(root, sealed)
+    )
 
 
 def check_sequence(

@@ -78,6 +78,13 @@ def gestures_of(attrs: Mapping[str, Any]) -> list[dict[str, Any]]:
     return (attrs.get("scenario") or {}).get("gestures", [])  # type: ignore[no-any-return]
 
 
+def cautions_of(attrs: Mapping[str, Any]) -> list[str]:
+    """What is doubtful about a sequence's mechanics, as another program's files state them."""
+    found = (attrs.get("mechanics") or {}).get("cautions", [])
+    texts = [one[:500] for one in found if isinstance(one, str)] if isinstance(found, list) else []
+    return ["".join(c if c.isprintable() else "?" for c in text) for text in texts]
+
+
 def name_gestures(attrs: Mapping[str, Any], of: str = "kind") -> str:
     """Gestures of all instruments ("pull + push") or, by `of`, their "instrument"; may be empty."""
     return " + ".join(one[of] for one in gestures_of(attrs) if one.get(of))

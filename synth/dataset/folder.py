@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from synth.system.checked_file import write_whole as write_whole
 from synth.system.config_file import validated
 
 _NAME = "dataset.json"
+_GATE_S = 3600.0  # that a part waits for the others to begin, or for one that writes the index
 
 
 class _Described(BaseModel):
@@ -36,11 +39,38 @@ class _Described(BaseModel):
     generators: list[dict[str, str]]
 
 
-class Folder:
-    """A dataset's folder. All state is read from disk, so that it survives a crash."""
+@dataclass(frozen=True)
+class Part:
+    """One of `count` runs that share a dataset without knowing of each other, as those of a SLURM array."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    number: int  # from 1
+    count: int
+
+    def __contains__(self, index: int) -> bool:
+        return index % self.count == self.number - 1
+
+    @property
+    def name(self) -> str:
+        return f"{self.number:05d}-of-{self.count:05d}"
+
+
+def parse_part(text: str) -> Part:
+    """A part such as 3/40. UserError: it is none."""
+    found = re.fullmatch(r"\s*(\d{1,5})\s*/\s*(\d{1,5})\s*", text)
+    part = Part(int(found[1]), int(found[2])) if found else None
+    if part is None or not 1 <= part.number <= part.count:
+        raise UserError(f"--part {text}: give NUMBER/COUNT, the number from 1, such as 3/40")
+    return part
+
+
+class Folder:
+    """A dataset's folder. All state is read from disk, so that it survives a crash.
+
+    `part`: of the dataset, that a run computes; None: all of it.
+    """
+
+    def __init__(self, root: Path, part: Part | None = None) -> None:
+        self.root, self.part = root, part
         self.state = root / ".run"
         self.logs = self.state / "logs"
         self.scratch = self.state / "scratch"
@@ -48,9 +78,14 @@ class Folder:
         self.turn_file = self.state / "turn"
         self.turn = 0
 
+    @property
+    def is_begun(self) -> bool:
+        """Whether it has a job."""
+        return os.path.lexists(self.root / _NAME)
+
     def described(self) -> dict[str, Any]:
         """The content of `dataset.json`. UserError if it is missing, damaged or of an unsupported format."""
-        if not os.path.lexists(self.root / _NAME):
+        if not self.is_begun:
             raise UserError(f"{self.root}: is not a dataset ({_NAME} is missing)")
         found = checked_file.read_json(self.root / _NAME)
         if isinstance(found, dict):
@@ -66,6 +101,18 @@ class Folder:
             render["scenery"] = [part for part in render.get("scenery", ()) if part != "cottonoid"]
             sensor["blur_px"] = sensor.get("blur_px", 0.0) * BLUR_WIDTH_PX / render.get("size", (640,))[0]
         return validated(Job, job, f"{self.root / _NAME}: is damaged", STORED)
+
+    def refuse_replaced(self, job: Job, name: str) -> None:
+        """Raises UserError if files of the folder's own job are no longer those that it was begun with.
+
+        `name`: identity of `job` by its files as they are now.
+        """
+        if not self.is_begun or (described := self.described())["identity"] == name:
+            return
+        if not _changes(described["job"], job.model_dump(mode="json")):
+            files = "mechanics.source, anatomy.mesh, appearance.photo or render.calibration"
+            why = f"a file of {files} was replaced since the dataset was begun"
+            raise UserError(f"{self.root}: {why}; restore it, or choose another folder")
 
     def sealed(self) -> list[int]:
         """Indices of the finished sequences, in order."""
@@ -89,8 +136,8 @@ class Folder:
         self.sweep(failure["index"])
 
     def clear_failures(self, indices: Iterable[int] | None = None) -> None:
-        """Deletes the marks of failed sequences, all if `indices` is None."""
-        for index in self.failures() if indices is None else indices:
+        """Deletes the marks of failed sequences, all of the part if `indices` is None."""
+        for index in filter(self.computes, self.failures()) if indices is None else indices:
             (self.state / "failed" / f"{index:06d}.json").unlink(missing_ok=True)
 
     def sweep(self, index: int) -> None:
@@ -100,8 +147,39 @@ class Folder:
         if leftover.exists() and not sealed.exists():
             shutil.rmtree(leftover)
 
+    def computes(self, index: int) -> bool:
+        """Whether a sequence is of its part."""
+        return self.part is None or index in self.part
+
+    @property
+    def lock_file(self) -> Path:
+        """Locked during a run of its part."""
+        return self.state / ("lock" if self.part is None else f"part-{self.part.name}.lock")
+
+    @property
+    def progress_file(self) -> Path:
+        """Progress of the current run of its part, for `synth status`."""
+        return self.state / ("progress.json" if self.part is None else f"part-{self.part.name}.json")
+
+    def running(self) -> list[Path]:
+        """Progress files of the runs that write to it now, other than of its own part."""
+        locks = {self.state / "lock": self.state / "progress.json"}
+        locks |= {lock: lock.with_suffix(".json") for lock in self.state.glob("part-*.lock")}
+        return [file for lock, file in locks.items() if lock != self.lock_file and file_lock.is_held(lock)]
+
+    @contextmanager
+    def gate(self) -> Iterator[None]:
+        """Excludes the others while one of several runs begins, or completes the dataset. `Locked` after an
+        hour."""
+        with file_lock.hold(self.state / "gate", _GATE_S):
+            yield
+
     def sweep_all(self) -> None:
-        """Deletes all files of interrupted attempts."""
+        """Deletes all files of interrupted attempts; beside runs of other parts, only its own stores."""
+        if self.part is not None and self.running():
+            for index in filter(self.computes, location.unfinished(self.root)):
+                self.sweep(index)
+            return
         for folder in (*self.root.glob("*.zarr.part"), *self.scratch.glob("*")):
             shutil.rmtree(folder)
         places = (self.root, self.state, self.state / "failed")
@@ -126,13 +204,14 @@ class Folder:
 
 
 @contextmanager
-def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folder]:
+def claim(root: Path, job: Job, *, mix_versions: bool = False, part: Part | None = None) -> Iterator[Folder]:
     """The folder for `job`, created or continued, and locked for this process; other content stays unchanged.
 
-    More sequences than before extend the dataset; `mix_versions` continues another version's. UserError: the
-    dataset of another job or version, other files, another run, or no permission.
+    More sequences than before extend the dataset; `mix_versions` continues another version's; `part`: runs of
+    other parts may write to it meanwhile. UserError: the dataset of another job or version, other files,
+    another run, or no permission.
     """
-    folder, created, fresh = Folder(root), not root.exists(), not (root / _NAME).exists()
+    folder, created, fresh = Folder(root, part), not root.exists(), not (root / _NAME).exists()
     name = identity.identify_job(job)
     try:
         _refuse_foreign(folder, job, name)
@@ -140,33 +219,47 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False) -> Iterator[Folde
         for place in (*own, *root.glob("*.zarr.part")):
             if place.is_symlink():  # a run writes or deletes here
                 raise UserError(f"{place}: is a link; remove it")
-        makers = _makers(folder, mix_versions)
         folder.state.mkdir(parents=True, exist_ok=True)
-        with file_lock.hold(folder.state / "lock") as folder.lock_fd:
-            _refuse_foreign(folder, job, name)
-            for place in (folder.state / "failed", folder.logs, folder.scratch):
-                place.mkdir(exist_ok=True)
-            values = job.model_dump(mode="json")
-            described = _Described(format_version=FOLDER, identity=name, job=values, generators=makers)
-            write_whole(root / _NAME, described.model_dump_json(indent=1) + "\n")
-            head = "# The job of this dataset, with all values.\n"
-            write_whole(root / "job.yaml", head + writer.dump_job(job))
-            folder.invalidate_workers()
-            folder.sweep_all()
+        with ExitStack() as held:
+            with folder.gate():
+                if part is None and folder.running():
+                    raise file_lock.Locked
+                if (folder.state / "progress.json") in folder.running():
+                    raise file_lock.Locked
+                folder.lock_fd = held.enter_context(file_lock.hold(folder.lock_file))
+                _refuse_foreign(folder, job, name)
+                _begin(folder, job, name, _makers(folder, mix_versions))
             try:
                 yield folder
             finally:
-                folder.invalidate_workers()
-                if fresh and not folder.sealed() and not folder.failures():
-                    folder.discard()
-                    if created and not any(root.iterdir()):  # an interrupted sequence may be left
-                        root.rmdir()
+                if part is None:
+                    folder.invalidate_workers()
+                    if fresh and not folder.sealed() and not folder.failures():
+                        folder.discard()
+                        if created and not any(root.iterdir()):  # an interrupted sequence may be left
+                            root.rmdir()
     except file_lock.Locked:
         raise UserError(f"{root}: another run is writing to it") from None
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR):
             raise UserError(f"{root}: cannot be written ({os.strerror(error.errno)})") from error
         raise
+
+
+def _begin(folder: Folder, job: Job, name: str, makers: list[dict[str, str]]) -> None:
+    """Writes the job into a folder that is locked, and removes what interrupted runs left."""
+    for place in (folder.state / "failed", folder.logs, folder.scratch):
+        place.mkdir(exist_ok=True)
+    values = job.model_dump(mode="json")
+    described = _Described(format_version=FOLDER, identity=name, job=values, generators=makers)
+    text = described.model_dump_json(indent=1) + "\n"
+    if not folder.running() or not folder.is_begun or (folder.root / _NAME).read_text("utf-8") != text:
+        write_whole(folder.root / _NAME, text)
+        head = "# The job of this dataset, with all values.\n"
+        write_whole(folder.root / "job.yaml", head + writer.dump_job(job))
+    if folder.part is None:
+        folder.invalidate_workers()
+    folder.sweep_all()
 
 
 def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
@@ -180,6 +273,13 @@ def _refuse_foreign(folder: Folder, job: Job, name: str) -> None:
             raise UserError(f"{root}: contains other files ({others[0]}); choose an empty or new folder")
         return
     described = folder.described()
+    if (
+        described["identity"] != name
+        and not folder.sealed()
+        and not folder.failures()
+        and not folder.running()
+    ):
+        return  # nothing was finished of the other one, and nobody computes it
     if described["identity"] != name:
         changes = _changes(described["job"], job.model_dump(mode="json"))
         what = ", ".join(changes[:4]) or "another mesh or photograph"

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synth.dataset import location, split
-from synth.dataset.attributes import gestures_of, name_gestures
+from synth.dataset.attributes import cautions_of, gestures_of, name_gestures
 from synth.dataset.folder import Folder, write_whole
 from synth.dataset.split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
@@ -189,6 +189,16 @@ def save_rows(root: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 def row_of(sequence: Sequence) -> dict[str, Any]:
     """The index row of a finished sequence, from its attributes; without its side, which is not its own."""
     return {column.name: column.read(sequence) for column in COLUMNS if column.name != "split"}
+
+
+def list_cautions(root: Path, sealed: Iterable[int]) -> dict[str, list[int]]:
+    """What is doubtful about the mechanics of sequences, each with those of which it is."""
+    found: dict[str, list[int]] = {}
+    for key in sealed:
+        with suppress(UserError):  # damage is reported by `synth verify`
+            for caution in cautions_of(open_sequence(location.store(root, key), sealed=False).attrs):
+                found.setdefault(caution, []).append(key)
+    return found
 
 
 def dataset_hash(rows: Iterable[Mapping[str, Any]]) -> str:

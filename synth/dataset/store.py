@@ -61,6 +61,11 @@ class Writer:
             "job": identity.identify_job(job),
         }
 
+    @property
+    def job_identity(self) -> str:
+        """Identity of its job, by the job's files as they are now."""
+        return str(self._own["job"])
+
     def wants(self, name: str) -> bool:
         """Whether the job stores that field; `put` ignores others."""
         return _field(name).name in self._wanted

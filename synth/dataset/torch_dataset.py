@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import os
 from bisect import bisect_right
 from collections.abc import Callable
 from collections.abc import Sequence as Several
 from functools import lru_cache
+from operator import index as index_of
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from synth.arguments import checked
 from synth.dataset.index import group_by_side
 from synth.dataset.store import Dataset, FieldReader, Sequence
-from synth.errors import UserError
+from synth.errors import UserError, did_you_mean
 from synth.fields import FIELDS, TIME
 
 
@@ -27,13 +29,14 @@ def _open(
 
 
 class TorchDataset:
-    """Frames of the sequences in `root`, as `{field: array}`, with `index` of the sequence and `frame`.
+    """Frames of the sequences in `root`, as `{field: array}` with what they need.
 
-    Fields without a frame axis are returned whole. `split`: only this side of the dataset's split; `clip`:
-    so many consecutive frames in an item; `transform`: applied to each item. Safe in forked or spawned
-    workers.
+    Each item has its fields, those without a frame axis as a whole; `index`, the sequence's; `frame`, its
+    number; and `scale_mm_per_px` and `young_kpa`, NaN where they are unknown. `split`: only this side of the
+    dataset's split; `clip`: so many frames in an item, `stride` apart; `step`: frames from the first of an
+    item to the first of the next; `transform`: applied to each item. Safe in forked or spawned workers.
 
-        frames = TorchDataset("out", ["rgb", "flow", "traction"], split="train")
+        frames = TorchDataset("out", ["rgb", "flow", "traction"], split="train", clip=8, stride=2)
         loader = torch.utils.data.DataLoader(frames, batch_size=8, num_workers=2)
     """
 
@@ -41,29 +44,39 @@ class TorchDataset:
     def __init__(
         self,
         root: Path | str,
-        fields: Several[str],
+        fields: str | Several[str] | None = None,
         sequences: Several[int] | None = None,
         *,
         split: str | None = None,
         clip: int = 0,
+        stride: int = 1,
+        step: int = 1,
         transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         """
         Args:
             root: the dataset.
-            fields: names from the field table.
+            fields: names from the field table; default: all that every sequence has.
             sequences: positions in the dataset of those to use; default: all.
-            split, clip, transform: see above; `frame` is a clip's first; clip 0: single frames, without axis.
+            split, clip, stride, step, transform: see above; `frame` is a clip's first; clip 0: single frames,
+                without axis.
 
         Raises:
             UserError: not a dataset, no such side, or a sequence lacks a field or is shorter than a clip.
         """
-        if unknown := [name for name in fields if name not in FIELDS]:
-            raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}")
-        self._dataset, self._fields = Dataset(root), tuple(fields)
+        named = (fields,) if isinstance(fields, str) else fields
+        if unknown := [name for name in named or () if name not in FIELDS]:
+            hint = did_you_mean(unknown[0], FIELDS)
+            raise UserError(f"{', '.join(unknown)}: no such field; there are {', '.join(FIELDS)}{hint}")
+        self._dataset = Dataset(root)
         if clip < 0:
             raise UserError(f"clip: {clip}: must be a number of frames, or 0 for single ones")
-        self._clip, self._transform = clip, transform
+        for key, value in (("stride", stride), ("step", step)):
+            if value < 1:
+                raise UserError(f"{key}: {value}: must be a number of frames, 1 at least")
+        if stride > 1 and clip < 2:
+            raise UserError("stride: is between the frames of a clip: give clip, or step for fewer items")
+        self._clip, self._stride, self._step, self._transform = clip, stride, step, transform
         if split is not None:
             sides = group_by_side(self._dataset)
             if sequences is not None:
@@ -74,24 +87,37 @@ class TorchDataset:
         self._chosen = tuple(range(len(self._dataset)) if sequences is None else sequences)
         if not all(0 <= position < len(self._dataset) for position in self._chosen):
             raise UserError(f"sequences: the dataset has positions 0 to {len(self._dataset) - 1}")
-        self._ends: list[int] = []
-        for sequence in map(self._dataset.__getitem__, self._chosen):
-            if missing := [name for name in fields if name not in sequence]:
+        every = [self._dataset[position] for position in self._chosen]
+        common = (name for name in FIELDS if all(name in sequence for sequence in every))
+        self._fields, self._ends = tuple(common if named is None else named), list[int]()
+        needed = (max(clip, 1) - 1) * stride + 1
+        for sequence in every:
+            if missing := [name for name in self._fields if name not in sequence]:
                 raise UserError(f"{sequence.path}: has no {', '.join(missing)}")
-            if sequence.frames < clip:
-                raise UserError(f"{sequence.path}: has {sequence.frames} frames, fewer than clip={clip}")
-            self._ends.append(len(self) + sequence.frames - max(clip - 1, 0))
+            if sequence.frames < needed:
+                apart = f" with stride={stride}" if stride > 1 else ""
+                raise UserError(
+                    f"{sequence.path}: has {sequence.frames} frames, fewer than clip={clip}{apart} needs"
+                )
+            self._ends.append(len(self) + 1 + (sequence.frames - needed) // step)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 
-    def __getitem__(self, item: int) -> Any:
-        if not 0 <= item < len(self):
-            raise IndexError(item)
-        which = bisect_right(self._ends, item)
-        frame = item - (self._ends[which - 1] if which else 0)
+    def __getitem__(self, item: SupportsIndex) -> Any:
+        """An item by its number, of any kind of integer; negative ones count from the end."""
+        number = index_of(item)
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"{number}: there are {len(self)} items")
+        number %= len(self)
+        which = bisect_right(self._ends, number)
+        frame = self._step * (number - (self._ends[which - 1] if which else 0))
         sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)
-        at = slice(frame, frame + self._clip) if self._clip else frame
+        last = frame + self._stride * (self._clip - 1) + 1
+        at = slice(frame, last, self._stride) if self._clip else frame
         values = {name: one[at] if one.dims[0] == TIME else one[:] for name, one in readers.items()}
-        found = {"index": sequence.index, "frame": frame, **values}
+        found: dict[str, Any] = {"index": sequence.index, "frame": frame, **values}
+        for name in ("scale_mm_per_px", "young_kpa"):
+            stated = sequence.attrs.get(name)
+            found[name] = math.nan if stated is None else float(stated)
         return found if self._transform is None else self._transform(found)

@@ -21,6 +21,7 @@ from synth.dataset.folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import gpu, llvm
+from synth.system.memory import free_bytes
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
@@ -192,6 +193,8 @@ def environment(job: Job, workers: int) -> dict[str, str]:
 
 
 def share_of_memory(workers: int) -> int:
-    """Bytes of the available memory for each of `workers` processes."""
-    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)
+    """Bytes of the memory that is free, as its control groups limit it, for each of `workers` processes."""
+    free = free_bytes()
+    if free is None:
+        raise UserError("the free memory is unknown on this system: give --memory in GB")
+    return int(0.9 * free / workers)

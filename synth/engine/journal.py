@@ -15,7 +15,6 @@ from synth.dataset.folder import Folder, write_whole
 from synth.engine.child import Attempt
 from synth.system.terminal import ProgressBars, clock
 
-FILE = "progress.json"
 _EVERY_S = 2.0
 _LATEST = 32  # sequences that the rate is estimated from
 _QUIET_S = 10.0  # least time between two lines without a terminal
@@ -52,7 +51,7 @@ class Journal(Watcher):
     """Writes the progress of a run to a file, and reports it."""
 
     def __init__(self, folder: Folder, workers: int, report: Callable[[RunProgress], None]) -> None:
-        self._path, self._report = folder.state / FILE, report
+        self._path, self._report = folder.progress_file, report
         self._cold, self._left, self._written = workers, 0, -_EVERY_S
         self._ends: deque[float] = deque(maxlen=_LATEST + 1)
         self._in_flight: dict[int, list[Any]] = {}

@@ -8,14 +8,14 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
 from synth.arguments import checked
 from synth.dataset import index, size_forecast
-from synth.dataset.folder import Folder, claim
+from synth.dataset.folder import Folder, Part, claim
 from synth.engine.child import Attempt, Child, Setup, choose_gpus, environment, share_of_memory
 from synth.engine.compilation import compile_once
 from synth.engine.journal import Journal, RunBars, Watcher
@@ -38,11 +38,14 @@ class Options:
     memory_gb: float | None = None  # limit of one process; None: an equal share of the available memory
     work: str = "synth.sequence.pipeline:render_sequence"  # `module:function` that computes one sequence
     mix_versions: bool = False  # continue a dataset that another version of the program began
+    part: Part | None = None  # of the sequences, that this run computes, beside runs of other parts
 
     def __post_init__(self) -> None:
         for name in ("workers", "memory_gb"):
             if getattr(self, name) is not None:
                 as_positive(name, getattr(self, name))
+        if self.part is not None and self.engine != "local":
+            raise UserError(f"--part is of one machine's run, not for --engine {self.engine}")
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class Summary:
     """The result of a run."""
 
     total: int
+    """Sequences of the job, or of the part."""
     already: int
     """Sequences that were finished before."""
     done: int
@@ -57,7 +61,9 @@ class Summary:
     failed: dict[int, str]
     """Reason of every failed sequence, of this run and of earlier ones."""
     content_hash: str
-    """Hash of the content hashes of all finished sequences in order."""
+    """Hash of the content hashes of all finished sequences in order; empty while other parts are computed."""
+    cautions: dict[str, list[int]] = field(default_factory=dict)
+    """What is doubtful about the mechanics of another program, and the finished sequences of which it is."""
 
 
 @checked
@@ -100,13 +106,15 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 
         refuse_unfit(job.render)
     gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")
-    with claim(root, job, mix_versions=options.mix_versions) as folder:
-        finished, failures = folder.sealed(), folder.failures()
-        todo = sorted(set(range(job.sequences)) - set(finished) - set(failures))
+    with claim(root, job, mix_versions=options.mix_versions, part=options.part) as folder:
+        mine = [index for index in range(job.sequences) if folder.computes(index)]
+        finished = [index for index in folder.sealed() if folder.computes(index)]
+        failures = {index: one for index, one in folder.failures().items() if folder.computes(index)}
+        todo = sorted(set(mine) - set(finished) - set(failures))
         size_forecast.refuse_if_too_large(size_forecast.forecast_rest(job, root, len(todo), finished), root)
         watchers = (Journal(folder, workers, watcher.account), watcher)
         for one in watchers:
-            one.begin(job.sequences, len(finished), len(failures))
+            one.begin(len(mine), len(finished), len(failures))
         setup = Setup(
             job=job.model_dump(mode="json"),
             folder=root.resolve(),
@@ -122,16 +130,35 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
             with _slots(options.engine, setup, workers, gpus) as slots:
                 done = _Pool(folder, slots[: max(1, len(todo))], todo).work(watchers)
         finally:
-            rows = index.write_index(folder)
-        if done or not (root / "README.md").exists():
+            rows = _complete(folder, job)
+        if folder.part is None and (done or not (root / "README.md").exists()):
             card.write_card(folder)
+        made = [key for key in folder.sealed() if folder.computes(key)]
+        failed = {key: one["reason"] for key, one in folder.failures().items() if folder.computes(key)}
         return Summary(
-            total=job.sequences,
+            total=len(mine),
             already=len(finished),
             done=done,
-            failed={key: failure["reason"] for key, failure in folder.failures().items()},
-            content_hash=index.dataset_hash(rows),
+            failed=failed,
+            content_hash="" if rows is None else index.dataset_hash(rows),
+            cautions={} if job.mechanics.source is None else index.list_cautions(root, made),
         )
+
+
+def _complete(folder: Folder, job: Job) -> list[dict[str, Any]] | None:
+    """Writes the index of a dataset; of one in parts the part that ends last writes it, and the card.
+
+    The split follows from all sequences together, so that it doesn't depend on the order of the parts.
+    Returns the rows; None if other parts are not done.
+    """
+    if folder.part is None:
+        return index.write_index(folder)
+    with folder.gate():
+        if set(range(job.sequences)) - set(folder.sealed()) - set(folder.failures()):
+            return None
+        rows = index.write_index(folder)
+        card.write_card(folder)
+        return rows
 
 
 @checked

@@ -13,7 +13,7 @@ from synth.dataset import location, size_forecast
 from synth.dataset.folder import Folder
 from synth.dataset.size_forecast import Forecast
 from synth.dataset.store import open_sequence
-from synth.engine.journal import FILE, RunProgress
+from synth.engine.journal import RunProgress
 from synth.errors import UserError
 from synth.system import checked_file, file_lock
 from synth.system.config_file import validated
@@ -84,12 +84,15 @@ def lines(status: Status) -> list[str]:
 
 
 def _progress(folder: Folder) -> RunProgress | None:
-    """Progress of the current run; None if there is none."""
-    if not file_lock.is_held(folder.state / "lock"):
-        return None
-    with suppress(UserError):  # it has just begun, or is of another version
-        return validated(RunProgress, checked_file.read_json(folder.state / FILE), FILE)
-    return RunProgress()
+    """Progress of the current run, or of all runs of parts together; None if there is none."""
+    files = [*folder.running(), *([folder.progress_file] if file_lock.is_held(folder.lock_file) else [])]
+    found = RunProgress()
+    for file in files:
+        with suppress(UserError):  # it has just begun, or is of another version
+            part = validated(RunProgress, checked_file.read_json(file), file.name)
+            left = [one for one in (found.left_s, part.left_s) if one is not None]
+            found = RunProgress(max(left, default=None), {**found.in_flight, **part.in_flight})
+    return found if files else None
 
 
 def _stages(root: Path, pilot: list[int]) -> dict[str, float]:

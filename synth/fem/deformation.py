@@ -61,6 +61,8 @@ class Deformation:
     """The volume under the surface, where `FemMechanics` was to return it."""
     pulse_work: Floats | None = None
     """(T,) mN mm, half of traction times the motion by the pulse alone."""
+    cautions: tuple[str, ...] = ()
+    """What is doubtful about it, a line each; stored, and counted by `synth verify`."""
 
 
 def check_deformation(

@@ -83,6 +83,7 @@ def deform(
         residual=path.residual,
         tool_work=work - pulse_work,
         pulse_work=pulse_work,
+        cautions=(),
     )
 
 

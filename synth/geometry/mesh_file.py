@@ -7,29 +7,43 @@ compressed by zlib or LZMA. Source: The VTK User's Guide, file formats.
 from __future__ import annotations
 
 import base64
+import io
+import json
 import lzma
 import re
+import warnings
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import Floats, Ints
 from synth.geometry.skin import CELLS, IGNORED, TRIANGLE
+from synth.system.memory import refuse_excess
 
 SUFFIXES = ("vtu", "vtk", "vtp")
+SURFACES = ("obj", "ply", "glb")  # without data at points
+LARGEST_EXPANDED = 2 << 30  # bytes of all arrays of a file that are read, as of a file without compression
 Numbers = NDArray[np.number]
 
 _VERTICES, _LINE, _STRIP, _POLYGON = 2, 4, 6, 7
 _REGULAR = {8: (9, [0, 1, 3, 2]), 11: (12, [0, 1, 3, 2, 4, 5, 7, 6])}  # pixel, voxel: as quad, hexahedron
 _XML_CELLS = {"Cells": None, "Polys": _POLYGON, "Strips": _STRIP, "Lines": _LINE, "Verts": _VERTICES}
 _LEGACY_CELLS = {"POLYGONS": _POLYGON, "TRIANGLE_STRIPS": _STRIP, "LINES": _LINE, "VERTICES": _VERTICES}
-_PACKERS = {"vtkZLibDataCompressor": zlib, "vtkLZMADataCompressor": lzma}
+_PACKERS: dict[str, Callable[[], Any]] = {
+    "vtkZLibDataCompressor": zlib.decompressobj,
+    "vtkLZMADataCompressor": partial(lzma.LZMADecompressor, memlimit=256 << 20),
+}
+_XML_TYPES = {
+    **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
+    **{"float32": "f4", "float64": "f8", "string": "u1"},
+}
 _LEGACY_TYPES = {
     "float": "f4", "double": "f8", "char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2",
     "int": "i4", "unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "vtkidtype": "i8",
@@ -37,7 +51,20 @@ _LEGACY_TYPES = {
 }  # fmt: skip
 _ATTRIBUTES = {"SCALARS": 1, "VECTORS": 3, "NORMALS": 3, "TENSORS": 9}
 _WORD_LINE = re.compile(rb"\n[ \t]*(?!nan\b|inf\b)[A-Za-z_]", re.IGNORECASE)
+_BLANK = re.compile(rb"\n[ \t\r]*\n")
 _TIMES = ("time", "timevalue")
+
+
+class _Reader(Protocol):
+    def __call__(self, node: ET.Element | None, expected: int | None = None) -> Numbers: ...
+
+
+@dataclass(frozen=True)
+class PointArray:
+    """An array at the points of a file, which is read when it is asked for."""
+
+    parts: int  # numbers at each point
+    read: Callable[[], Numbers]  # (N, parts); raises as `read_mesh`
 
 
 @dataclass
@@ -46,15 +73,24 @@ class MeshFile:
 
     points: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3), the file's unit
     cells: dict[int, Ints] = field(default_factory=dict)  # nodes (C, n) by VTK's number of the type
-    point_data: dict[str, Numbers] = field(default_factory=dict)  # (N, ...) by name
+    point_data: dict[str, PointArray] = field(default_factory=dict)  # by name
     time: float = np.nan  # as stated in the file
     space: str = ""  # of its axes, such as LPS, as 3D Slicer states it in .vtp
+
+
+class _Cells:
+    """Cells as a file lists them, part by part."""
+
+    def __init__(self) -> None:
+        self._parts: dict[int, list[Ints]] = {}
 
     def add(self, kinds: Numbers | int, nodes: Ints, ends: Ints) -> None:
         """Adds cells of types (C,) or of one: their nodes one after another, and where each cell ends."""
         if np.shape(kinds) not in ((), ends.shape) or (len(ends) and ends[-1] != len(nodes)):
             raise ValueError("numbers of cells, types and nodes differ")
         kinds, sizes = np.broadcast_to(kinds, len(ends)), np.diff(ends, prepend=0)
+        if sizes.min(initial=0) < 0 or (len(ends) and not 0 <= kinds.min() <= kinds.max() < 256):
+            raise ValueError("a cell's size or type is out of range")
         for kind in np.unique(kinds).tolist():
             mine = kinds == kind
             own, each = nodes[np.repeat(mine, sizes)], sizes[mine]
@@ -67,52 +103,98 @@ class MeshFile:
                 size = CELLS[kind].nodes if kind in CELLS else int(each[0])
                 if (each != size).any():
                     raise ValueError(f"a cell of VTK's type {kind} has {each[each != size][0]} nodes")
-                own = own.reshape(-1, size)[:, order]
-            self.cells[kind] = np.concatenate([self.cells.get(kind, own[:0]), own])
+                own = own.reshape(len(each), size)[:, order]
+            self._parts.setdefault(kind, []).append(own)
+
+    def join(self) -> dict[int, Ints]:
+        """Nodes (C, n) of all by type. ValueError: cells of one type differ in size."""
+        return {kind: np.concatenate(parts) for kind, parts in self._parts.items()}
 
 
 def read_mesh(data: bytes) -> MeshFile:
     """The mesh in the bytes of a .vtk, .vtu or .vtp file.
 
-    Raises ValueError if it is none, or damaged; others as parsers of numbers raise them.
+    Raises ValueError if it is none, or damaged, or would need more memory than is free or than 2 GB for all
+    arrays that are read; others as parsers of numbers raise them.
     """
     return _read_legacy(data) if data.startswith(b"# vtk DataFile") else _read_xml(data)
 
 
+def read_surface(data: bytes, suffix: str) -> tuple[Floats, Ints]:
+    """Points (N, 3) and triangles (F, 3) of an .obj, .ply or .glb in the file's order, by trimesh.
+
+    Files that it names (materials, pictures) are not opened. Raises what trimesh raises for what is none.
+    """
+    import trimesh  # here, as it is slow to import
+
+    if suffix == "glb":
+        _refuse_hollow(data)
+    if suffix == "ply":
+        _refuse_overcount(data)
+    given = {"force": "mesh", "process": False, "maintain_order": True, "skip_materials": True}
+    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, **given)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def _refuse_hollow(data: bytes) -> None:
+    """ValueError for a .glb with arrays that have no bytes in it: they may be of any size."""
+    size = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + size])
+    hollow = [one for one in tree.get("accessors", []) if "bufferView" not in one or "sparse" in one]
+    if data[:4] != b"glTF" or hollow or tree.get("extensionsRequired"):
+        raise ValueError("it is no plain GLB: sparse, empty or compressed arrays, or another format")
+
+
+def _refuse_overcount(data: bytes) -> None:
+    """ValueError for a .ply whose header counts more elements than it has bytes."""
+    head = data.partition(b"end_header")[0]
+    for count in re.findall(rb"^element\s+\S+\s+(\S+)", head, re.MULTILINE):
+        if not 0 <= int(count) <= len(data) - len(head):
+            raise ValueError(f"its header counts {count.decode('latin-1')} elements, its size is less")
+
+
 def _triangles(nodes: Ints, sizes: Ints, strips: bool) -> Ints:
     """Triangles (F, 3) of polygons, as fans, or of strips, each second of which is turned."""
-    parts = [np.zeros((0, 3), np.int64)]
-    for size in np.unique(sizes):
-        cells = nodes[np.repeat(sizes == size, sizes)].reshape(-1, size)
-        for k in range(size - 2):
-            strip = [k, k + 1, k + 2] if k % 2 == 0 else [k + 1, k, k + 2]
-            parts.append(cells[:, strip if strips else [0, k + 1, k + 2]])
-    return np.concatenate(parts)
+    count = np.maximum(sizes - 2, 0)  # triangles of each
+    first = np.repeat(np.cumsum(sizes) - sizes, count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    if strips:
+        turned = step % 2
+        corners = first + step + np.stack([turned, 1 - turned, np.full_like(step, 2)])
+    else:
+        corners = np.stack([first, first + step + 1, first + step + 2])
+    return np.asarray(nodes[corners.T])
 
 
 def _read_xml(data: bytes) -> MeshFile:
     head, tag, rest = data.partition(b"<AppendedData")  # what is appended may be raw, thus no XML
-    if b"<!ENTITY" in head:
-        raise ValueError("it declares entities")
+    if b"\0" in head or b"<!DOCTYPE" in head or b"<!ENTITY" in head:
+        raise ValueError("it declares entities, or is not in UTF-8")
     root = ET.fromstring(head + b"</VTKFile>" if tag else data)
     if root.tag != "VTKFile" or root.get("type") not in ("UnstructuredGrid", "PolyData"):
         raise ValueError(f"it holds {root.get('type') or root.tag}, not an unstructured grid or polygons")
-    array, found = _xml_arrays(root, rest), MeshFile()
+    array, found, cells = _xml_arrays(root, rest), MeshFile(), _Cells()
+    points, each, before = list[Floats](), list[tuple[int, dict[str, ET.Element]]](), 0
     for piece in root.iter("Piece"):
-        if piece.get("NumberOfPoints") == "0":
+        if (count := int(piece.get("NumberOfPoints", 0))) == 0:
             continue
-        before, here = len(found.points), array(piece.find("Points/DataArray")).reshape(-1, 3)
-        found.points = np.concatenate([found.points, here.astype(np.float64)])
+        points.append(array(piece.find("Points/DataArray"), 3 * count).reshape(-1, 3).astype(np.float64))
         for name, kind in _XML_CELLS.items():
-            parts = {one.get("Name"): array(one) for one in piece.iterfind(f"{name}/DataArray")}
-            if {"connectivity", "offsets"} <= set(parts):
-                nodes, ends = (parts[one].astype(np.int64) for one in ("connectivity", "offsets"))
-                found.add(parts["types"] if kind is None else kind, before + nodes, ends)
-        for one in piece.iterfind("PointData/DataArray"):
-            if len(values := array(one)) and len(values) % len(here) == 0:
-                name, values = str(one.get("Name")), values.reshape(len(here), -1)
-                earlier = found.point_data.get(name, np.zeros((before, values.shape[1]), values.dtype))
-                found.point_data[name] = np.concatenate([earlier, values])
+            stated = piece.get("NumberOfCells" if kind is None else f"NumberOf{name}")
+            number = None if stated is None else int(stated)
+            parts = {str(one.get("Name")): one for one in piece.iterfind(f"{name}/DataArray")}
+            if {"connectivity", "offsets"} <= set(parts) and number != 0:
+                ends = whole(array(parts["offsets"], number))
+                kinds = whole(array(parts["types"], number)) if kind is None else kind
+                cells.add(kinds, before + whole(array(parts["connectivity"])), ends)
+        data_here = {str(one.get("Name")): one for one in piece.iterfind("PointData/DataArray")}
+        each.append((count, data_here))
+        before += count
+    found.points, found.cells = np.concatenate([np.zeros((0, 3)), *points]), cells.join()
+    for name in dict.fromkeys(name for _, here in each for name in here):
+        nodes = [(count, here.get(name)) for count, here in each]
+        if (parts_of := _count_parts(nodes, array)) is not None:
+            found.point_data[name] = PointArray(parts_of, partial(_join, nodes, parts_of, array))
     for one in root.iterfind(".//FieldData/"):
         if str(one.get("Name")).lower() in _TIMES:
             found.time = float(array(one)[0])
@@ -121,7 +203,38 @@ def _read_xml(data: bytes) -> MeshFile:
     return found
 
 
-def _xml_arrays(root: ET.Element, rest: bytes) -> Callable[[ET.Element | None], Numbers]:
+_Nodes = list[tuple[int, ET.Element | None]]  # of an array: points of each piece, and its numbers there
+
+
+def _count_parts(nodes: _Nodes, array: _Reader) -> int | None:
+    """Numbers at each point of an array; where it states none, by its length. None: pieces differ."""
+    stated = {one.get("NumberOfComponents") for _, one in nodes if one is not None}
+    if stated == {None}:
+        count, node = next((count, one) for count, one in nodes if one is not None)
+        length = len(array(node))
+        return length // count if length and length % count == 0 else None
+    return int(stated.pop() or 1) if len(stated) == 1 else None
+
+
+def _join(nodes: _Nodes, parts: int, array: _Reader) -> Numbers:
+    """An array (N, parts) over all pieces; 0 in those without it."""
+    each = [
+        np.zeros((count, parts)) if one is None else array(one, parts * count).reshape(count, parts)
+        for count, one in nodes
+    ]
+    return each[0] if len(each) == 1 else np.concatenate(each)
+
+
+def whole(numbers: Numbers) -> Ints:
+    """Whole numbers (...) as int64. ValueError: one is not whole."""
+    if numbers.dtype.kind not in "iu" and not (
+        numbers.dtype.kind == "f" and (np.abs(numbers) < 2**53).all() and (numbers == np.rint(numbers)).all()
+    ):
+        raise ValueError("a number of a point or cell is not whole")
+    return numbers.astype(np.int64)
+
+
+def _xml_arrays(root: ET.Element, rest: bytes) -> _Reader:
     """A function that gives the numbers of an array, one after another; text as the bytes' numbers.
 
     `rest`: the file after <AppendedData.
@@ -130,83 +243,127 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> Callable[[ET.Element | None], 
     raw = b"raw" in coding
     order: Literal["<", ">"] = ">" if root.get("byte_order") == "BigEndian" else "<"
     word = np.dtype(root.get("header_type", "UInt32").lower()).newbyteorder(order)
+    if word not in (np.dtype(f"{order}u4"), np.dtype(f"{order}u8")):
+        raise ValueError("its header_type is neither UInt32 nor UInt64")
     if (packer := root.get("compressor")) not in (None, *_PACKERS):
         raise ValueError(f"it is compressed by {packer}; write it with zlib or uncompressed")
     appended = (one for one in root.iter() if one.get("format") == "appended")
     starts = sorted({int(one.get("offset", 0)) for one in appended})
+    if starts and not 0 <= starts[0] <= starts[-1] <= len(tail):
+        raise ValueError("an offset is outside of what is appended; is it truncated?")
     ends = dict(zip(starts, [*starts[1:], len(tail)], strict=False))
+    budget = [LARGEST_EXPANDED]
 
-    def array(node: ET.Element | None) -> Numbers:
+    def array(node: ET.Element | None, expected: int | None = None) -> Numbers:
+        """`expected`: how many numbers there have to be."""
         if node is None:
             return np.zeros(0)
-        dtype = np.dtype(node.get("type", "").lower().replace("string", "uint8"))
+        if (kind := node.get("type", "").lower()) not in _XML_TYPES:
+            raise ValueError(f"unknown type {kind[:20]!r} of an array")
+        dtype = np.dtype(_XML_TYPES[kind])
         data, form = (node.text or "").encode(), node.get("format", "ascii")
         if form == "ascii":
-            return _parsed(data, dtype)
-        if form == "appended":
-            data = tail[(at := int(node.get("offset", 0))) : ends[at]]
-        if form != "appended" or not raw:  # header and data may be coded separately, each with padding
-            data = b"".join(map(base64.b64decode, re.findall(rb"[^=]+=*", b"".join(data.split()))))
-        count, width = int(np.frombuffer(data, word, 1)[0]), word.itemsize
-        if packer is None:
-            if len(data) < width + count:
-                raise ValueError("it is truncated")
-            data = data[width : width + count]
+            found = _parsed(data, dtype)
         else:
-            sizes = np.frombuffer(data, word, count + 3)[3:].tolist()
-            stops = np.cumsum([width * (count + 3), *sizes])
-            data = b"".join(_PACKERS[packer].decompress(data[a:b]) for a, b in pairwise(stops))
-        return np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
+            if form == "appended":
+                data = tail[(at := int(node.get("offset", 0))) : ends[at]]
+            if form != "appended" or not raw:  # header and data may be coded separately, each with padding
+                data = b"".join(map(base64.b64decode, re.findall(rb"[^=]+=*", b"".join(data.split()))))
+            limit = budget[0] if expected is None else min(budget[0], expected * dtype.itemsize)
+            data = _unpacked(data, word, packer, limit)
+            budget[0] -= len(data)
+            found = np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
+        if expected is not None and len(found) != expected:
+            raise ValueError(f"an array has {len(found)} numbers where {expected} are stated; truncated?")
+        return found
 
     return array
+
+
+def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit: int) -> bytes:
+    """The bytes of an array after its header, expanded; ValueError if they are not those that it states, or
+    more than `limit`."""
+    count, width = int(np.frombuffer(data, word, 1)[0]), word.itemsize
+    if packer is None:
+        if len(data) < width + count:
+            raise ValueError("it is truncated")
+        if count > limit:
+            raise ValueError(f"an array has {count} bytes, {limit} are expected")
+        return data[width : width + count]
+    if (count + 3) * width > len(data):
+        raise ValueError("it is truncated")
+    size, last, *packed = np.frombuffer(data, word, count + 3)[1:].tolist()
+    sizes = [size] * (count - 1) + [last or size] * (count > 0)
+    total = sum(sizes)
+    if total > limit or (count and min(sizes) < 1):
+        raise ValueError(f"an array expands to {total} bytes, {limit} are expected at most")
+    refuse_excess(total)
+    stops, parts = np.cumsum([width * (count + 3), *packed]), list[bytes]()
+    for (start, end), wanted in zip(pairwise(stops.tolist()), sizes, strict=True):
+        part = _PACKERS[packer]().decompress(data[start:end], wanted)
+        if len(part) != wanted:
+            raise ValueError("a block has another size than it states; is it truncated?")
+        parts.append(part)
+    return b"".join(parts)
 
 
 def _parsed(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
     """The numbers in a text."""
     kind = np.int64 if dtype.kind in "iu" else np.float64
-    words = text.split()
-    found = np.array(words, "S32").astype(kind) if len(words) < 100 else np.fromstring(text, kind, sep=" ")
-    if len(found) != len(words):
+    if len(text) < 2000:
+        return np.array([kind(word) for word in text.split()], kind)
+    filled = np.frombuffer(text, np.uint8) > ord(" ")
+    count = int(filled[0]) + int(
+        (filled[1:] & ~filled[:-1]).sum()
+    )  # of words; a list of them is 20 times the text
+    refuse_excess(8 * count)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a text that ends early
+        found = np.fromstring(text, kind, sep=" ")
+    if len(found) != count:
         raise ValueError("a number can't be read")
     return found
 
 
 def _read_legacy(data: bytes) -> MeshFile:
-    file, found = _Legacy(data), MeshFile()
+    file, found, cells = _Legacy(data), MeshFile(), _Cells()
     mixed: tuple[Ints, Ints] | None = None
-    target: dict[str, Numbers] | None = None
+    target: dict[str, PointArray] | None = None
     rows = 0
     while words := file.words():
         key = words[0].upper()
         if key == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
             raise ValueError(f"it holds {words[1]}, not an unstructured grid or polygons")
         if key == "POINTS":
-            found.points = file.numbers(3 * int(words[1]), words[2]).reshape(-1, 3).astype(np.float64)
+            found.points = file.numbers(3 * int(words[1]), words[2])().reshape(-1, 3).astype(np.float64)
         elif key == "CELLS":
             mixed = file.cells(int(words[1]), int(words[2]))
         elif key in _LEGACY_CELLS:
-            found.add(_LEGACY_CELLS[key], *file.cells(int(words[1]), int(words[2])))
+            cells.add(_LEGACY_CELLS[key], *file.cells(int(words[1]), int(words[2])))
         elif key == "CELL_TYPES" and mixed is not None:
-            found.add(file.numbers(int(words[1]), "int"), *mixed)
+            cells.add(file.numbers(int(words[1]), "int")(), *mixed)
         elif key in ("POINT_DATA", "CELL_DATA"):
             rows, target = int(words[1]), found.point_data if key == "POINT_DATA" else {}
+            if target is found.point_data and rows != len(found.points):
+                raise ValueError(f"it has data of {rows} points, and {len(found.points)} points")
         elif key in _ATTRIBUTES and target is not None:
             parts = int(words[3]) if key == "SCALARS" and len(words) > 3 else _ATTRIBUTES[key]
             if key == "SCALARS":
                 file.words()  # LOOKUP_TABLE
-            target[words[1]] = file.numbers(rows * parts, words[2]).reshape(rows, parts)
+            target[words[1]] = PointArray(parts, file.numbers(rows * parts, words[2], (rows, parts)))
         elif key == "FIELD":
             for _ in range(int(words[2])):
-                name, width, tuples, kind = file.words()[:4]
+                name, width, tuples, kind = file.words()[:4]  # ValueError at the end of the file
+                parts, count = int(width), int(tuples)
                 if kind == "string":
-                    for _ in range(int(tuples)):
-                        file.words()
+                    file.skip_lines(count)
                     continue
-                values = file.numbers(int(width) * int(tuples), kind).reshape(int(tuples), int(width))
+                values = file.numbers(parts * count, kind, (count, parts))
                 if target is not None:
-                    target[name] = values
-                elif name.lower() in _TIMES and values.size:
-                    found.time = float(values.ravel()[0])
+                    target[name] = PointArray(parts if count == rows else 0, values)
+                elif name.lower() in _TIMES and parts * count > 0:
+                    found.time = float(values().ravel()[0])
+    found.cells = cells.join()
     return found
 
 
@@ -228,39 +385,62 @@ class _Legacy:
             found = self._data[self._at : end].decode("latin-1").split()
             self._at = end + 1
             if found == ["METADATA"]:
-                blank = re.compile(rb"\n[ \t\r]*\n").search(self._data, self._at - 1)
+                blank = _BLANK.search(self._data, self._at - 1)
                 self._at = blank.end() if blank else len(self._data)
             elif found:
                 return found
         return []
 
-    def numbers(self, count: int, kind: str) -> Numbers:
-        """The next `count` numbers of a type."""
+    def skip_lines(self, count: int) -> None:
+        """Passes over lines of text. ValueError: there are fewer."""
+        for _ in range(count):
+            if not self.words():
+                raise ValueError(f"it ends before its {count} texts; is it truncated?")
+
+    def numbers(self, count: int, kind: str, shape: tuple[int, ...] = (-1,)) -> Callable[[], Numbers]:
+        """Passes over the next `count` numbers of a type; what is returned reads them in a shape."""
         if kind.lower() not in _LEGACY_TYPES:
-            raise ValueError(f"unknown type {kind!r}")
-        dtype = np.dtype(f">{_LEGACY_TYPES[kind.lower()]}")
+            raise ValueError(f"unknown type {kind[:20]!r}")
+        dtype, start = np.dtype(f">{_LEGACY_TYPES[kind.lower()]}"), self._at
+        least = count * dtype.itemsize if self._binary else 2 * count - 1  # digits, and what parts them
+        if count < 0 or least > len(self._data) - start:
+            raise ValueError(f"it ends before the {count} numbers that are stated; is it truncated?")
         if self._binary:
-            found = np.frombuffer(self._data, dtype, count, self._at)
-            self._at += found.nbytes
-            return found.astype(dtype.newbyteorder("="))
-        stop = _WORD_LINE.search(self._data, self._at - 1)
-        end = stop.start() if stop else len(self._data)
-        found = _parsed(self._data[self._at : end], dtype)
-        if len(found) != count:
-            raise ValueError(f"it has {len(found)} numbers where {count} are stated; is it truncated?")
-        self._at = end
-        return found
+            self._at += count * dtype.itemsize
+            return lambda: (
+                np.frombuffer(self._data, dtype, count, start).astype(dtype.newbyteorder("=")).reshape(shape)
+            )
+        stop = _WORD_LINE.search(self._data, start - 1)
+        self._at = end = stop.start() if stop else len(self._data)
+
+        def read() -> Numbers:
+            found = _parsed(self._data[start:end], dtype)
+            if len(found) != count:
+                raise ValueError(f"it has {len(found)} numbers where {count} are stated; is it truncated?")
+            return found.reshape(shape)
+
+        return read
 
     def cells(self, count: int, size: int) -> tuple[Ints, Ints]:
         """Nodes of cells one after another, and where each ends."""
         start, words = self._at, self.words()
         if words[:1] == ["OFFSETS"]:  # since 5.1: `count` offsets, then `size` point numbers
-            offsets = self.numbers(count, words[1]).astype(np.int64)
-            return self.numbers(size, self.words()[1]).astype(np.int64), offsets[1:]
+            offsets = whole(self.numbers(count, words[1])())
+            return whole(self.numbers(size, self.words()[1])()), offsets[1:]
         self._at = start
-        numbers = self.numbers(size, "int").astype(np.int64)
-        first, at = np.empty(count, np.int64), 0
+        numbers = whole(self.numbers(size, "int")())
+        if not 0 <= count <= size:
+            raise ValueError(f"{count} cells can't consist of {size} numbers")
+        if count and size % count == 0 and (numbers[:: size // count] == size // count - 1).all():
+            return np.delete(numbers, slice(None, None, size // count)), np.arange(1, count + 1) * (
+                size // count - 1
+            )
+        first, at, lengths = np.empty(count, np.int64), 0, numbers.tolist()
         for k in range(count):
+            if at >= size or lengths[at] < 0:
+                raise ValueError("a cell has no nodes; is it truncated?")
             first[k] = at
-            at += 1 + int(numbers[at])
+            at += 1 + lengths[at]
+        if at != size:
+            raise ValueError("numbers of cells and of their nodes differ")
         return np.delete(numbers, first), np.cumsum(numbers[first])

@@ -21,7 +21,8 @@ FILES: dict[tuple[str, str], int] = {
 LARGEST_STATE, _LARGEST_LIST = 2 << 30, 32 << 20  # bytes of a file of a series, of a collection of them
 COLLECTIONS = (".pvd", ".series")  # suffixes of files that name those of a series
 _PICTURES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-_OF_SERIES = (*COLLECTIONS, ".vtu", ".vtk", ".vtp", ".npz", ".obj")
+_OF_SERIES = (*COLLECTIONS, ".vtu", ".vtk", ".vtp", ".npz", ".obj", ".ply", ".glb")
+_MOST_STATES = 20_000  # of a collection, which may name one file again and again
 
 
 def canonical(value: Any) -> bytes:
@@ -58,6 +59,16 @@ def list_sources(mechanics: MechanicsSection) -> list[Path]:
     return folders if "*" in source.name and folders else [source]
 
 
+def inside(folder: Path, name: str) -> Path:
+    """The file that a series names in its folder. UserError: it is elsewhere, also by a link."""
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name:
+        raise UserError(f"{folder}: {name} is not in its folder; copy the file there")
+    if not (folder / path).resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{folder / path}: is a link out of its folder; copy the file there")
+    return folder / path
+
+
 def list_files(mechanics: MechanicsSection) -> list[Path]:
     """Files that series and tables of all sequences consist of. UserError: there are none."""
     found, tables = list[Path](), (table_of(mechanics.force), mechanics.instruments)
@@ -68,7 +79,7 @@ def list_files(mechanics: MechanicsSection) -> list[Path]:
         lists = [one for one in files if one.suffix in COLLECTIONS]
         if len(lists) == 1:  # which is then read instead of numbered files
             files += [file for file, _ in read_collection(lists[0])]
-        found += [*files, *(folder / one for one in tables if one is not None)]
+        found += [*files, *(inside(folder, one) for one in tables if one is not None)]
     if not (found := [file for file in dict.fromkeys(found) if file.is_file()]):
         raise UserError(f"mechanics.source: no file is named by {mechanics.source}")
     return found
@@ -78,6 +89,8 @@ def read_collection(source: Path) -> list[tuple[Path, float]]:
     """Files and times of a .pvd or .series file. UserError if it is neither, or lists fewer than two."""
     text = checked_file.read_text(source, _LARGEST_LIST)
     with as_user_error(f"{source}: is not a collection of files"):
+        if "<!ENTITY" in text:
+            raise ValueError("it declares entities")
         if source.suffix == ".pvd":
             sets = [one.attrib for one in ET.fromstring(text).iter("DataSet")]
             if len({one.get("part", "0") for one in sets}) > 1:
@@ -85,11 +98,9 @@ def read_collection(source: Path) -> list[tuple[Path, float]]:
             found = [(one["file"], float(one["timestep"])) for one in sets]
         else:
             found = [(one["name"], float(one["time"])) for one in json.loads(text)["files"]]
-        if len(found) < 2:
-            raise ValueError("it lists fewer than two files")
-        if outside := [name for name, _ in found if Path(name).is_absolute() or ".." in Path(name).parts]:
-            raise ValueError(f"{outside[0]} is not in its folder")
-        return [(source.parent / name, time) for name, time in found]
+        if not 2 <= len(found) <= _MOST_STATES:
+            raise ValueError(f"it lists {len(found)} files, 2 to {_MOST_STATES} are possible")
+        return [(inside(source.parent, name), time) for name, time in found]
 
 
 def list_pictures(folder: Path) -> list[Path]:

@@ -65,6 +65,8 @@ class RenderedFrame:
     """(H, W) this frame's pixels: a specular highlight hides the tissue."""
     flow_next: Map | None = None
     """(H, W, 2) px from this frame to the next, at this frame's pixels; 0 off the tissue."""
+    flow_next_all: Map | None = None
+    """(H, W, 2) px, as `flow_next`, of tissue, instruments and all else; 0 where there is nothing."""
     normals: Map | None = None
     """(H, W, 3) camera axes, this frame's pixels; 0 where there is nothing."""
     blur: Map | None = None
@@ -154,6 +156,11 @@ class Renderer:
             there = after or state
             lens = there.camera or self.camera
             extra["flow_next"] = truth.forward_flow(own.hits, faces, there.vertices, lens)
+        if "flow_next_all" in self._extra:
+            there = after or state
+            moved = joined(Shape(there.vertices, faces), self._static, self._posed(there))
+            lens = there.camera or self.camera
+            extra["flow_next_all"] = truth.forward_flow(own.hits, moved.faces, moved.vertices, lens)
         if "normals" in self._extra:
             extra["normals"] = truth.normal_map(camera, own.hits, shapes)
         if "blur" in self._extra:

@@ -146,7 +146,7 @@ def trace_frame(camera: Camera, rest: RestFrame, surface: Shape, static: Shape, 
 
 def forward_flow(hits: Hits, faces: Indices, vertices: Floats, camera: Camera) -> Map:
     """Flow (H, W, 2) px from each pixel of one frame, by its hits, the surface's faces first, to another
-    frame, by the surface's vertices (V, 3) mm and the camera in it; 0 off the tissue."""
+    frame, by the surface's vertices (V, 3) mm and the camera in it; 0 off the surface."""
     on = (hits.face >= 0) & (hits.face < len(faces))
     points = blend(faces, hits.face[on], hits.bary[on], vertices)
     return _picture(on, cameras.project(camera, points) - cameras.pixel_grid(camera.size)[on], camera)

@@ -10,6 +10,7 @@ import numpy as np
 
 from synth.arguments import checked
 from synth.arrays import Mask, Pixels
+from synth.dataset.folder import Folder
 from synth.dataset.store import Writer
 from synth.errors import UserError
 from synth.fields import FIELDS, MOST_INSTRUMENTS
@@ -76,6 +77,7 @@ def write_scene(
     _refuse_unseen(scene)
     width, height = job.render.size
     writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=scene.dataset)
+    Folder(Path(folder)).refuse_replaced(scene.dataset, writer.job_identity)
     writer.put("time", scene.time)
     writer.put("force", scene.force)  # labels are in camera axes
     if writer.wants("force_of"):
@@ -244,6 +246,7 @@ def _mechanics(scene: Scene) -> dict[str, Any]:
         # Whether the work of the instruments equals the stored energy.
         "elastic": timeless and case.pulse is None and scene.series is None,
         **{name: values.tolist() for name, values in series.items() if values is not None},
+        **({"cautions": list(motion.cautions)} if motion.cautions else {}),
         "instruments": [
             {
                 "kind": kind,

@@ -55,18 +55,21 @@ class SeriesMechanics:
                         nearest = np.linalg.norm(away, axis=2).argmin(axis=1)
                         parts[t] = [load[t][nearest == k].sum(axis=0) for k in range(count)]
                     work[t] = 0.5 * (load[t] * moved[t]).sum()
-        step = float(np.linalg.norm(np.diff(moved, axis=0), axis=2).max())
+        steps = np.linalg.norm(np.diff(moved, axis=0), axis=2).max(axis=1)
         corners = series.points[series.faces]
-        if step > np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)):
-            jump = f"a vertex moves by {step:.2g} mm from frame to frame, more than a cell of the mesh"
-            warnings.warn(f"mechanics.source: {jump}; store more states, or raise fps", Caution, stacklevel=1)
+        cell = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+        cautions = list(series.cautions)
+        if (step := float(steps.max())) > cell and not any(one.startswith("nodes") for one in cautions):
+            between = f"from frame {steps.argmax()} to the next, more than a cell of the mesh, {cell:.2g} mm"
+            cautions.append(f"the surface moves by {step:.2g} mm {between}: store more states, or raise fps")
         whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm
         outside = float(np.linalg.norm(lost + load[:, hidden].sum(axis=1), axis=1).max())
         if outside > _LOST * (most := max(float(np.linalg.norm(whole + lost, axis=1).max()), outside)):
             share = f"{outside:.3g} mN, {100 * outside / most:.0f}% of the load"
             beyond = f"{np.linalg.norm(lost, axis=1).max():.2f} mN beyond the drawn surface are in no label"
-            why = f"mechanics.force: {share}, act outside the opening; {beyond}"
-            warnings.warn(why, Caution, stacklevel=1)
+            cautions.append(f"force: {share}, act outside the opening; {beyond}")
+        for caution in cautions:
+            warnings.warn(f"mechanics.source: {caution}", Caution, stacklevel=1)
         if series.force is None:
             for unknown in (load, whole, parts):
                 unknown.fill(np.nan)
@@ -78,4 +81,5 @@ class SeriesMechanics:
             tip=tip,
             shaft=shaft,
             tool_work=None if series.force is None else work,
+            cautions=tuple(cautions),
         )

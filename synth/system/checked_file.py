@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import glob
 import json
+import math
 import os
 import shutil
 import stat
 import tempfile
+import time
 import warnings
-from collections.abc import Callable, Iterator
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -21,10 +25,13 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError, as_user_error, first_line
+from synth.system.memory import refuse_excess
 
 LARGEST_PICTURE, LARGEST_YAML = 512 << 20, 200_000  # bytes
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
+_LARGEST_HEAD = 10_000  # bytes of an array's header, NumPy's own limit
+_OLD_S = 86_400.0  # after which an unfinished folder has been left, where locks can't tell
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
@@ -67,15 +74,69 @@ def read_json(path: Path, largest: int = 64 << 20) -> Any:
         return json.loads(text)
 
 
+class ArrayFile(Mapping[str, NDArray[Any]]):
+    """The arrays of an .npz by name, numbers or Booleans of any shape (A, ...), each read when it is indexed.
+
+    UserError, here and on reading: it is no .npz, an array is of another type, or has another size than its
+    header states, or than the memory holds.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.shapes = path, dict[str, tuple[int, ...]]()
+        self.types = dict[str, np.dtype[Any]]()
+        label = as_user_error(f"{path}: cannot be read as .npz")
+        with open_file(path, _LARGEST_ARRAYS) as file, label, zipfile.ZipFile(file) as archive:
+            for entry in archive.infolist():
+                name = entry.filename.removesuffix(".npy")
+                self.shapes[name], self.types[name] = _read_head(archive, entry)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self.shapes:
+            raise KeyError(name)
+        with open_file(self.path, _LARGEST_ARRAYS) as file, as_user_error(f"{self.path}: cannot be read"):
+            refuse_excess(math.prod(self.shapes[name]) * self.types[name].itemsize)
+            with np.load(file, allow_pickle=False) as held:
+                found = np.asarray(held[name])
+            if found.shape != self.shapes[name]:
+                raise ValueError(f"{name} has changed meanwhile")
+            return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.shapes)
+
+    def __len__(self) -> int:
+        return len(self.shapes)
+
+
+def _read_head(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an .npy in an archive; ValueError if it is none, or its size is not as it states."""
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{entry.filename} is compressed in another way than by NumPy")
+    with archive.open(entry) as file:
+        start = file.read(12)
+    version, size = (
+        tuple(start[6:8]),
+        int.from_bytes(start[8:10] if start[6:7] == b"\1" else start[8:], "little"),
+    )
+    if start[:6] != b"\x93NUMPY" or version not in ((1, 0), (2, 0)) or size > _LARGEST_HEAD:
+        raise ValueError(f"{entry.filename} is not an array of numbers")
+    with archive.open(entry) as file:
+        np.lib.format.read_magic(file)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, _, dtype = read(file)
+    if dtype.kind not in "biuf":
+        raise ValueError(f"{entry.filename.removesuffix('.npy')} is not an array of numbers")
+    stated = (10 if version == (1, 0) else 12) + size + math.prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or stated != entry.file_size:
+        raise ValueError(f"{entry.filename} has {entry.file_size} bytes, its header states {stated}")
+    return shape, dtype
+
+
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by name, of any shape (A, ...), numbers or Booleans. UserError for others."""
-    with open_file(path, _LARGEST_ARRAYS) as file, as_user_error(f"{path}: cannot be read as .npz"):
-        with np.load(file, allow_pickle=False) as held:
-            found = {name: held[name] for name in held.files}
-        for name, array in found.items():
-            if array.dtype.kind not in "biuf":
-                raise ValueError(f"{name} is not an array of numbers")
-        return found
+    """All arrays of an .npz by name. UserError as of `ArrayFile`."""
+    return dict(ArrayFile(path))
 
 
 def read_picture(path: Path, flags: int = 1) -> NDArray[np.generic]:
@@ -184,12 +245,53 @@ def part_of(
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[Path]:
-    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created."""
+    """As `part_of`, for a new folder. UserError if `path` exists, or its parent folder can't be created.
+
+    What an earlier process left of it when it was killed is deleted.
+    """
     if os.path.lexists(path):
         raise UserError(f"{path}: exists already")
     make_folder(path.absolute().parent)
+    _sweep_parts(path)
     with part_of(path, Path.mkdir) as part:
-        yield part
+        descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            _lock(descriptor)  # tells that a process writes to it
+            yield part
+        finally:
+            os.close(descriptor)
+
+
+def _sweep_parts(path: Path) -> None:
+    """Deletes the unfinished folders of `path` that no process writes to any more."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.????????{PART}"):
+        if part.is_symlink() or not part.is_dir():
+            continue
+        with suppress(OSError):
+            descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                free = _lock(descriptor)
+                if free is None:  # no locks here: another machine may write to it
+                    free = (
+                        time.time() - max(one.lstat().st_mtime for one in (part, *part.rglob("*"))) > _OLD_S
+                    )
+                if free:
+                    shutil.rmtree(part)
+            finally:
+                os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool | None:
+    """Whether no other process held the lock of a folder, which this one now holds; None without locks."""
+    try:
+        import fcntl  # not on Windows
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return None
+    return True
 
 
 def make_folder(path: Path, space_bytes: int = 0) -> None:

@@ -24,16 +24,17 @@ class Locked(Exception):
 
 
 @contextmanager
-def hold(path: Path) -> Iterator[int]:
+def hold(path: Path, wait_s: float | None = None) -> Iterator[int]:
     """Holds the lock of a file, which is created; yields its descriptor, by which child processes hold it
     too.
 
     Without locks of the file system a file next to it is refreshed: a dead process's is taken at once,
     another machine's after half a minute; machines with locks see it, but not the other way round. If it is
-    lost, as after a suspension, this process is interrupted. Raises `Locked` after some seconds.
+    lost, as after a suspension, this process is interrupted. Raises `Locked` after some seconds, or `wait_s`.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    until = time.monotonic() + _WAIT_S
+    wait_s = _WAIT_S if wait_s is None else wait_s
+    until = time.monotonic() + wait_s
     try:
         while (locked := _try_lock(descriptor, fcntl.LOCK_EX)) is False or (locked and _is_leased(path)):
             if time.monotonic() > until:
@@ -48,7 +49,7 @@ def hold(path: Path) -> Iterator[int]:
             _lease(path), lease_duration=_LEASE_S, on_compromise=lambda lost: interrupt_main()
         )
         try:
-            lease.acquire(timeout=_LEASE_S + _WAIT_S)
+            lease.acquire(timeout=_LEASE_S + wait_s)
         except Timeout:
             raise Locked from None
         try:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from synth.dataset.folder import claim
+from synth.dataset.folder import claim, parse_part
 from synth.dataset.index import write_index
 from synth.engine.child import Attempt
 from synth.engine.journal import Watcher
@@ -47,21 +47,22 @@ def in_process(job: Job, root: Path, work: Callable[..., None]) -> None:
         card.write_card(folder)
 
 
-def start(root: Path, job: Job, work: str) -> subprocess.Popen[bytes]:
+def start(root: Path, job: Job, work: str, part: str = "") -> subprocess.Popen[bytes]:
     """Starts a run in a process of its own, which can be killed."""
     # Tests in a shell's background ignore SIGINT, and so would their children.
     program = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "import sys; sys.path[:0] = sys.argv[4:]; from pathlib import Path; import fake_run; "
-        "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3])"
+        "import sys; sys.path[:0] = sys.argv[5:]; from pathlib import Path; import fake_run; "
+        "fake_run.run_here(Path(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4])"
     )
-    words = [str(root), job.model_dump_json(), work, str(HERE), str(HERE.parents[1])]
+    words = [str(root), job.model_dump_json(), work, part, str(HERE), str(HERE.parents[1])]
     return subprocess.Popen([sys.executable, "-c", program, *words])
 
 
-def run_here(root: Path, job: str, work: str) -> None:
+def run_here(root: Path, job: str, work: str, part: str) -> None:
     """The run in the process of `start`."""
-    run_job(Job.model_validate_json(job), root, options(work), Silent())
+    given = options(work, part=parse_part(part) if part else None)
+    run_job(Job.model_validate_json(job), root, given, Silent())
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:

@@ -21,10 +21,13 @@ from synth.arrays import Floats, Ints
 from synth.errors import UserError, as_user_error
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.fem.external.vtk_series import force_field
+from synth.geometry.mesh_file import read_surface, whole
 from synth.geometry.skin import TRIANGLE
+from synth.job import identity
 from synth.system import checked_file
 
 _CELLS = {"faces": TRIANGLE, "tetrahedra": 10, "hexahedra": 12}
+_MOTION = ("displacement", "displacements")
 _RECORDED = "surface_external_forces"
 _NEAR = 1e-3  # of the extent, within which a vertex of the OBJ is one of the arrays
 
@@ -41,45 +44,51 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     `recorded`: a run of the published recorder. Its forces are an "intensity", scaled so that their peak is
     the total force; they are scaled back.
     """
-    held = checked_file.read_arrays(file)
-    if "points" in held and held["points"].ndim == 3 and len(held["points"]):
-        rest, moved = held["points"][0].astype(np.float64), held["points"] - held["points"][0]
-    elif {"rest", "displacement"} <= set(held) or {"rest", "displacements"} <= set(held):
-        rest, moved = held["rest"].astype(np.float64), held.get("displacement", held.get("displacements"))
+    held = checked_file.ArrayFile(file)
+    shapes = held.shapes
+    if len(shapes.get("points", ())) == 3 and shapes["points"][0]:
+        moved = held["points"]
+        rest = moved[0].astype(np.float64)
+        moved = moved - moved[0]
+    elif "rest" in held and (name := next((one for one in _MOTION if one in held), None)):
+        rest, moved = held["rest"].astype(np.float64), held[name]
     else:
         what = "needs points (S, N, 3), or rest and displacement"
         raise UserError(f"{file}: {what}; it has {', '.join(sorted(held))}")
-    assert moved is not None
-    fields = [name for name, one in held.items() if one.shape == moved.shape]
+    fields = [name for name, shape in shapes.items() if shape == moved.shape]
     name, per_area = force_field(force, fields, file)
-    time = held.get("times", np.full(len(moved), np.nan))
+    time = held["times"] if "times" in held else np.full(len(moved), np.nan)
     same = moved.shape == (len(time), *rest.shape) and time.ndim == 1
     if not same or rest.shape[1:] != (3,) or len(time) < 2:
-        shapes = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
-        raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {shapes}")
-    load = None if name is None else held[name].astype(np.float64)
+        given = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
+        raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {given}")
+    load = None if name is None else held[name]
     if recorded:
         units = Units(mm=units.mm or 1.0, mn=units.mn or 1000.0, dt_s=units.dt_s)
         if load is not None and name == _RECORDED:
             peak, total = np.linalg.norm(load, axis=2).max(axis=1), np.linalg.norm(load.sum(axis=1), axis=1)
-            load *= np.divide(peak, total, out=np.zeros_like(peak), where=total > 0)[:, None, None]
-    cells = {kind: held[one].astype(np.int64) for one, kind in _CELLS.items() if one in held}
-    surface = find_surface(rest, {TRIANGLE: _faces_of(file, rest)} if recorded else cells, file)
-    loads = [None] * len(time) if load is None else load
-    states = (State(file, *one) for one in zip(time.tolist(), moved.astype(np.float64), loads, strict=True))
+            share = np.divide(peak, total, out=np.zeros_like(peak), where=total > 0)
+            load = load * share[:, None, None]
+    with as_user_error(f"{file}: its cells"):
+        named = {TRIANGLE: _faces_of(file, rest)} if recorded else {}
+        cells = named or {kind: whole(held[one]) for one, kind in _CELLS.items() if one in held}
+    surface = find_surface(rest, cells, file)
+    states = (
+        State(file, at, moved[k].astype(np.float64), None if load is None else load[k].astype(np.float64))
+        for k, at in enumerate(time.tolist())
+    )
     return assemble(file, surface, units, len(time), states, fields, per_area)
 
 
 def _faces_of(arrays: Path, rest: Floats) -> Ints:
     """Faces (F, 3) of the surface next to the arrays, by the numbers of their points."""
-    import trimesh
-
     found = sorted(arrays.parent.glob("*.obj"))
     if len(found) != 1:
         raise UserError(f"{arrays.parent}: {len(found)} OBJ files; the recorded surface, one, is needed")
+    data = checked_file.read_bytes(found[0], identity.FILES["anatomy", "mesh"])
     with as_user_error(f"{found[0]}: is not a readable surface"):
-        mesh = trimesh.load(found[0], force="mesh", process=False)
-    away, nearest = cKDTree(rest).query(np.asarray(mesh.vertices))
+        vertices, faces = read_surface(data, "obj")
+    away, nearest = cKDTree(rest).query(vertices)
     if len(away) == 0 or away.max() > _NEAR * np.ptp(rest, axis=0).max():
         raise UserError(f"{found[0]}: its vertices are not those of {arrays.name} at rest")
-    return np.asarray(nearest[np.asarray(mesh.faces)], np.int64)
+    return np.asarray(nearest[faces], np.int64)

@@ -13,13 +13,18 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints, Map
 from synth.errors import UserError, as_user_error
+from synth.fem.external import plausibility
 from synth.fem.surface_embedding import vertex_area
 from synth.geometry.skin import skin
 from synth.system.csv_table import read_csv, read_header
+from synth.system.memory import refuse_excess
 
 _LENGTHS = {1.0: "mm", 1000.0: "m", 10.0: "cm"}
 _LIKELY_MM, _POSSIBLE_MM = (20.0, 400.0), (1.0, 2000.0)  # largest extent of a specimen
 _ROUNDING = 1e-5  # relative to an extent or a largest force: files are in single precision
+_LARGEST = 1e30  # of a displacement or force: its square is summed in double precision
+_MOST_STRETCH = 3.0  # of the width of a specimen
+_DISPLACED = 0.3  # share of the largest displacement
 _LEAST_LOAD = 0.01  # share of the largest load below which a surface counts as unloaded
 
 
@@ -47,6 +52,7 @@ class MeshSeries:
     fields: tuple[str, ...]  # names of the vector fields at nodes
     timed: bool  # whether the files state times
     force: Map | None = None  # (S, N, 3) mN at nodes, on the surface from outside; None: not known
+    cautions: tuple[str, ...] = ()  # what can't be right, or is unlikely for soft tissue; see `plausibility`
 
     @property
     def summary(self) -> str:
@@ -127,8 +133,11 @@ def assemble(
     """
     place, nodes = surface.place, surface.nodes
     files, times = list[Path](), list[float]()
+    with as_user_error(f"{source}: {count} states"):
+        refuse_excess(12 * count * len(nodes))
     displacement, force = np.empty((count, len(nodes), 3), np.float32), None
     for k, (where, at, moved, load) in enumerate(states):
+        _refuse_wild(surface.points, moved[nodes], where)
         if np.abs(moved - moved[place]).max(initial=0) > _ROUNDING * max(float(np.abs(moved).max()), 1e-9):
             raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
         files.append(where)
@@ -137,7 +146,8 @@ def assemble(
         if load is not None:
             force, whole = np.empty_like(displacement) if force is None else force, np.zeros_like(moved)
             np.add.at(whole, place, load)
-            force[k] = whole[nodes] / (np.bincount(place)[nodes][:, None] if per_area else 1)
+            force[k] = _single(whole[nodes] / (np.bincount(place)[nodes][:, None] if per_area else 1), where)
+    _refuse_blank(displacement, files)
     timed, time = not np.isnan(times).all(), _rising(times, files, units)
     scale = _length(surface.points, units, source)
     points = scale * surface.points
@@ -153,7 +163,10 @@ def assemble(
         hint = f"is unit_mm right, and which of its vectors ({has}) displacement?"
         raise UserError(f"{source}: its surface of {extent:.3g} mm moves by {largest:.2g} mm only; {hint}")
     none = np.zeros((len(time), 0, 3))  # instruments
-    found = MeshSeries(points, surface.faces, time, displacement, none, none, scale, tuple(fields), timed)
+    cautions = plausibility.find_permutations(points, surface.faces, displacement, nodes, files)
+    cautions += plausibility.find_speed_doubts(displacement, time)
+    about = scale, tuple(fields), timed, None, tuple(cautions)
+    found = MeshSeries(points, surface.faces, time, displacement, none, none, *about)
     if force is None:
         return found
     each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
@@ -161,8 +174,39 @@ def assemble(
     return bear(found, force, source)
 
 
+def _single(values: Floats, where: Path) -> Map:
+    """Values (N, 3) in single precision. UserError: they are too large for it, or not finite."""
+    if not np.abs(values).max(initial=0) < _LARGEST:
+        raise UserError(f"{where}: has values that are not finite, or above {_LARGEST:g}")
+    return values.astype(np.float32)
+
+
+def _refuse_wild(points: Floats, moved: Floats, where: Path) -> None:
+    """Raises UserError for displacement (N, 3) of points (N, 3) that isn't finite, or no motion of tissue."""
+    _single(moved, where)
+    extent, largest = float(np.ptp(points, axis=0).max()), float(np.abs(moved).max(initial=0))
+    if largest > extent:
+        times = f"{largest / max(extent, 1e-300):.3g} times the width of its surface"
+        what = f"is displaced by {largest:.3g}, {times}"
+        raise UserError(f"{where}: {what}; are they in one unit, and do nodes keep their numbers?")
+    wide = float(np.ptp(points + moved, axis=0).max())
+    if not extent / _MOST_STRETCH <= wide <= _MOST_STRETCH * extent:
+        raise UserError(f"{where}: its surface is {wide:.3g} wide, at rest {extent:.3g}; are values missing?")
+
+
+def _refuse_blank(displacement: Map, files: list[Path]) -> None:
+    """Raises UserError for a state at rest between two that are displaced: one that wasn't written."""
+    size = np.abs(displacement).max(axis=(1, 2), initial=0)
+    high = size > _DISPLACED * size.max()
+    for k in np.flatnonzero((size[1:-1] == 0) & high[:-2] & high[2:]) + 1:
+        why = "is one missing? Leave it out, or store states next to it"
+        raise UserError(f"{files[k]}: state {k} is at rest, those before and after it are displaced; {why}")
+
+
 def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
     """Times (S,) s from 0, as stated by the files or `dt_s`. UserError: none, or they don't rise."""
+    if np.isinf(times).any():
+        raise UserError(f"{files[int(np.isinf(times).argmax())]}: its time is infinite")
     if np.isnan(times).all():
         if units.dt_s is None:
             raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
@@ -184,12 +228,19 @@ def bear(series: MeshSeries, force: Map, source: Path) -> MeshSeries:
     """The series with forces (S, N, 3) mN on its nodes. UserError: they can't be those of a contact."""
     size, motion = np.sqrt(np.einsum("snd,snd->sn", force, force)).sum(axis=1), series.displacement
     moved = int(np.maximum(motion.max(axis=(1, 2)), -motion.min(axis=(1, 2))).argmax())
+    if not size.max() < _LARGEST:
+        raise UserError(f"{source}: has forces that are not finite, or above {_LARGEST:g} mN")
     if size[0] > 1e-3 * size.max():
         raise UserError(f"{source}: the first state bears {size[0]:.3g} mN; it has to be at rest")
     if size[moved] <= _LEAST_LOAD * size.max():
         raise UserError(
             f"{source}: where the surface is displaced most the force is {size[moved]:.2g} mN; a net force "
             "is 0 wherever the tissue is held (as that of SOFA's Monitor): give the force of the contact"
+        )
+    if plausibility.is_rigid(series.points, motion[k := int(size.argmax())]):
+        raise UserError(
+            f"{source}: state {k} bears {size[k]:.3g} mN and moves as a rigid body: no tissue is deformed by "
+            "that force; is the displacement that of the tissue?"
         )
     force[0] = 0.0
     return replace(series, force=force)
@@ -234,7 +285,7 @@ def _at_states(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
     found = read_csv(table, ("time", *names))
     time = found["time"] - found["time"][0]
     rows = np.stack([found[name] for name in names], axis=1)
-    if not np.isfinite(rows).all() or not (np.diff(time) > 0).all():
+    if not np.isfinite([*rows.ravel(), *time]).all() or not (np.diff(time) > 0).all():
         raise UserError(f"{table}: times don't rise, or a value is missing")
     if series.time[-1] > time[-1] + 1e-6:
         raise UserError(f"{table}: lasts {time[-1]:g} s, the series {series.time[-1]:g} s")

@@ -1,4 +1,5 @@
-"""Series of VTK files: numbered .vtu, .vtk or .vtp, and collections of them: .pvd, ParaView's .series."""
+"""Series of meshes: numbered .vtu, .vtk or .vtp, collections of them (.pvd, ParaView's .series), or surfaces
+(.obj, .ply, .glb) whose points move."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import numpy as np
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error, did_you_mean
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
-from synth.geometry.mesh_file import SUFFIXES, MeshFile, read_mesh
+from synth.geometry.mesh_file import SUFFIXES, SURFACES, MeshFile, read_mesh, read_surface
+from synth.geometry.skin import TRIANGLE
 from synth.job.identity import COLLECTIONS, LARGEST_STATE, read_collection
 from synth.system import checked_file
 
@@ -35,7 +37,7 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
     files, times = list_states(source)
     first = _read(files[0])
     surface = find_surface(first.points, first.cells, files[0])
-    fields = [name for name, values in first.point_data.items() if values.shape == first.points.shape]
+    fields = [name for name, values in first.point_data.items() if values.parts == 3]
     named = [name for name in fields if name.lower() in MOVED]
     field = named[0] if len(named) == 1 else None  # else the points themselves move
     load, per_area = force_field(force, fields, files[0])
@@ -66,13 +68,16 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     if len(lists) == 1:
         return list_states(lists[0])
     found = [file for file in every if file.suffix[1:] in SUFFIXES]
+    found = found or [file for file in every if file.suffix[1:].lower() in SURFACES]
     stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in found})
     if len(stems) > 1:
         raise UserError(f"{source}: files of several series, {', '.join(stems[:3])}; choose one of these")
     numbers = {file: re.search(r"\d+$", file.stem) for file in found}
     order = sorted((int(number[0]), file) for file, number in numbers.items() if number)
     if len(order) < 2:
-        raise UserError(f"{source}: no series; two numbered files at least ({', '.join(SUFFIXES)})")
+        raise UserError(
+            f"{source}: no series; two numbered files at least ({', '.join((*SUFFIXES, *SURFACES))})"
+        )
     steps = np.diff([number for number, _ in order])
     if (odd := np.flatnonzero(steps != steps.min())).size:
         before, after = (order[odd[0] + k][1].name for k in (0, 1))
@@ -83,6 +88,9 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
 def _read(file: Path) -> MeshFile:
     data = checked_file.read_bytes(file, LARGEST_STATE)
     with as_user_error(f"{file}: is not a readable mesh"):
+        if (kind := file.suffix[1:].lower()) in SURFACES:
+            points, faces = read_surface(data, kind)
+            return MeshFile(points, {TRIANGLE: faces})
         return read_mesh(data)
 
 
@@ -102,6 +110,7 @@ def force_field(force: str | None, fields: Sequence[str], where: Path) -> tuple[
 
 def _values(state: MeshFile, name: str, file: Path) -> Floats:
     values = state.point_data.get(name)
-    if values is None or values.shape != state.points.shape:
+    if values is None or values.parts != 3:
         raise UserError(f"{file}: has no vectors {name} at its points")
-    return np.asarray(values, np.float64)
+    with as_user_error(f"{file}: {name} can't be read"):
+        return np.asarray(values.read(), np.float64)

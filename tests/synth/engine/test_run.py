@@ -4,9 +4,12 @@ import json
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from pathlib import Path
 
+import fake_work
+import numpy as np
 import pytest
 from command import run as command
 from fake_run import Silent, options, start, wait_for
@@ -14,7 +17,7 @@ from forked_workers import Forkserver
 
 from synth.cli import app
 from synth.dataset import index, provenance, size_forecast
-from synth.dataset.folder import Folder
+from synth.dataset.folder import Folder, Part, parse_part
 from synth.engine import child, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup
@@ -64,6 +67,76 @@ def test_a_dataset_is_extended_by_any_number_of_workers(tmp_path: Path, undistur
     assert before == {path: path.stat().st_mtime_ns for path in root.rglob("*/c/*")}
     with pytest.raises(UserError):
         run(root, job=fewer)
+
+
+class InProcess:
+    """A slot that computes stand-ins in the engine's own process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def run(self, index: int, report: object, stop: threading.Event) -> child.Attempt:
+        fake_work.sequence(PARTED, index, self._folder, lambda *_: None)
+        return child.Attempt(index, "done")
+
+    def close(self) -> None:
+        pass
+
+
+PARTED = JOB.model_copy(update={"sequences": 45})
+
+
+def test_forty_parts_give_the_dataset_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight at a time, in an order of their own: stores, split and index are those of a single run."""
+
+    @contextmanager
+    def slots(kind: str, setup: Setup, *_: object) -> Iterator[list[InProcess]]:
+        yield [InProcess(setup.folder)]
+
+    monkeypatch.setattr(engine, "_slots", slots)
+    one = run(tmp_path / "one", job=PARTED)
+    order = np.random.default_rng(1).permutation(40) + 1
+
+    def part(number: int) -> Summary:
+        return run(tmp_path / "out", job=PARTED, part=Part(number, 40))
+
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(part, order.tolist()))
+    assert sum(summary.done for summary in made) == 45
+    assert {summary.total for summary in made} == {1, 2}
+    assert one.content_hash in {summary.content_hash for summary in made}
+    roots = tmp_path / "one", tmp_path / "out"
+    tables = [index.read_index(root).drop_columns(["cpu_s"]) for root in roots]
+    assert tables[0].equals(tables[1])
+    for name in ("split.json", "dataset.json", "job.yaml"):
+        assert len({(root / name).read_bytes() for root in roots}) == 1
+    assert (tmp_path / "out/README.md").is_file()
+    assert run(tmp_path / "out", job=PARTED).content_hash == one.content_hash
+
+
+@pytest.mark.slow
+def test_a_killed_part_is_run_again_beside_another(tmp_path: Path, undisturbed: str) -> None:
+    """Neither touches what the other computes; a run of the whole waits for none of them."""
+    victim = start(tmp_path / "out", JOB, "stuck", "1/2")
+    wait_for(lambda: len(list((tmp_path / "out").glob("*.zarr"))) >= 1)
+    with pytest.raises(UserError, match="another run"):
+        run(tmp_path / "out")
+    beside = run(tmp_path / "out", part=Part(2, 2))
+    assert (beside.total, beside.done, beside.content_hash) == (3, 3, "")
+    assert status.read_status(tmp_path / "out").running
+    victim.send_signal(signal.SIGKILL)
+    victim.wait(timeout=60)
+    wait_for(lambda: not status.read_status(tmp_path / "out").running)
+    assert not (tmp_path / "out/index.parquet").exists()
+    last = run(tmp_path / "out", part=Part(1, 2))
+    assert last.content_hash == undisturbed
+    assert not list((tmp_path / "out").glob("*.part"))
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "1", "a/b", "1/0", "-1/4", "1/100000000"])
+def test_a_wrong_part_is_refused(text: str) -> None:
+    with pytest.raises(UserError, match="--part"):
+        parse_part(text)
 
 
 @pytest.mark.usefixtures("forked")

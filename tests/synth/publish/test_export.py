@@ -12,8 +12,10 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 from command import run
 from PIL import Image
+from torch.utils.data import DataLoader
 
 from synth.cli import app
 from synth.dataset import index, split
@@ -102,36 +104,106 @@ def test_frames_are_those_of_the_store(root: Path) -> None:
     for wrong in ({"split": "all"}, {"clip": 4}, {"clip": -1}, {"split": "test", "sequences": [0]}):
         with pytest.raises(UserError):
             TorchDataset(root, ["flow"], **wrong)
-    with pytest.raises(IndexError):
-        frames[18]
+    for beyond in (18, -19):
+        with pytest.raises(IndexError):
+            frames[beyond]
+    for same in (-14, np.int64(4), np.array(4), torch.tensor(4)):
+        assert np.array_equal(frames[same]["flow"], item["flow"])
+    assert item["scale_mm_per_px"] == sequence.attrs["scale_mm_per_px"]
+    assert item["young_kpa"] == sequence.attrs["young_kpa"]
+    apart = TorchDataset(root, "flow", clip=2, stride=2)
+    assert len(apart) == 6
+    assert np.array_equal(apart[1]["flow"], sequence["flow"][::2])
+    assert [TorchDataset(root, "flow", step=2)[k]["frame"] for k in range(4)] == [0, 2, 0, 2]
+    assert {*sequence.fields} <= TorchDataset(root)[0].keys()
+    batch = next(iter(DataLoader(apart, batch_size=3)))
+    assert batch["flow"].shape[:2] == (3, 2)
+    assert batch["young_kpa"].shape == (3,)
+    for wrong in ({"stride": 2}, {"step": 0}, {"clip": 3, "stride": 2}, {"clip": 2, "stride": 0}):
+        with pytest.raises(UserError):
+            TorchDataset(root, "flow", **wrong)
     for name in ("colour", "motion_recovered"):
         with pytest.raises(UserError):
             TorchDataset(root, [name])
 
 
+def read_kitti(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (H, W, 2) px and where it is valid, by KITTI's development kit."""
+    png = cv2.imread(str(path), -1)[..., ::-1].astype(float)
+    return (png[..., :2] - 2**15) / 64, png[..., 2] > 0
+
+
 def test_flow_pairs_are_read_by_the_rules_of_their_layouts(root: Path, tmp_path: Path) -> None:
+    """As torchvision's Sintel and KittiFlow read them; each pair is in the tree of its side."""
     export_dataset(root, tmp_path / "to", "flow-pairs")
-    stores = by_index(root)
-    rows = (tmp_path / "to/kitti/pairs.csv").read_text().splitlines()[1:]
+    stores, on = by_index(root), sides(root)
+    rows = [row.split(",") for row in (tmp_path / "to/pairs.csv").read_text().splitlines()]
+    assert rows.pop(0) == ["kind", "side", "scene", "flo", "pair", "sequence", "first", "second"]
     assert len(rows) == sum(sequence.frames - 1 for sequence in stores.values())
-    for pair, number, t in (map(int, row.split(",")) for row in rows):
-        sequence = stores[number]
-        flow, visible, tissue = sequence["flow"][t], sequence["visible"][t], sequence["tissue"][:]
-        scenes = tmp_path / "to/sintel/training"
-        one, clean = (scenes / kind / f"{number:06d}_{t:04d}" for kind in ("flow", "clean"))
-        assert len(sorted(clean.iterdir())) == len(sorted(one.iterdir())) + 1, "a loader pairs neighbours"
-        found = cv2.readOpticalFlow(str(one / "frame_0001.flo"))
-        assert np.array_equal(found[tissue], flow[tissue])
-        assert (found[~tissue] > 1e9).all()
-        hidden = cv2.imread(str(scenes / f"occlusions/{one.name}/frame_0001.png"), 0) > 0
-        assert np.array_equal(hidden, tissue & ~visible)
-        kitti = tmp_path / "to/kitti/training"
-        for kind, valid in (("occ", tissue), ("noc", tissue & visible)):
-            png = cv2.imread(str(kitti / f"flow_{kind}/{pair:06d}_10.png"), -1)[..., ::-1].astype(float)
-            assert np.array_equal(png[..., 2] > 0, valid)
-            assert np.abs((png[..., :2] - 2**15) / 64 - flow)[valid].max(initial=0) <= 1 / 128
-        for folder, name in ((clean, "frame_0002.png"), (kitti, f"image_2/{pair:06d}_11.png")):
-            assert np.array_equal(np.asarray(Image.open(folder / name)), sequence["rgb"][t])
+    assert (tmp_path / "to/README.md").is_file()
+    for kind, side, scene, flo, pair, number, start, t in rows:
+        sequence = stores[int(number)]
+        assert (kind, int(start), int(number) in on[side]) == ("rest", 0, True)
+        flow, visible = sequence["flow"][int(t)], sequence["visible"][int(t)]
+        shown = sequence["tissue"][:] & ~sequence["tool"][0]
+        tree = tmp_path / "to/rest/Sintel" / {"train": "training"}.get(side, side)
+        clean, flows = (sorted((tree / name / scene).iterdir()) for name in ("clean", "flow"))
+        assert [len(clean), len(flows)] == [2, 1], "a loader pairs neighbours"
+        assert flows[0].name == flo
+        read = cv2.readOpticalFlow(str(flows[0]))
+        assert np.array_equal(read[shown], flow[shown])
+        assert (read[~shown] > 1e9).all()
+        hidden = cv2.imread(str(tree / f"occlusions/{scene}/frame_0001.png"), 0) > 0
+        assert np.array_equal(hidden, shown & ~visible)
+        other = {"train": "training", "test": "testing"}.get(side, side)
+        kitti = tmp_path / "to/rest/KittiFlow" / other
+        for name, valid in (("occ", shown), ("noc", shown & visible)):
+            coded, there = read_kitti(kitti / f"flow_{name}/{int(pair):06d}_10.png")
+            assert np.array_equal(there, valid)
+            assert np.abs(coded - flow)[valid].max(initial=0) <= 1 / 128
+        for file in (clean[1], kitti / f"image_2/{int(pair):06d}_11.png"):
+            assert np.array_equal(np.asarray(Image.open(file)), sequence["rgb"][int(t)])
+
+
+def test_pairs_of_neighbouring_frames_have_the_motion_between_them(tmp_path: Path) -> None:
+    """A texture that slides by a pixel a frame, under an instrument that moves by two."""
+    job = Job(sequences=1, frames=4, render={"size": (40, 30)}, store={"extra": ["flow_next_all"]})
+    job = job.model_copy(update={"flow": job.flow.model_copy(update={"backend": "ideal"})})
+    (tmp_path / "in").mkdir()
+    writer = Writer(tmp_path / "in", 0, frames=4, size=(30, 40), job=job)
+    shade = np.random.default_rng(0).integers(0, 256, (30, 60, 3), np.uint8)
+    tissue, columns = np.ones((30, 40), bool), np.arange(40)[None].repeat(30, axis=0)
+    for name, values in (("time", np.arange(4.0)), ("force", np.zeros((4, 3))), ("tissue", tissue)):
+        writer.put(name, values)
+    writer.put("area", np.ones((30, 40)))
+    tools = [(columns >= 4 + 2 * t) & (columns < 10 + 2 * t) for t in range(4)]
+    for t, tool in enumerate(tools):
+        now = columns + t
+        seen = (now < 40) & ~((now >= 4 + 2 * t) & (now < 10 + 2 * t))
+        writer.put_frame("rgb", t, np.where(tool[..., None], 90, shade[:, 20 - t : 60 - t]).astype(np.uint8))
+        writer.put_frame("flow", t, np.stack([np.full((30, 40), float(t)), np.zeros((30, 40))], axis=-1))
+        step = np.where(tool, 2.0, 1.0) * (t < 3)
+        writer.put_frame("flow_next_all", t, np.stack([step, 0 * step], axis=-1))
+        for name, values in (("visible", seen), ("tool", tool), ("glare", ~tissue)):
+            writer.put_frame(name, t, values)
+        writer.put_frame("depth", t, np.full((30, 40), 300.0))
+        writer.put_frame("traction", t, np.zeros((30, 40, 3)))
+    writer.seal(scale_mm_per_px=0.1, young_kpa=1.0)
+    export_dataset(tmp_path / "in", tmp_path / "to", "flow-pairs")
+    tree = tmp_path / "to/flow_next/Sintel/training"
+    assert len(list((tree / "clean/000000").iterdir())) == 4
+    assert len(list((tree / "flow/000000").iterdir())) == 3
+    for t in range(3):
+        read = cv2.readOpticalFlow(str(tree / f"flow/000000/frame_{t + 1:04d}.flo"))
+        assert np.array_equal(read[..., 0], np.where(tools[t], 2, 1))
+        hidden = cv2.imread(str(tree / f"occlusions/000000/frame_{t + 1:04d}.png"), 0) > 0
+        covered = ~tools[t] & (np.roll(tools[t + 1], -1, axis=1) | (columns == 39))
+        # Tissue that was under the instrument at rest can't be followed by the flow from rest.
+        known = (columns >= 13) & (columns < 39)
+        assert np.array_equal(hidden[known], covered[known])
+        flow, valid = read_kitti(tmp_path / f"to/flow_next/KittiFlow/training/flow_occ/{t:06d}_10.png")
+        assert valid.all()
+        assert np.array_equal(flow[..., 0], np.where(tools[t], 2, 1))
 
 
 @pytest.mark.slow

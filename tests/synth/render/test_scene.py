@@ -156,6 +156,21 @@ def test_truth_on_request() -> None:
     assert (shots[2].flow_next == 0).sum() > 0
 
 
+def test_flow_of_all_that_is_seen_is_the_tissues_and_the_instruments() -> None:
+    """An instrument that is shifted in parallel to the picture moves by focal length over depth."""
+    ours, vertices = made(VARIANTS[-1], spp=1, extra=("flow_next", "flow_next_all", "instrument"))
+    aside = ours.camera.rotation.T @ [0.7, 0.0, 0.0]
+    now, after = (SceneState(vertices + 0.3 * k * aside, TIPS + k * aside, SHAFTS) for k in (0, 1))
+    shot = ours.render(now, 1, (), after)
+    on = shot.instrument > 0
+    assert on.sum() > 100
+    own = (shot.depth > 0) & ~on & (shot.flow_next != 0).any(axis=-1)
+    assert own.sum() > 100
+    assert np.array_equal(shot.flow_next_all[own], shot.flow_next[own])
+    expected = ours.camera.K[0, 0] * 0.7 / shot.depth[on]
+    np.testing.assert_allclose(shot.flow_next_all[on][:, 0], expected, rtol=0.02)
+
+
 def test_rest_disparity_triangulates_to_the_rest_points() -> None:
     ours, _ = made(VARIANTS[-1], spp=1, tool=False, stereo_mm=20.0)
     rows, columns = (at[::50] for at in np.nonzero(ours.rest.tissue))

@@ -3,6 +3,8 @@
 import io
 import os
 import pickle
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ from PIL import Image
 
 from synth.errors import UserError
 from synth.system import checked_file
+
+HOME = str(Path(checked_file.__file__).parents[2])
 
 
 class Malicious:
@@ -83,6 +87,29 @@ def test_a_failed_write_leaves_files_unchanged(tmp_path: Path) -> None:
             raise ZeroDivisionError
     assert (tmp_path / "a").read_text() == "before"
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_what_a_killed_process_left_is_deleted_and_what_another_writes_is_not(tmp_path: Path) -> None:
+    """A folder being written is locked by its process; the name of another target only begins alike."""
+    victim = "import os; from pathlib import Path; from synth.system import checked_file\n"
+    victim += "with checked_file.folder_of(Path('b')) as part: (part / 'c').mkdir(); os.kill(os.getpid(), 9)"
+    done = subprocess.run(
+        [sys.executable, "-c", victim], cwd=tmp_path, env={**os.environ, "PYTHONPATH": HOME}
+    )
+    assert done.returncode == -9
+    (left,) = tmp_path.glob(".b.*.part")
+    (tmp_path / ".b.c.01234567.part").mkdir()
+    (tmp_path / "precious").mkdir()
+    (tmp_path / ".b.01234567.part").symlink_to(tmp_path / "precious")
+    with checked_file.folder_of(tmp_path / "b") as writing:
+        assert not left.exists()
+        (writing / "own").touch()
+        with pytest.raises(ZeroDivisionError), checked_file.folder_of(tmp_path / "b"):
+            raise ZeroDivisionError
+        assert (writing / "own").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".b.01234567.part", ".b.c.01234567.part", "b", "precious",
+    ]  # fmt: skip
 
 
 def test_a_folder_without_space_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,167 @@
+"""Whether a series of another program can be soft tissue under a load: units, signs, axes, times, nodes.
+
+A doubt doesn't stop a series: it is said when the series is read, and stored. The limits are wide, so that a
+wrong factor of 1000 is outside of them and a tissue, at any rate that is filmed, is inside.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from synth.arrays import Floats, Ints, Map
+from synth.fem.surface_embedding import vertex_area
+
+_LOADS = 1e-3, 10.0  # P = F / (E a^2): below, nothing is seen; above, no contact of that radius bears it
+_STIFFNESS = (
+    0.03,
+    100.0,
+)  # of load and motion over the stated E; thin layers and membranes are up to 30 times stiffer
+_YOUNG_KPA = 0.01, 300.0  # of soft tissue, where E isn't stated
+_SPEED_MM_S = 0.02, 500.0  # of the fastest node, from one state to the next
+_ALONG = (
+    0.35  # cosine between load and motion of the loaded nodes: a press and its motion are 20 degrees apart
+)
+_HALF_SPACE = 0.43  # E a u / F of a uniform load on a half-space, 16 (1 - nu^2) / (3 pi^2), nu = 0.45
+_LEAST_WORK = 0.02  # share of the largest work below which a negative one is rounding
+_PULLS = 0.5  # cosine between a load and the outward direction above which it pulls
+_OUT_OF_LINE, _NEAR = 0.5, 0.35  # of the length of edges: a node off its neighbours; on another's place
+_MOST_NAMED = 4
+
+
+def find_permutations(
+    points: Floats, faces: Ints, displacement: Map, names: Ints, files: list[Path]
+) -> list[str]:
+    """Doubts on nodes that change places: each of their states lies where another node should be.
+
+    `points` (N, 3) and `displacement` (S, N, 3) in one unit; `faces` (F, 3); `names` (N,): numbers of the
+    nodes in the mesh; `files`: that of each state.
+    """
+    pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    links = sp.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    count = np.maximum(np.asarray(links.sum(axis=1)).ravel(), 1)
+    length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    edge = np.bincount(pairs[:, 0], length, len(points)) / count
+    states, moved = list[int](), set[int]()
+    for k in range(1, len(displacement)):
+        u = np.asarray(displacement[k], np.float64)
+        off = np.linalg.norm(u - (links @ u) / count[:, None], axis=1)
+        odd = np.flatnonzero(off > _OUT_OF_LINE * edge)
+        if len(odd) < 2:
+            continue
+        usual = np.ones(len(points))
+        usual[odd] = 0.0
+        known = links @ usual
+        near = (links @ (u * usual[:, None])) / np.maximum(known, 1)[:, None]
+        place = points[odd] + np.where(known[odd, None] > 0, near[odd], displacement[k - 1][odd])
+        away, other = cKDTree(place).query(points[odd] + u[odd])
+        swapped = odd[(other != np.arange(len(odd))) & (away < _NEAR * edge[odd])]
+        if len(swapped) > 1:
+            states.append(k)
+            moved |= set(names[swapped].tolist())
+    if not states:
+        return []
+    listed = sorted(moved)
+    which = ", ".join(map(str, listed[:_MOST_NAMED])) + (" ..." if len(listed) > _MOST_NAMED else "")
+    where = "" if len(set(files)) == 1 else f" ({files[states[0]].name})"
+    more = f" and {len(states) - 1} more states" if len(states) > 1 else ""
+    why = "their numbers have to stay the same"
+    return [
+        f"nodes {which} change places in state {states[0]}{where}{more}: {why}; the motion there is false"
+    ]
+
+
+def find_speed_doubts(displacement: Map, time: Floats) -> list[str]:
+    """Doubts on the times (S,) s of displacement (S, N, 3) mm."""
+    steps = [float(np.linalg.norm(now - before, axis=1).max()) for before, now in pairwise(displacement)]
+    speed = float((np.array(steps) / np.diff(time)).max())
+    if _SPEED_MM_S[0] <= speed <= _SPEED_MM_S[1]:
+        return []
+    hint = (
+        "are they in ms?"
+        if speed < _SPEED_MM_S[0]
+        else "are they in units longer than s, or is dt_s too small?"
+    )
+    whole = f"the surface moves at {speed:.2g} mm/s at most, over {time[-1]:.4g} s"
+    return [f"times: {whole}; {_SPEED_MM_S[0]:g} to {_SPEED_MM_S[1]:g} mm/s are likely: {hint}"]
+
+
+def find_load_doubts(
+    points: Floats, faces: Ints, displacement: Map, force: Map, young_kpa: float | None
+) -> list[str]:
+    """Doubts on unit, sign and axes of a load.
+
+    Args:
+        points: (N, 3) mm at rest.
+        faces: (F, 3).
+        displacement: (S, N, 3) mm.
+        force: (S, N, 3) mN on the nodes.
+        young_kpa: Young's modulus; None: not stated.
+    """
+    size = np.linalg.norm(force, axis=2)
+    k = int(size.sum(axis=1).argmax())
+    f, u = np.asarray(force[k], np.float64), np.asarray(displacement[k], np.float64)
+    total_mn, radius = float(size[k].sum()), contact_radius(points, faces, f)
+    work, most = float((f * u).sum()), float((size[k] * np.linalg.norm(u, axis=1)).sum())
+    found, low, high = list[str](), *_LOADS
+    if young_kpa is not None and not low <= (load := total_mn / (young_kpa * radius**2)) <= high:
+        where = f"a contact of {radius:.2g} mm radius and {young_kpa:g} kPa"
+        what = f"{total_mn:.3g} mN on {where} is P = {load:.2g}"
+        found.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
+    done = np.einsum("snd,snd->s", force, displacement, dtype=np.float64)
+    if done.min() < -_LEAST_WORK * np.abs(done).max():
+        at = int(done.argmin())
+        found.append(
+            f"force: does negative work, {done[at] / 2:.2g} mN mm in state {at}: it has to be what acts on "
+            "the tissue, not the reaction; is its sign right?"
+        )
+    elif work < _ALONG * most:
+        angle = np.degrees(np.arccos(np.clip(work / max(most, 1e-300), -1, 1)))
+        found.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
+    elif total_mn > 0:
+        stiff = _HALF_SPACE * total_mn / (radius * work / total_mn)
+        least, largest = _YOUNG_KPA if young_kpa is None else (one * young_kpa for one in _STIFFNESS)
+        if not least <= stiff <= largest:
+            stated = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
+            what = f"load and motion are those of a tissue of {stiff:.2g} kPa, fem.young_kpa is {stated}"
+            found.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
+    return found
+
+
+def find_pull_doubt(force: Map, out: Floats) -> list[str]:
+    """A doubt on a load (S, N, 3) mN that pulls along the outward direction `out` (3,)."""
+    total = force.sum(axis=1, dtype=np.float64)
+    largest = total[np.linalg.norm(total, axis=1).argmax()]
+    size = float(np.linalg.norm(largest))
+    if size == 0 or largest @ out <= _PULLS * size * float(np.linalg.norm(out)):
+        return []
+    right = "right for forceps or suction, which fem.instrument may name"
+    return [f"force: pulls the tissue outwards by {size:.3g} mN: {right}; or is the series upside down?"]
+
+
+def contact_radius(points: Floats, faces: Ints, force: Floats) -> float:
+    """Radius [mm] of the disk as large as the contact of nodal forces (N, 3), by its mean pressure.
+
+    `points`: (N, 3) mm; `faces`: (F, 3).
+    """
+    area, size = vertex_area(points, faces), np.linalg.norm(force, axis=1)
+    square = float((np.square(size) / np.maximum(area, 1e-12)).sum())
+    return float(np.sqrt(size.sum() ** 2 / max(square, 1e-300) / np.pi))
+
+
+def is_rigid(points: Floats, displacement: Map) -> bool:
+    """Whether displacement (N, 3) of points (N, 3) is a rigid body's, to a thousandth of its largest."""
+    chosen = np.linspace(0, len(points) - 1, min(len(points), 5000)).astype(int)
+    rest, now = points[chosen], points[chosen] + displacement[chosen]
+    a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
+    left, _, right = np.linalg.svd(b.T @ a)
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    off = np.linalg.norm(b - a @ turn.T, axis=1).max()
+    return bool(
+        off < max(1e-3 * np.linalg.norm(displacement, axis=1).max(), 1e-5 * np.ptp(points, axis=0).max())
+    )
