@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -11,19 +12,16 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from bench.importers import igsio
 from bench.importers.registry import STILLS, Intake, SecondView
+from bench.recording import sensor_table
+from bench.recording.sensor_table import SINCE_1970_S, Readings
 from synth.arrays import Array, Floats
 from synth.errors import UserError
-from synth.system import checked_file, csv_table
+from synth.system import checked_file
 from synth.video import file_numbers
 from synth.video import read as video
 
-# Names of columns without "%", "_" or "/" in front, with "." for "/".
-_TIME = r"(?:t|time|time_?stamp|stamp|elapsed)(?:[ _]*[\[(]?(s|secs?|seconds|ms|us|µs|ns)[\])]?)?"
-_STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
-_FORCE = r"(?:.*\.)?(?:f{0}|force[._]{0})(?:_n|[ _]*[\[(]n[\])])?"
-_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_SINCE_1970_S = 0.9e9, 5e9  # of the years 1998 to 2128
 _AT_ONCE = 16  # pages of a stack
 _Pictures = Callable[[], Iterator[Array]]
 
@@ -62,10 +60,18 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             raise UserError(
                 f"--use right={use['right']}: no picture has the number of one of the left camera"
             )
-    force = np.zeros(0), np.zeros((0, 3))
-    if "force" in use:
-        force = _read_forces(Path(use["force"]), notes)
-    return Intake(times, pictures, *force, notes=tuple(notes), second=second)
+    found = Intake(times, pictures, notes=tuple(notes), second=second)
+    if "force" not in use:
+        return found
+    table = _read_forces(Path(use["force"]), use.get("columns", ""), times[0] > SINCE_1970_S, notes)
+    return replace(
+        found,
+        force_s=table.time_s,
+        force=table.force,
+        axes=table.axes,
+        in_newtons=table.in_newtons,
+        notes=(*notes, *table.notes),
+    )
 
 
 def _open(source: Path, names: str | None, notes: list[str]) -> tuple[_Pictures, list[int], Floats | None]:
@@ -118,57 +124,25 @@ def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
             yield from (picture[..., ::-1] for picture in found)
 
 
-def _read_forces(path: Path, notes: list[str]) -> tuple[Floats, Floats]:
-    """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
-    header = csv_table.read_header(path)
-    names = [_columns(header, _FORCE.format(axis)) for axis in "xyz"]
-    if any(len(one) != 1 for one in names):
-        why = "several columns of force" if all(names) else "no columns of force"
-        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
-    time = _seconds(path, header, notes)
-    force = np.column_stack(list(csv_table.read_csv(path, [name for (name,) in names]).values()))
-    filled = np.isfinite(time) & np.isfinite(force).any(axis=1)
+def _read_forces(path: Path, columns: str, since_1970: bool, notes: list[str]) -> Readings:
+    """Samples of a table, or of a PLUS/IGSIO sequence. UserError as `sensor_table.read_forces`."""
+    if path.suffix.lower() in igsio.SUFFIXES:
+        return igsio.read_forces(path)
+    found = sensor_table.read_forces(path, columns, since_1970)
+    filled = np.isfinite(found.time_s) & np.isfinite(found.force).any(axis=1)
     if not filled.all():
         notes.append(f"{path}: {np.sum(~filled)} blank rows are left out")
-    return time[filled], force[filled]
+    return replace(found, time_s=found.time_s[filled], force=found.force[filled])
 
 
 def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:
     """Times (T,) s of the pictures with these numbers: by the table's column `frame`, else in its order."""
-    header = csv_table.read_header(path)
-    time = _seconds(path, header, notes)
-    if _columns(header, "frame"):
-        by_number = dict(zip(csv_table.read_csv(path, ("frame",))["frame"].tolist(), time, strict=True))
+    time, frames = sensor_table.read_clock(path, notes)
+    if frames is not None:
+        by_number = dict(zip(frames.tolist(), time, strict=True))
         if by_number.keys() >= set(numbers):
             return np.array([by_number[number] for number in numbers])
     time = time[np.isfinite(time)]
     if len(time) != len(numbers):
         raise UserError(f"{path}: {len(time)} times for {len(numbers)} pictures")
     return time
-
-
-def _seconds(path: Path, header: list[str], notes: list[str]) -> Floats:
-    """Times of a table's rows, (N,) s: the header's stamps if there are any, else the column of times."""
-    stamps, times = _columns(header, _STAMP), _columns(header, _TIME)
-    if len(stamps) > 1 or not stamps + times:
-        why = "several stamps" if stamps else "no column of times"
-        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
-    found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(header, _NANOSECONDS))])
-    name = stamps[0] if stamps and (not times or np.nanmax(found[stamps[0]]) > 0) else times[0]
-    if stamps and times:
-        notes.append(f"{path}: times are those of {name}, not {times[0] if name in stamps else stamps[0]}")
-    values = found[name]
-    if name in stamps and rest:
-        return np.asarray(values + 1e-9 * found[rest[0]], np.float64)
-    match = re.fullmatch(_TIME, _plain(name))
-    units = [_UNITS.get(match[1], 1.0)] if match and match[1] else [1.0, 1e-3, 1e-6, 1e-9]
-    largest, (least, most) = np.nanmax(values), _SINCE_1970_S
-    return np.asarray(values * next((u for u in units if least < largest * u < most), units[0]), np.float64)
-
-
-def _columns(header: list[str], pattern: str) -> list[str]:
-    return [name for name in header if re.fullmatch(pattern, _plain(name))]
-
-
-def _plain(name: str) -> str:
-    return name.lstrip("%_/").replace("/", ".")

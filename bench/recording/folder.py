@@ -3,7 +3,7 @@
 meta.yaml              scale, stiffness, rest frame, ... (`bench.recording.meta`)
 video.mp4 or frames/*.png
 frames.csv             optional: frame,t_s      (else the video's own presentation times)
-force.csv              optional: t_s,fx_n,fy_n,fz_n
+force.csv              optional: t_s,fx_n,fy_n,fz_n; or one axis, as t_s,fz_n; or t_s,f_n, a size
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
 mask.png               optional: the same for all frames that have no mask of their own
 tissue.png             optional: white on all tissue in the rest frame; without it found by motion
@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from bench.recording import meta
+from bench.recording import meta, sensor_table
 from bench.recording.meta import Meta
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
@@ -159,7 +159,9 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
         how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
         notes.append(f"the video: {how}; scale and calibration are assumed to be for square pixels")
     times = _frame_times(folder / "frames.csv", frames, notes)
-    force = _force(folder / "force.csv", about, notes)
+    force, axes = _force(folder / "force.csv", about, notes)
+    if axes != "xyz":  # without a direction no component can be compared
+        about = about.model_copy(update={"sensor": about.sensor.size_only()})
     about, times, force = _from_start(about, times, force, notes)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _find_stereo(folder, about)
@@ -260,11 +262,31 @@ def _rising(time: Floats) -> Mask:
     return np.asarray(forward if forward.sum() >= backward.sum() else backward, bool)
 
 
-def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
-    if not os.path.lexists(path):
-        return None
+def _read_forces(path: Path, notes: list[str]) -> tuple[dict[str, Floats], str]:
+    """Columns t_s, fx_n, fy_n, fz_n, and gx, gy, gz if there, and the measured axes. UserError: no unit."""
     forces = ("fx_n", "fy_n", "fz_n")
-    columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
+    if set(csv_table.read_header(path)) >= {"t_s", *forces}:
+        return csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz")), "xyz"
+    table = sensor_table.read_forces(path)
+    if not table.in_newtons:
+        raise UserError(
+            f"{path}: the unit of force isn't stated: name its columns fx_n, fy_n, fz_n (or f_n "
+            "for a size) if they "
+            "are in newtons, as `bench import` writes them"
+        )
+    notes += [note.replace(str(path), path.name) for note in table.notes]
+    columns = dict(zip(("t_s", *forces), (table.time_s, *table.force.T), strict=True))
+    if table.gravity is not None:
+        columns |= dict(zip(("gx", "gy", "gz"), table.gravity.T, strict=True))
+    return columns, table.axes
+
+
+def _force(path: Path, about: Meta, notes: list[str]) -> tuple[Force | None, str]:
+    """The samples, and which axes of them are measured, some of "xyz" or empty for a size."""
+    if not os.path.lexists(path):
+        return None, "xyz"
+    columns, axes = _read_forces(path, notes)
+    forces = ("fx_n", "fy_n", "fz_n")
     columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
     blank = np.asarray(np.isnan([columns[name] for name in forces]).all(axis=0), bool)
     if 0 < blank.sum() < blank.size:  # rows of other instruments, as in joined tables
@@ -297,4 +319,4 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     directions = [columns[name] for name in ("gx", "gy", "gz") if name in columns]
     gravity = np.stack(directions, axis=1) if len(directions) == 3 else None
     sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
-    return Force(columns["t_s"], sign * 1000.0 * newtons, gravity)
+    return Force(columns["t_s"], sign * 1000.0 * newtons, gravity), axes

@@ -106,6 +106,10 @@ class SensorMeta(Section):
             raise ValueError("give turn_s or to_camera or axes: camera, not several of them")
         return self
 
+    def size_only(self) -> SensorMeta:
+        """The same for a sensor of one axis or of a size, whose components can't be compared."""
+        return self.model_copy(update={"axes": "sensor", "to_camera": None, "turn_s": None})
+
     @property
     def in_camera_axes(self) -> bool:
         """Whether force components are along the camera's axes, as recorded or after the rotation."""
