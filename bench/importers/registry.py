@@ -23,7 +23,7 @@ from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 from synth.video import read as video
 from synth.video import stereo_layout
-from synth.video.file_numbers import find_stills
+from synth.video.file_numbers import STILLS, find_stills
 
 ROLES = ("frames", "frame_time", "force", "force_time")  # parts of a source; `--use ROLE=NAME` names one
 PLAIN_ROLES = (
@@ -35,7 +35,6 @@ PLAIN_ROLES = (
 film in a video with several; `start=file` counts a video's times from the start of its file, as sound may,
 not from its first picture."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
-STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
@@ -96,9 +95,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
         checked_file.check_file(source, LARGEST_BYTES)
     maker = _MAKERS.get(source.suffix.lower())
     if source.is_dir():
-        bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
-        pictures_only = not recording and find_stills(source, STILLS)
-        maker = _BAG if bag else _PLAIN if pictures_only else None
+        maker = _folder_maker(source)
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
@@ -143,6 +140,16 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
+
+
+def _folder_maker(source: Path) -> str | None:
+    """The reader of a folder: of a ROS 2 bag, or of pictures or videos; None: a recording, or neither."""
+    names = [path.suffix.lower() for path in source.glob("*") if not path.name.startswith(".")]
+    if (source / "metadata.yaml").is_file() or any(suffix in (".mcap", ".db3") for suffix in names):
+        return _BAG
+    is_recording = (source / "meta.yaml").is_file()
+    has_pictures = find_stills(source, STILLS) or any(suffix in video.SUFFIXES for suffix in names)
+    return _PLAIN if has_pictures and not is_recording else None
 
 
 def _calibrated(found: Intake, file: Path) -> Intake:

@@ -33,12 +33,13 @@ from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
-from synth.video.read import Picture
+from synth.video.read import Picture, VideoFile
 
 S = TypeVar("S", bound=Section)
-Video = Path | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
+Video = VideoFile | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
 
 _LARGEST_FORCE_N = 50.0
+_LATE_START_S = 2e-3  # of a first picture, from which it is said
 _EPOCH_S = 1e8  # three years, longer than any recording: larger times count from 1970
 
 
@@ -83,13 +84,15 @@ class Recording:
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""
-        first, fps = next(iter(self.numbers()), 0), self.meta.fps
+        fps, by_name = self.meta.fps, dict[int, float]()
+        if fps is not None and not isinstance(self.footage, VideoFile):
+            by_name = file_numbers.still_times(self.footage, fps, [])
         for picture in _pictures(self.footage):
             time_s = picture.time_s
             if self.times_s is not None:
                 time_s = self.times_s.get(picture.index)
             elif time_s is None and fps is not None:
-                time_s = (picture.index - first) / fps
+                time_s = by_name.get(picture.index, picture.index / fps)
             yield replace(picture, time_s=time_s)
 
     def right_frames(self) -> Iterator[Picture]:
@@ -127,11 +130,11 @@ class Recording:
 
 
 def _pictures(files: Video) -> Iterator[Picture]:
-    return video.read_video(files) if isinstance(files, Path) else video.read_pictures(files)
+    return video.read_video(files) if isinstance(files, VideoFile) else video.read_pictures(files)
 
 
 def _numbers(files: Video) -> Collection[int]:
-    return range(video.count_frames(files) or 0) if isinstance(files, Path) else files.keys()
+    return range(video.count_frames(files) or 0) if isinstance(files, VideoFile) else files.keys()
 
 
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
@@ -145,20 +148,25 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     about = meta.read_meta(folder / "meta.yaml")
     if phantom:
         about = about.model_copy(update={"tissue": "phantom"})
-    footage = _find_video(folder, "video", "frames")
-    if not footage:
-        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found")
     notes: list[str] = []
+    footage = _find_video(folder, "video", "frames", about, notes)
+    if not footage:
+        holds = ", ".join(sorted(path.name for path in folder.iterdir())[:8])
+        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found; it holds {holds}")
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
         notes.append(UNKNOWN_NOTE)
     frames = _numbers(footage)
-    if not isinstance(footage, Path):
+    if not isinstance(footage, VideoFile):
         notes += file_numbers.describe_gaps(list(frames), "frames/")
     elif (aspect := video.pixel_aspect(footage)) != 1:
         how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
         notes.append(f"the video: {how}; scale and calibration are assumed to be for square pixels")
     times = _frame_times(folder / "frames.csv", frames, notes)
+    if times is None and isinstance(footage, VideoFile):
+        notes += _describe_start(footage)
+    elif times is None and about.fps is not None and not isinstance(footage, VideoFile):
+        file_numbers.still_times(footage, about.fps, notes)
     force, axes = _force(folder / "force.csv", about, notes)
     if axes != "xyz":  # without a direction no component can be compared
         about = about.model_copy(update={"sensor": about.sensor.size_only()})
@@ -175,9 +183,22 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     return found.within(MaskFiles.find(folder / "masks", folder), None)
 
 
+def _describe_start(footage: VideoFile) -> list[str]:
+    """A note on a video whose first picture is not at the start of its file."""
+    late_s = video.find_start(footage)
+    if late_s < _LATE_START_S:
+        return []
+    what = "the start of its file" if footage.from_file else "that picture"
+    return [
+        f"{footage.path.name}: its first picture is {late_s:.3f} s after the start of its file, "
+        "with which sound or "
+        f"pictures that can't be decoded begin: times count from {what} (start: picture or file in meta.yaml)"
+    ]
+
+
 def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     """The right camera's video or pictures, and depth pictures. UserError if meta.yaml does not match."""
-    right = _find_video(folder, "right", "right")
+    right = _find_video(folder, "right", "right", about, [])
     depths = file_numbers.find_stills(folder / "depth", (".png", ".npy"))
     for found, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
         if bool(found) != (section is not None):
@@ -188,16 +209,34 @@ def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     return right, file_numbers.number_files(depths)
 
 
-def _find_video(folder: Path, name: str, pictures: str) -> Video:
-    """The video NAME.*, or the pictures in a folder; empty: neither. UserError for several."""
-    found: list[Video] = [
-        path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
-    ]
-    if stills := file_numbers.number_files(file_numbers.find_stills(folder / pictures)):
-        found.append(stills)
-    if len(found) > 1:
-        raise UserError(f"{folder}: has several of {name}.mp4 and {pictures}/; keep one of them")
-    return found[0] if found else {}
+def _find_video(folder: Path, name: str, pictures: str, about: Meta, notes: list[str]) -> Video:
+    """The video NAME.*, else the only one, or the pictures in a folder; empty: neither. UserError:
+    several."""
+    films = sorted(path for path in folder.glob("*") if path.suffix.lower() in video.SUFFIXES)
+    films = [path for path in films if not path.name.startswith(".")]
+    named = [path for path in films if path.name.lower().startswith(f"{name}.")]
+    stills = file_numbers.number_files(file_numbers.find_stills(folder / pictures, file_numbers.STILLS))
+    if not named and not stills and name == "video":
+        others = [path for path in films if not path.stem.lower().startswith("right")]
+        if len(others) > 1:
+            some = ", ".join(path.name for path in others[:4])
+            raise UserError(
+                f"{folder}: holds {some}, but no video.mp4: rename the one to be used, or keep only it"
+            )
+        notes += [f"{path.name} is taken for the video" for path in others]
+        named = others
+    if len(named) > 1:
+        some = ", ".join(path.name for path in named[:4])
+        raise UserError(
+            f"{folder}: holds {some}; keep one of them. If they are chapters of one recording, "
+            "move them into a "
+            "folder of their own, and bench import joins it"
+        )
+    if named and stills:
+        raise UserError(f"{folder}: has {named[0].name} and pictures in {pictures}/; keep one of them")
+    if named:
+        return VideoFile(named[0], about.stream, about.start == "file")
+    return stills
 
 
 def _from_start(

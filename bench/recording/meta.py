@@ -182,6 +182,11 @@ class Meta(Section):
     """Range of the tissue's Poisson's ratio."""
     fps: Positive | None = None
     """Frames per second, for frames/*.png without frames.csv."""
+    start: Literal["picture", "file"] = "picture"
+    """What is at t = 0 of a video without frames.csv: its first `picture`, or the start of its `file`, with
+    which sound, or pictures that can't be decoded, may begin earlier."""
+    stream: Annotated[int, Field(ge=0)] | None = None
+    """Number of the film in a video that holds several, from 0; covers don't count."""
     rest_frame: Annotated[int, Field(ge=0)] = 0
     """Number of a frame with the tissue unloaded; displacement is measured from it."""
     press_s: Span | None = None
