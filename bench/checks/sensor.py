@@ -75,7 +75,7 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
     if force is None or rest_s is None or sync.method == "correlate":
         return []
     known = np.isfinite(force.force_mn).all(axis=1)
-    t = force.time_s[known] + (sync.offset_s if sync.method == "offset" else 0.0)
+    t = sync.rate * force.time_s[known] + (sync.offset_s if sync.method == "offset" else 0.0)
     size = np.linalg.norm(force.force_mn[known], axis=1)
     least, most = float(size.min()), float(size.max())
     there = float(np.interp(rest_s, t, size))
