@@ -198,7 +198,12 @@ def import_(
             "alternating; add ,right-first if so."
         ),
     ] = None,
-    newtons: Annotated[float, Option(min=1e-6, help="Newtons per unit of force: 0.001 for mN.")] = 1.0,
+    newtons: Annotated[
+        float | None,
+        Option(
+            min=1e-9, help="Newtons per unit of force: 0.001 for mN; default: as the source states, or 1."
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Converts another system's recording into a recording folder."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import find_peaks
 from scipy.special import betainc
 
 from bench.checks.sensor import LEAST_FRAMES, SensorMotion
@@ -32,7 +33,19 @@ _LEFT = 0.5  # share of the force's mean deviation that a hypothesis may leave
 _SIDEWAYS = 0.2  # least share of the force in the observed axes
 _UNITS = {1000.0: "mN for N, or Pa or MPa for kPa", 102.0: "grams", 100.0: "cm for mm"}
 _RATES = (0.9, 0.92, 0.95, 0.97, 1.03, 1.05, 1.08, 1.1)
-_RATE_S = 10.0  # least duration for advice on a clock's rate
+_CAMERAS_HZ = (
+    20.0,
+    24.0,
+    25.0,
+    30.0,
+    50.0,
+    60.0,
+)  # a video may be stamped with another rate than it was taken at
+_STAMPED = sorted(
+    {a / b for a in _CAMERAS_HZ for b in _CAMERAS_HZ if 0.4 <= a / b <= 1.7 and abs(a / b - 1) > 0.11}
+)
+_RATE_S = 10.0  # least duration for advice on a clock's rate that is nearly right
+_RISES = 0.3  # of the largest force, by which it rises and falls with a contact
 _LATE_S = 1.5  # largest clock error tried, in both directions
 _TRIED = 30  # largest number of lags, and twice that of positions of a gap
 _PART = 4  # least number of frames before and after a gap
@@ -236,15 +249,17 @@ def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
     most = round(_LATE_S / frame)
     # Creep delays the tissue by as much as one frame.
     lags = [k for k in range(-most, most + 1, max(1, 2 * most // _TRIED)) if abs(k) > 1]
-    contact = np.concatenate([[False], sensor.size_mn > sensor.contact_mn, [False]])
-    several = np.count_nonzero(np.diff(contact)) > 2
-    rates = _RATES if since[-1] >= _RATE_S and several else ()
+    # Loads that rise and fall twice, whether or not contact is lost between, tell a rate from an offset.
+    size = np.pad(sensor.size_mn, 1)
+    several = len(find_peaks(size, prominence=_RISES * float(size.max()))[0]) > 1
+    rates = (*(_RATES if since[-1] >= _RATE_S else ()), *_STAMPED) if several else ()
     for k in (0, *lags):
         if k:
             yield f"the sensor's clock: add {k * frame:+.2f} s (sync.offset_s)", time_s - k * frame, len(lags)
         for rate in rates:
-            too = f" (add {k * frame:+.2f} s too)" if k else ""
-            what = f"the sensor's clock runs {1 / rate:.2f} times as fast{too}"
+            late_s = time_s[0] + (k * frame - time_s[0]) / rate
+            too = f", sync.offset_s {late_s:+.2f}" if abs(late_s) > frame / 2 else ""
+            what = f"the video is stamped with another rate, or a clock runs wrong: sync.rate {1 / rate:.4f}{too}"
             yield what, time_s[0] + since * rate - k * frame, len(lags) * len(rates)
     starts = time_s[_PART : -_PART : max(1, 2 * len(time_s) // _TRIED)]
     for k in lags:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
+import numpy as np
+
 from bench.recording import pixel_scale
 from bench.recording.folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.errors import UserError
 from synth.recording_flow.finding import Finding, judge_scale, judge_young
+from synth.video.read import VideoFile, find_length, find_start
 
 _FEW = 0.02  # share of the frames lost, from which it is a warning; by hand
+_MASKS_READ, _INVERTED = 5, 0.5  # masks looked at; median white share that no instrument has; by hand
+_SPARE_S, _SPARE_STEPS = 0.5, 5  # by which a stated length may exceed the last time; by hand
 _MANY = 0.2  # share of the tissue masked, from which to check the recording; by hand
 _NO_YOUNG = (
     "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that are independent of a "
@@ -24,14 +31,35 @@ def check_notes(recording: Recording) -> list[Finding]:
 def check_tool(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on masks of the tool."""
     message = recording.describe_tool(len(tracked.decoded))
-    return [Finding("ok" if recording.masks else "missing", "tool", message)]
+    found = [Finding("ok" if recording.masks else "missing", "tool", message)]
+    numbers, shares = [number for number, _ in tracked.decoded], []
+    for k in np.linspace(0, len(numbers) - 1, min(_MASKS_READ, len(numbers))).astype(int):
+        with suppress(UserError):  # tracking reports it
+            mask = recording.masks.read(numbers[k], tracked.size)
+            shares += [] if mask is None else [float(mask.mean())]
+    if shares and (share := float(np.median(shares))) > _INVERTED:
+        wrong = f"the masks are white on {100 * share:.0f}% of the picture, as if on the tissue: invert them"
+        found.append(Finding("warning", "tool", wrong))
+    return found
 
 
 def check_pictures(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
     """Findings on number and size of the pictures, and those that tracking collects."""
     height, width = tracked.size
     message = f"{len(tracked.decoded)} frames of {width} x {height} px"
-    return [Finding("ok", "pictures", message)] * bool(tracked.decoded) + tracked.findings
+    found = [Finding("ok", "pictures", message)] * bool(tracked.decoded) + tracked.findings
+    times = [time_s for _, time_s in tracked.decoded if time_s is not None]
+    if isinstance(recording.footage, VideoFile) and recording.times_s is None and len(times) > 1:
+        with suppress(UserError):  # reading the pictures reports it
+            stated_s = find_length(recording.footage)
+            end_s = max(times) + _SPARE_STEPS * (max(times) - min(times)) / (len(times) - 1)
+            late_s = 0.0 if recording.footage.from_file else find_start(recording.footage)
+            if stated_s > end_s + max(late_s, _SPARE_S):
+                cut = f"the video states {stated_s:.2f} s, but its pictures end at {max(times):.2f} s"
+                found.append(
+                    Finding("warning", "pictures", f"{cut}: it is cut off or damaged, copy it again")
+                )
+    return found
 
 
 def check_tracking(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

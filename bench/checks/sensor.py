@@ -11,6 +11,7 @@ from bench.methods.flow_size import FlowSize, flow_sizes
 from bench.methods.fusion import Fusion
 from bench.methods.protocol import Method
 from bench.recording.folder import Recording
+from bench.recording.sensor_table import find_bias
 from bench.sensor.alignment import AlignedSensor
 from bench.tracking.tracking import TrackedRecording
 from synth.arrays import Floats, Mask
@@ -38,6 +39,8 @@ def check_samples(recording: Recording) -> list[Finding]:
     if most > _SURGICAL_MN and recording.meta.tissue != "phantom":
         message = f"{most / 1000:.3g} N is a large force for a brain: is force.csv in newtons?"
         found.append(Finding("warning", "sensor", message))
+    if not recording.meta.sensor.free_s and (bias := find_bias(force.force_mn)):
+        found.append(Finding("warning", "sensor", bias))
     if not recording.meta.sensor.free_s:
         message = "no sensor.free_s: no tare, no drift correction, no noise floor"
         found.append(Finding("missing", "sensor", message))
@@ -72,7 +75,7 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
     if force is None or rest_s is None or sync.method == "correlate":
         return []
     known = np.isfinite(force.force_mn).all(axis=1)
-    t = force.time_s[known] + (sync.offset_s if sync.method == "offset" else 0.0)
+    t = sync.rate * force.time_s[known] + (sync.offset_s if sync.method == "offset" else 0.0)
     size = np.linalg.norm(force.force_mn[known], axis=1)
     least, most = float(size.min()), float(size.max())
     there = float(np.interp(rest_s, t, size))

@@ -15,6 +15,8 @@ from synth.recording_flow.finding import Finding
 _GAP = 3.0  # median intervals
 _RATES_HZ = 0.5, 1000.0  # of frames whose times are in seconds
 _TRACKED_HZ = 10.0  # default rate of tracked frames
+_CAMERAS_HZ = 15.0, 20.0, 24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 100.0, 120.0, 240.0  # usual rates
+_SAME_RATE, _TOGETHER_S, _LEAST_S = 2e-3, 0.2, 5.0  # of a rate; between starts; least record; by hand
 _COVERED = 0.9  # least share of the video that the sensor should cover
 _LEAST_PRESS = 5  # frames of a press that determine its gain
 
@@ -67,11 +69,39 @@ def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Findi
         return [Finding("warning", "clocks", f"{other}: nothing is scored")]
     offset = sync.offset_s if sync.method == "offset" else 0.0
     margin = sync.search_s if sync.method == "correlate" else 0.0
-    first, last = force.time_s[0] + offset - margin, force.time_s[-1] + offset + margin
+    first, last = (
+        sync.rate * force.time_s[0] + offset - margin,
+        sync.rate * force.time_s[-1] + offset + margin,
+    )
     share = max(min(t[-1], last) - max(t[0], first), 0.0) / (t[-1] - t[0])
     message = f"the sensor covers {100 * share:.0f}% of the video"
     message += "" if share else ": are both clocks in seconds?"
-    return [Finding("ok" if share > _COVERED else "warning", "clocks", message)]
+    return [Finding("ok" if share > _COVERED else "warning", "clocks", message), *_stamped_rate(t, recording)]
+
+
+def _stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
+    """A finding on records whose lengths are as the usual rates of cameras, as if one were stamped for another."""
+    force, sync = recording.force, recording.meta.sync
+    if force is None or sync.rate != 1 or sync.method == "correlate":
+        return []
+    step = (t[-1] - t[0]) / (len(t) - 1)
+    stamped, video_s, sensor_s = 1 / step, t[-1] - t[0] + step, float(np.ptp(force.time_s))
+    together = abs(force.time_s[0] + sync.offset_s * (sync.method == "offset") - t[0]) < _TOGETHER_S
+    for taken in _CAMERAS_HZ:
+        likely = min(_CAMERAS_HZ, key=lambda rate: abs(rate / stamped - 1))
+        if abs(likely / stamped - 1) > _SAME_RATE or taken == likely or not together or sensor_s < _LEAST_S:
+            continue
+        if abs(sensor_s / video_s * taken / likely - 1) < max(_SAME_RATE, 1.5 * step / video_s):
+            rate = taken / likely
+            return [
+                Finding(
+                    "warning",
+                    "clocks",
+                    f"the sensor's record is {1 / rate:.4g} times as long as the video, as if pictures taken at "
+                    f"{taken:g} a second were stamped as {likely:g}: if so, set sync.rate to {rate:.4f}",
+                )
+            ]
+    return []
 
 
 def check_margin(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
@@ -79,7 +109,7 @@ def check_margin(recording: Recording, tracked: TrackedRecording) -> list[Findin
     force, sync = recording.force, recording.meta.sync
     if force is None or sync.method != "correlate" or sync.calibration_s is None:
         return []
-    (start, stop), t, margin = sync.calibration_s, force.time_s, sync.search_s
+    (start, stop), t, margin = sync.calibration_s, sync.rate * force.time_s, sync.search_s
     lacks = max(t[0] - (start - margin), (stop + margin) - t[-1], 0.0)
     message = f"force.csv lacks {lacks:.3g} s of sync.calibration_s and {margin:g} s on either side"
     return [Finding("warning", "clocks", message)] if lacks > 0 else []

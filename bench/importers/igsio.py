@@ -1,99 +1,264 @@
-"""PLUS/IGSIO sequences: a MetaImage with header fields for every frame, read by SimpleITK."""
+"""PLUS/IGSIO sequences: a MetaImage with header fields for every frame; pictures in it, or in a video
+beside it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from bench.importers.registry import LARGEST_BYTES, MOST_FRAMES, Intake, one_of
+from bench.recording.sensor_table import Readings
 from synth.arrays import Floats, Pixels
-from synth.errors import UserError
+from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
+from synth.video import read as video
 
+SUFFIXES = (".mha",)
 _LONGEST_LINE = 65536
 _FIELD = re.compile(r"Seq_Frame(\d+)_(.+)")
+_SPARE = 2  # frames by which a video may be longer or shorter than its sequence
+_NO_PIXELS = "MET_NONE"
 Fields = dict[str, dict[int, str]]  # text of a field by name and frame
 
 
+@dataclass(frozen=True)
+class Header:
+    """The text of a sequence."""
+
+    source: Path
+    of: dict[str, str]  # fields of the whole
+    frames: Fields
+    count: int  # of frames
+    has_pixels: bool
+
+    def error(self, fault: str) -> UserError:
+        return UserError(f"{self.source}: {fault}")
+
+
 def read_source(source: Path, use: dict[str, str]) -> Intake:
-    """Opens a sequence with the fields `Timestamp` and `Force`. UserError for another format, or no times."""
-    import SimpleITK
+    """Opens a sequence with the fields `Timestamp` and `Force`; of six numbers of force the first three
+    count.
 
-    _refuse_elsewhere(source)
-    reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(str(source))
-    reader.ReadImageInformation()
-    fields: Fields = {}
-    for key in reader.GetMetaDataKeys():
-        if match := _FIELD.fullmatch(key):
-            fields.setdefault(match[2], {})[int(match[1])] = reader.GetMetaData(key)
-    size = reader.GetSize()
-    if len(size) != 3 or size[2] > MOST_FRAMES:
-        raise UserError(f"{source}: not a sequence of pictures, or one of more than {MOST_FRAMES} frames")
-    count = size[2]
-    refuse_large(size[0], size[1])
-    stamp = use.get("frame_time", "Timestamp")
-    if stamp not in fields:
-        raise UserError(
-            f"{source}: frames have no field {stamp}; there are {', '.join(sorted(fields)) or 'none'}"
-        )
-    times = _column(source, stamp, fields[stamp], count, (1,))[:, 0]
+    Without pixels its pictures are those of the `VideoFile` in the same folder. What has the status
+    INVALID is left out: forces, poses and pictures. UserError for another format, no times, or no such video.
+    """
+    header = read_header(source)
+    times = _times(header, use)
     notes: list[str] = []
-    force = _force(source, fields, count, use, notes)
-    if "UltrasoundImageOrientation" in reader.GetMetaDataKeys():
-        orientation = reader.GetMetaData("UltrasoundImageOrientation")
+    force, axes = _force(header, use, notes)
+    if "UltrasoundImageOrientation" in header.of and header.has_pixels:
+        orientation = header.of["UltrasoundImageOrientation"]
         notes.append(f"orientation {orientation}: pictures are imported as stored")
+    film = None
+    if header.has_pixels:
+        shown = _good(header, "Image")
+        pictures: Callable[[], Iterator[Pixels]] = _Pixels(header, shown)
+    else:
+        film = _find_film(header)
+        shown = _shown(header, film, notes)
+        pictures = _Film(film, len(shown))
+    if len(shown) < header.count:
+        notes.append(f"{header.count - len(shown)} of {header.count} frames have no picture and are left out")
+    poses = {name: rows[shown] for name, rows in _poses(header).items()}
+    good = np.isfinite(force).all(axis=1) & np.isfinite(times) if len(force) else np.zeros(0, bool)
+    if len(force) and (lost := int(header.count - good.sum())):
+        notes.append(f"{lost} of {header.count} frames have no valid force")
+    return Intake(
+        times[shown],
+        pictures,
+        times[: len(force)][good],
+        force[good],
+        tuple(notes),
+        axes=axes,
+        film=film if len(shown) == header.count else None,
+        poses=poses,
+    )
 
-    def pictures() -> Iterator[Pixels]:
-        for k in range(count):
-            reader.SetExtractIndex([0, 0, k])
-            reader.SetExtractSize([size[0], size[1], 0])
-            yield SimpleITK.GetArrayFromImage(reader.Execute())
 
-    good = np.isfinite(force).all(axis=1) if len(force) else np.zeros(0, bool)
-    return Intake(times, pictures, times[: len(force)][good], force[good], tuple(notes))
+def read_forces(source: Path) -> Readings:
+    """Times and forces of a sequence alone, as a table of them. UserError: it has none."""
+    header, notes = read_header(source), list[str]()
+    times = _times(header, {})
+    force, axes = _force(header, {}, notes)
+    if not len(force):
+        raise header.error(f"frames have no field Force; there are {_names(header.frames)}")
+    good = np.isfinite(force).all(axis=1) & np.isfinite(times)
+    return Readings(times[good], force[good], axes, False, tuple(notes))
 
 
-def _refuse_elsewhere(source: Path) -> None:
-    """Raises UserError for a header that names another file for its pictures, or is not a MetaImage's."""
+def read_header(source: Path) -> Header:
+    """The fields of a MetaImage. UserError: it is none, has other dimensions, or pictures in another file."""
+    of, frames, where = dict[str, str](), Fields(), ""
     with checked_file.open_file(source, LARGEST_BYTES) as file:
         while line := file.readline(_LONGEST_LINE):
-            key, _, value = line.partition(b"=")
-            if key.strip() == b"ElementDataFile":
-                if value.strip() == b"LOCAL":
-                    return
-                raise UserError(f"{source}: its pictures are in another file, which is not opened; use .mha")
-            if not value or len(line) == _LONGEST_LINE:
+            key, mark, value = (part.strip() for part in line.decode("utf-8", "replace").partition("="))
+            if not line.strip():
+                continue
+            if not mark or len(line) == _LONGEST_LINE:
+                shown = ascii(line[:60].decode("latin-1").strip())
+                raise UserError(f"{source}: no MetaImage: after {len(of)} fields it goes on with {shown}")
+            if match := _FIELD.fullmatch(key):
+                frames.setdefault(match[2], {})[int(match[1])] = value
+            else:
+                of[key] = value
+            if key == "ElementDataFile":
+                where = value
                 break
-    raise UserError(f"{source}: not a readable MetaImage")
+    kind = of.get("ElementType", "")
+    has_pixels = kind not in ("", _NO_PIXELS)
+    if has_pixels and where != "LOCAL":
+        raise UserError(
+            f"{source}: its pictures ({kind}) are in another file, {where or 'not named'}, which "
+            "is not opened; "
+            "save it as one .mha"
+        )
+    sizes = [int(word) for word in of.get("DimSize", "").split() if word.isdigit()]
+    if len(sizes) not in (3, 4) or not 0 < sizes[-1] <= MOST_FRAMES or (len(sizes) == 4 and sizes[2] != 1):
+        raise UserError(
+            f"{source}: not a sequence of pictures: ElementType {kind or 'not stated'}, DimSize "
+            f"{of.get('DimSize', 'not stated')}; needed are width, height and at most {MOST_FRAMES} frames"
+        )
+    return Header(source, of, frames, sizes[-1], has_pixels)
 
 
-def _force(source: Path, fields: Fields, count: int, use: dict[str, str], notes: list[str]) -> Floats:
-    """(T, 3), NaN where a frame has none; (0, 3) without a field of force."""
-    names = sorted(fields) if "force" in use else [name for name in fields if name.lower() == "force"]
+class _Pixels:
+    """The pictures in a sequence, those of some frames in order."""
+
+    def __init__(self, header: Header, shown: Sequence[int]) -> None:
+        """UserError if they can't be read."""
+        import SimpleITK
+
+        self._shown = shown
+        self._reader = SimpleITK.ImageFileReader()
+        self._reader.SetFileName(str(header.source))
+        try:
+            self._reader.ReadImageInformation()
+        except RuntimeError as error:
+            kind = header.of.get("ElementType")
+            raise header.error(
+                f"pictures of ElementType {kind} can't be read ({first_line(error)})"
+            ) from None
+        self._size = self._reader.GetSize()
+        if len(self._size) != 3:
+            raise header.error(f"not a sequence of pictures: {len(self._size)} dimensions")
+        refuse_large(self._size[0], self._size[1])
+
+    def __call__(self) -> Iterator[Pixels]:
+        import SimpleITK
+
+        for k in self._shown:
+            self._reader.SetExtractIndex([0, 0, int(k)])
+            self._reader.SetExtractSize([self._size[0], self._size[1], 0])
+            yield SimpleITK.GetArrayFromImage(self._reader.Execute())
+
+
+@dataclass(frozen=True)
+class _Film:
+    """The first pictures of a video."""
+
+    path: Path
+    count: int
+
+    def __call__(self) -> Iterator[Pixels]:
+        return (picture.rgb for picture in islice(video.read_video(self.path), self.count))
+
+
+def _find_film(header: Header) -> Path:
+    """The video that a sequence without pixels names, in its own folder. UserError: there is none."""
+    name = PureWindowsPath(header.of.get("VideoFile", "")).name  # recorders write whole paths of their system
+    if not name:
+        raise header.error(
+            f"no pictures: ElementType {header.of.get('ElementType', 'not stated')}, and no "
+            "VideoFile is named"
+        )
+    folder = header.source.resolve().parent
+    path = header.source.parent / name
+    if not path.exists():
+        raise header.error(f"its pictures are in {name}, which is not in the same folder: copy it there")
+    if path.resolve().parent != folder or path.suffix.lower() not in video.SUFFIXES:
+        raise header.error(f"VideoFile {name} is no video in the same folder")
+    return path
+
+
+def _shown(header: Header, film: Path, notes: list[str]) -> list[int]:
+    """The frames that a video has pictures of. UserError: it has many more, or fewer."""
+    pictures = video.count_frames(film) or 0
+    if abs(pictures - header.count) > _SPARE:
+        raise header.error(
+            f"{header.count} frames, but {film.name} has {pictures} pictures: which is of which "
+            "can't be told; "
+            f"import {film.name} with --use force={header.source.name} and --use frame_time=TABLE.csv"
+        )
+    if pictures != header.count:
+        notes.append(
+            f"{film.name} has {pictures} pictures for {header.count} frames: matched from the first on"
+        )
+    return list(range(min(pictures, header.count)))
+
+
+def _times(header: Header, use: dict[str, str]) -> Floats:
+    stamp = use.get("frame_time", "Timestamp")
+    if stamp not in header.frames:
+        raise header.error(f"frames have no field {stamp}; there are {_names(header.frames)}")
+    times = _column(header, stamp, (1,))[:, 0]
+    if not np.isfinite(times).all():
+        raise header.error(f"{np.sum(~np.isfinite(times))} of {header.count} frames have no {stamp}")
+    return times
+
+
+def _names(frames: Fields) -> str:
+    return ", ".join(sorted(frames)) or "none"
+
+
+def _force(header: Header, use: dict[str, str], notes: list[str]) -> tuple[Floats, str]:
+    """(T, 3), NaN where a frame has none, and its axes; (0, 3) without a field of force."""
+    numbers = [name for name in sorted(header.frames) if not name.endswith(("Status", "Transform"))]
+    names = numbers if "force" in use else [name for name in numbers if name.lower() == "force"]
     name = one_of("force", use.get("force"), names, "field")
     if name is None:
-        return np.zeros((0, 3))
-    force = _column(source, name, fields[name], count, (1, 3))
+        notes.append(f"no field Force; the frames have {_names(header.frames)}")
+        return np.zeros((0, 3)), "xyz"
+    force = _column(header, name, (1, 3, 6))
     if force.shape[1] == 1:
-        notes.append(f"{name} is one number per frame: imported as a magnitude, in fx_n")
-        force = np.column_stack([force, np.zeros((count, 2))])
-    return force
+        notes.append(f"{name} is one number per frame: only the size is scored")
+        return np.column_stack([force, np.zeros((header.count, 2))]), ""
+    if force.shape[1] == 6:
+        notes.append(f"{name} holds six numbers: the first three are the force")
+    return force[:, :3], "xyz"
 
 
-def _column(source: Path, name: str, values: dict[int, str], count: int, widths: tuple[int, ...]) -> Floats:
-    """(T, width) numbers of a field; NaN where a frame lacks it."""
-    rows = {k: text.split() for k, text in values.items() if k < count}
-    width = max((len(row) for row in rows.values()), default=0)
+def _good(header: Header, name: str) -> list[int]:
+    """The frames of which something has no status, or another one than INVALID."""
+    status = header.frames.get(f"{name}Status", {})
+    return [k for k in range(header.count) if status.get(k, "OK").upper() != "INVALID"]
+
+
+def _poses(header: Header) -> dict[str, Floats]:
+    """Rigid transforms (T, 4, 4) by name, as stored; NaN where a frame lacks one or its status is INVALID."""
+    names = [name for name in sorted(header.frames) if name.endswith("Transform")]
+    return {name: _column(header, name, (16,)).reshape(-1, 4, 4) for name in names}
+
+
+def _column(header: Header, name: str, widths: tuple[int, ...]) -> Floats:
+    """(T, width) numbers of a field; NaN where a frame lacks it or its status is INVALID."""
+    good = set(_good(header, name))
+    rows = {k: text.split() for k, text in header.frames[name].items() if k in good}
+    width = max((len(row) for row in rows.values()), default=widths[-1])
     if width not in widths:
-        raise UserError(f"{source}: field {name} holds {width} numbers per frame, expected {widths[-1]}")
-    out = np.full((count, width), np.nan)
+        expected = " or ".join(map(str, widths))
+        raise header.error(f"field {name} holds {width} numbers per frame, expected {expected}")
+    out = np.full((header.count, width), np.nan)
     for k, row in rows.items():
         if len(row) != width:  # a single number would be broadcast
-            raise UserError(f"{source}: field {name} of frame {k} is not {width} numbers")
-        out[k] = [float(word) for word in row]
+            raise header.error(f"field {name} of frame {k} is not {width} numbers")
+        try:
+            out[k] = [float(word) for word in row]
+        except ValueError:
+            raise header.error(f"field {name} of frame {k} is not numbers: {' '.join(row)[:60]}") from None
     return out

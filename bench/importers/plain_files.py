@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -11,19 +12,19 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from bench.importers.registry import STILLS, Intake, SecondView
+from bench.importers import igsio
+from bench.importers.registry import Intake, SecondView
+from bench.recording import sensor_table
+from bench.recording.sensor_table import SINCE_1970_S, Readings
 from synth.arrays import Array, Floats
 from synth.errors import UserError
-from synth.system import checked_file, csv_table
+from synth.system import checked_file
 from synth.video import file_numbers
 from synth.video import read as video
+from synth.video.read import VideoFile
 
-# Names of columns without "%", "_" or "/" in front, with "." for "/".
-_TIME = r"(?:t|time|time_?stamp|stamp|elapsed)(?:[ _]*[\[(]?(s|secs?|seconds|ms|us|µs|ns)[\])]?)?"
-_STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
-_FORCE = r"(?:.*\.)?(?:f{0}|force[._]{0})(?:_n|[ _]*[\[(]n[\])])?"
-_UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_SINCE_1970_S = 0.9e9, 5e9  # of the years 1998 to 2128
+_LATE_START_S = 2e-3  # of a first picture, from which it is said
+_GAP_S = 1.5  # between chapters, from which it is one: dates are in whole seconds
 _AT_ONCE = 16  # pages of a stack
 _Pictures = Callable[[], Iterator[Array]]
 
@@ -37,14 +38,16 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     table without the columns, or not as many times as pictures.
     """
     notes: list[str] = []
-    pictures, numbers, times = _open(source, use.get("frames"), notes)
+    pictures, numbers, times = _open(source, use.get("frames"), use, notes)
     if "frame_time" in use:
         times = _frame_seconds(Path(use["frame_time"]), numbers, notes)
     elif "fps" in use:
         rate = float(use["fps"]) if use["fps"].replace(".", "", 1).isdigit() else 0.0
         if rate == 0:
             raise UserError(f"--use fps={use['fps']}: give pictures per second")
-        times = (np.array(numbers) - numbers[0]) / rate
+        stills = pictures.stills() if isinstance(pictures, _Stills) else {}
+        by_name = file_numbers.still_times(stills, rate, notes)
+        times = np.array([by_name.get(number, (number - numbers[0]) / rate) for number in numbers])
         if numbers[-1] - numbers[0] != len(numbers) - 1:
             span = f"{numbers[0]} to {numbers[-1]}"
             notes.append(f"{source}: {len(numbers)} numbers from {span}: times follow them")
@@ -54,7 +57,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     if "right" in use:
         other = Path(use["right"])
         where, names = (other, None) if other.exists() else (source, use["right"])
-        right, own, _ = _open(where, names, notes)
+        right, own, _ = _open(where, names, use, notes)
         at = {number: k for k, number in enumerate(numbers)}
         matched = file_numbers.match_numbers(own, numbers, "right", notes)
         second = SecondView("right", np.array([at.get(matched[number], -1) for number in own]), right)
@@ -62,19 +65,46 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
             raise UserError(
                 f"--use right={use['right']}: no picture has the number of one of the left camera"
             )
-    force = np.zeros(0), np.zeros((0, 3))
-    if "force" in use:
-        force = _read_forces(Path(use["force"]), notes)
-    return Intake(times, pictures, *force, notes=tuple(notes), second=second)
+    found = Intake(times, pictures, notes=tuple(notes), second=second)
+    if "force" not in use:
+        return found
+    table = _read_forces(Path(use["force"]), use.get("columns", ""), times[0] > SINCE_1970_S, notes)
+    return replace(
+        found,
+        force_s=table.time_s,
+        force=table.force,
+        axes=table.axes,
+        in_newtons=table.in_newtons,
+        notes=(*notes, *table.notes),
+    )
 
 
-def _open(source: Path, names: str | None, notes: list[str]) -> tuple[_Pictures, list[int], Floats | None]:
+def _open(
+    source: Path, names: str | None, use: Mapping[str, str], notes: list[str]
+) -> tuple[_Pictures, list[int], Floats | None]:
     """Pictures, their numbers, and their times [s] if the source has them, NaN where it lacks one."""
     if names and not source.is_dir():
         raise UserError(f"{names}: no such file, and {source} is no folder to choose from")
+    if source.is_dir() and (films := films_in(source, names)):
+        return _open_chapters(films, use, notes)
     if source.suffix.lower() in video.SUFFIXES:
-        times = np.array([one.time_s for one in video.read_video(source)], np.float64)
-        return lambda: (one.rgb for one in video.read_video(source)), list(range(len(times))), times
+        film = _choose_film(source, use)
+        times, damaged = [], 0
+        for one in video.read_video(film):
+            times.append(one.time_s)
+            damaged += one.damaged
+        if damaged:
+            notes.append(
+                f"{source}: {damaged} of {len(times)} pictures are damaged in the file: copy it again"
+            )
+        if (late_s := video.find_start(film)) > _LATE_START_S:
+            notes.append(
+                f"{source}: its first picture is {late_s:.3f} s after the start of its file, as "
+                "after sound; times "
+                f"count from "
+                f"{'the start' if film.from_file else 'that picture (--use start=file: from the start)'}"
+            )
+        return _Film(film), list(range(len(times))), np.array(times, np.float64)
     if source.suffix.lower() == ".npy":
         frames = np.load(source, mmap_mode="r", allow_pickle=False)
         if frames.ndim not in (3, 4):
@@ -82,18 +112,109 @@ def _open(source: Path, names: str | None, notes: list[str]) -> tuple[_Pictures,
         return lambda: (np.asarray(picture) for picture in frames), list(range(len(frames))), None
     files = {0: source}
     if source.is_dir():
-        stills = [p for p in file_numbers.find_stills(source, STILLS) if fnmatch(p.name, names or "*")]
+        stills = [
+            p for p in file_numbers.find_stills(source, file_numbers.STILLS) if fnmatch(p.name, names or "*")
+        ]
         if not stills:
             raise UserError(f"{source}: holds no picture {names}")
         files = file_numbers.number_files(stills)
-        last = [int(part) for one in files.values() for part in re.findall("[0-9]+", one.stem)[-1:]]
-        if 0 in files and last and last != list(files):
-            notes.append(f"{source}: the names' numbers are not those of frames: in order, evenly spaced")
     pages = {path: _count_pages(path) for path in files.values()}
     total, is_stack = sum(pages.values()), max(pages.values()) > 1
     if is_stack:
         notes.append(f"{source}: {total} pages of {len(pages)} TIFF files")
-    return lambda: _read_stills(pages), list(range(total)) if is_stack else list(files), None
+    stamps = None if is_stack else file_numbers.find_stamps(files.values())
+    if stamps is not None:
+        notes.append(f"{source}: the names are times since 1970")
+    return (
+        _Stills(pages, files if not is_stack else {}),
+        list(range(total)) if is_stack else list(files),
+        stamps,
+    )
+
+
+@dataclass(frozen=True)
+class _Stills:
+    """The pictures of files with so many pages."""
+
+    pages: Mapping[Path, int]
+    numbered: Mapping[int, Path]  # empty: stacks
+
+    def __call__(self) -> Iterator[Array]:
+        return _read_stills(self.pages)
+
+    def stills(self) -> Mapping[int, Path]:
+        return self.numbered
+
+
+@dataclass(frozen=True)
+class _Film:
+    """The pictures of a video."""
+
+    file: VideoFile
+
+    def __call__(self) -> Iterator[Array]:
+        return (one.rgb for one in video.read_video(self.file))
+
+
+def _choose_film(source: Path, use: Mapping[str, str]) -> VideoFile:
+    """A video by the roles `stream` and `start`. UserError: not a number, or another word."""
+    stream, start = use.get("stream"), use.get("start", "picture")
+    if stream is not None and not stream.isdigit():
+        raise UserError(f"--use stream={stream}: the number of a film, from 0")
+    if start not in ("picture", "file"):
+        raise UserError(f"--use start={start}: picture or file")
+    return VideoFile(source, None if stream is None else int(stream), start == "file")
+
+
+def films_in(folder: Path, names: str | None = None) -> list[Path]:
+    """The videos in a folder, in the order of the numbers in their names, without hidden ones."""
+    films = [p for p in folder.glob("*") if p.suffix.lower() in video.SUFFIXES and not p.name.startswith(".")]
+    return sorted((p for p in films if fnmatch(p.name, names or "*")), key=file_numbers.natural_order)
+
+
+def _open_chapters(
+    films: list[Path], use: Mapping[str, str], notes: list[str]
+) -> tuple[_Pictures, list[int], Floats | None]:
+    """The pictures of videos that follow each other. UserError: they are not of one series, or overlap."""
+    series = {re.sub("[0-9]+", "*", path.name.lower()) for path in films}
+    gopro = [re.fullmatch(r"g[hxl](\d\d)(\d{4})\..*", path.name.lower()) for path in films]
+    takes = {match[2] for match in gopro if match}  # GX020123 is chapter 2 of recording 0123
+    if len(series) > 1 or len(takes) > 1:
+        names = ", ".join(path.name for path in films[:4])
+        raise UserError(
+            f"{films[0].parent}: several videos that are no chapters of one recording ({names}): "
+            "name them by "
+            "--use frames=NAME and, for a second camera, right=NAME"
+        )
+    times, begun = list[Floats](), list[float | None]()
+    for path in films:
+        own = np.array([one.time_s for one in video.read_video(_choose_film(path, use))], np.float64)
+        if not np.isfinite(own).all() or len(own) < 2:
+            raise UserError(f"{path}: a chapter whose pictures have no times")
+        after, step = 0.0, float(np.median(np.diff(own)))
+        if times:
+            after = float(times[-1][-1]) + step
+            begun.append(video.find_date(path))
+            first, now = begun[0], begun[-1]
+            stated = None if first is None or now is None else now - first
+            if stated is not None and stated > after + _GAP_S:
+                notes.append(
+                    f"{path.name}: begins {stated - after:.1f} s after the end of the one before, by its date"
+                )
+                after = stated
+        else:
+            begun.append(video.find_date(path))
+        times.append(after + own)
+    if len(films) > 1:
+        ends = ", ".join(f"{path.name} from {own[0]:.2f} s" for path, own in zip(films, times, strict=True))
+        notes.append(f"{len(films)} chapters are joined in order: {ends}")
+    every = np.concatenate(times)
+
+    def pictures() -> Iterator[Array]:
+        for path in films:
+            yield from _Film(_choose_film(path, use))()
+
+    return pictures, list(range(len(every))), every
 
 
 def _count_pages(path: Path) -> int:
@@ -118,57 +239,25 @@ def _read_stills(pages: Mapping[Path, int]) -> Iterator[Array]:
             yield from (picture[..., ::-1] for picture in found)
 
 
-def _read_forces(path: Path, notes: list[str]) -> tuple[Floats, Floats]:
-    """Times (N,) s and forces (N, 3) in the table's unit. UserError if the columns are missing."""
-    header = csv_table.read_header(path)
-    names = [_columns(header, _FORCE.format(axis)) for axis in "xyz"]
-    if any(len(one) != 1 for one in names):
-        why = "several columns of force" if all(names) else "no columns of force"
-        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
-    time = _seconds(path, header, notes)
-    force = np.column_stack(list(csv_table.read_csv(path, [name for (name,) in names]).values()))
-    filled = np.isfinite(time) & np.isfinite(force).any(axis=1)
+def _read_forces(path: Path, columns: str, since_1970: bool, notes: list[str]) -> Readings:
+    """Samples of a table, or of a PLUS/IGSIO sequence. UserError as `sensor_table.read_forces`."""
+    if path.suffix.lower() in igsio.SUFFIXES:
+        return igsio.read_forces(path)
+    found = sensor_table.read_forces(path, columns, since_1970)
+    filled = np.isfinite(found.time_s) & np.isfinite(found.force).any(axis=1)
     if not filled.all():
         notes.append(f"{path}: {np.sum(~filled)} blank rows are left out")
-    return time[filled], force[filled]
+    return replace(found, time_s=found.time_s[filled], force=found.force[filled])
 
 
 def _frame_seconds(path: Path, numbers: list[int], notes: list[str]) -> Floats:
     """Times (T,) s of the pictures with these numbers: by the table's column `frame`, else in its order."""
-    header = csv_table.read_header(path)
-    time = _seconds(path, header, notes)
-    if _columns(header, "frame"):
-        by_number = dict(zip(csv_table.read_csv(path, ("frame",))["frame"].tolist(), time, strict=True))
+    time, frames = sensor_table.read_clock(path, notes)
+    if frames is not None:
+        by_number = dict(zip(frames.tolist(), time, strict=True))
         if by_number.keys() >= set(numbers):
             return np.array([by_number[number] for number in numbers])
     time = time[np.isfinite(time)]
     if len(time) != len(numbers):
         raise UserError(f"{path}: {len(time)} times for {len(numbers)} pictures")
     return time
-
-
-def _seconds(path: Path, header: list[str], notes: list[str]) -> Floats:
-    """Times of a table's rows, (N,) s: the header's stamps if there are any, else the column of times."""
-    stamps, times = _columns(header, _STAMP), _columns(header, _TIME)
-    if len(stamps) > 1 or not stamps + times:
-        why = "several stamps" if stamps else "no column of times"
-        raise UserError(f"{path}: {why}; the header has {', '.join(header)}")
-    found = csv_table.read_csv(path, [*stamps, *times[:1], *(rest := _columns(header, _NANOSECONDS))])
-    name = stamps[0] if stamps and (not times or np.nanmax(found[stamps[0]]) > 0) else times[0]
-    if stamps and times:
-        notes.append(f"{path}: times are those of {name}, not {times[0] if name in stamps else stamps[0]}")
-    values = found[name]
-    if name in stamps and rest:
-        return np.asarray(values + 1e-9 * found[rest[0]], np.float64)
-    match = re.fullmatch(_TIME, _plain(name))
-    units = [_UNITS.get(match[1], 1.0)] if match and match[1] else [1.0, 1e-3, 1e-6, 1e-9]
-    largest, (least, most) = np.nanmax(values), _SINCE_1970_S
-    return np.asarray(values * next((u for u in units if least < largest * u < most), units[0]), np.float64)
-
-
-def _columns(header: list[str], pattern: str) -> list[str]:
-    return [name for name in header if re.fullmatch(pattern, _plain(name))]
-
-
-def _plain(name: str) -> str:
-    return name.lstrip("%_/").replace("/", ".")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from bench.recording import clocks, writer
+from bench.recording.sensor_table import find_bias
 from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
 from synth.flow.stereo.calibration import read_rig
@@ -21,13 +23,18 @@ from synth.system import checked_file
 from synth.system.checked_file import refuse_large
 from synth.video import read as video
 from synth.video import stereo_layout
-from synth.video.file_numbers import find_stills
+from synth.video.file_numbers import STILLS, find_stills
 
 ROLES = ("frames", "frame_time", "force", "force_time")  # parts of a source; `--use ROLE=NAME` names one
-PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")
-"""Of loose files: `fps` is the rate of pictures without times; `frames` and `right` may be patterns."""
+PLAIN_ROLES = (
+    *("frames", "frame_time", "force", "fps", "right", "calibration"),
+    *("columns", "stream", "start"),
+)
+"""Of loose files: `fps` is the rate of pictures without times; `frames` and `right` may be patterns.
+`columns` names the columns of the table of forces in order, `-` for others; `stream` is the number of a
+film in a video with several; `start=file` counts a video's times from the start of its file, as sound may,
+not from its first picture."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
-STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
@@ -65,9 +72,15 @@ class Intake:
     """The T frames in order: grey (H, W) or RGB[A] (H, W, C) uint8 or uint16; after `read_source`
     (H, W, 3) uint8."""
     force_s: Floats = field(default_factory=lambda: np.zeros(0))  # (N,) s; empty: no force
-    force: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) in the source's unit
+    force: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) in N, or the source's own unit
     notes: tuple[str, ...] = ()
     second: SecondView | None = None
+    axes: str = "xyz"
+    """The axes of force that the source has; empty: a size, in the first component."""
+    in_newtons: bool = False  # whether the source states the unit of its force
+    film: Path | None = None  # a video of exactly these pictures, which is copied as it is
+    poses: Mapping[str, Floats] = field(default_factory=dict)
+    """Poses (T, 4, 4) of instruments by name, in the source's axes and unit; NaN: unknown."""
 
 
 def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str | None = None) -> Intake:
@@ -82,9 +95,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
         checked_file.check_file(source, LARGEST_BYTES)
     maker = _MAKERS.get(source.suffix.lower())
     if source.is_dir():
-        bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
-        pictures_only = not recording and find_stills(source, STILLS)
-        maker = _BAG if bag else _PLAIN if pictures_only else None
+        maker = _folder_maker(source)
     if maker is None:
         known = ", ".join(sorted(_MAKERS))
         raise UserError(
@@ -117,6 +128,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if second is not None:
         second = replace(second, pictures=partial(decoded, second, second.kind == "right"))
     found = replace(found, pictures=partial(decoded, found), second=second)
+    notes += _describe_force(found)
     if layout is not None:
         found = _split(found, layout)
     elif second is None and (
@@ -128,6 +140,16 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
+
+
+def _folder_maker(source: Path) -> str | None:
+    """The reader of a folder: of a ROS 2 bag, or of pictures or videos; None: a recording, or neither."""
+    names = [path.suffix.lower() for path in source.glob("*") if not path.name.startswith(".")]
+    if (source / "metadata.yaml").is_file() or any(suffix in (".mcap", ".db3") for suffix in names):
+        return _BAG
+    is_recording = (source / "meta.yaml").is_file()
+    has_pictures = find_stills(source, STILLS) or any(suffix in video.SUFFIXES for suffix in names)
+    return _PLAIN if has_pictures and not is_recording else None
 
 
 def _calibrated(found: Intake, file: Path) -> Intake:
@@ -158,7 +180,8 @@ def _split(found: Intake, layout: str) -> Intake:
 
     times = found.times_s[left : 2 * count : 2] if in_turn else found.times_s
     second = SecondView("right", np.arange(count), partial(view, 1 - left))
-    return replace(found, times_s=times, pictures=partial(view, left), second=second)
+    poses = {name: rows[left : 2 * count : 2] if in_turn else rows for name, rows in found.poses.items()}
+    return replace(found, times_s=times, pictures=partial(view, left), second=second, film=None, poses=poses)
 
 
 @contextmanager
@@ -188,23 +211,57 @@ def _refuse_odd(source: Path, found: Intake) -> None:
         raise UserError(f"{source}: {other}")
 
 
+def _describe_force(found: Intake) -> list[str]:
+    """Notes on what the force needs: its bias, and a clock that isn't that of the pictures."""
+    if not len(found.force):
+        return []
+    notes = [bias] if (bias := find_bias(found.force)) else []
+    sensor_s, frame_s = found.force_s[np.isfinite(found.force_s)], found.times_s
+    if len(sensor_s) and (sensor_s.min() > frame_s.max() or sensor_s.max() < frame_s.min()):
+        notes.append(
+            f"the sensor's clock ({sensor_s.min():.10g} to {sensor_s.max():.10g} s) isn't that of "
+            "the pictures "
+            f"({frame_s.min():.10g} to {frame_s.max():.10g} s): nothing is scored before sync is "
+            "set in meta.yaml; "
+            f"if both start together: method: offset, offset_s: {frame_s.min() - sensor_s.min():.6f}"
+        )
+    return notes
+
+
 def write_recording(
-    found: Intake, out: Path, newtons: float, about: Mapping[str, object], progress: Callable[[int], None]
+    found: Intake,
+    out: Path,
+    newtons: float | None,
+    about: Mapping[str, object],
+    progress: Callable[[int], None],
 ) -> Path:
     """Writes a recording folder, whole or not at all: lossless video.mp4, frames.csv, force.csv, meta.yaml.
 
-    A right camera adds right/ and stereo.yaml, a depth camera depth/. `newtons`: per unit of force in the
-    source; `about`: contents of meta.yaml; `progress`: called with the number of frames written. Raises
-    UserError if the folder exists, or a picture can't be decoded.
+    A right camera adds right/ and stereo.yaml, a depth camera depth/, poses poses.csv. `newtons`: per unit of
+    force in the source, None: the source's, or 1; `about`: contents of meta.yaml; `progress`: called with the
+    number of frames written. Raises UserError if the folder exists, a picture can't be decoded, or the source
+    states another unit.
     """
+    if newtons not in (None, 1.0) and found.in_newtons and len(found.force):
+        raise UserError(
+            f"--newtons {newtons:g}: the source states its unit, and its forces are newtons "
+            "already: leave it out, "
+            "or name the columns without a unit by --use columns="
+        )
     with checked_file.folder_of(out) as part:
         # The container requires rising times; frames.csv has the true ones.
         steps = np.maximum(np.diff(found.times_s), 1e-3)
         rising = found.times_s[0] + np.cumsum([0.0, *steps])
-        writer.write_video(part / "video.mp4", found.pictures(), rising, crf=0, progress=progress)
+        if found.film is not None:
+            shutil.copyfile(found.film, part / f"video{found.film.suffix.lower()}")
+            progress(len(found.times_s))
+        else:
+            writer.write_video(part / "video.mp4", found.pictures(), rising, crf=0, progress=progress)
         writer.write_frames(part, found.times_s)
         if len(found.force):
-            writer.write_force(part, found.force_s, newtons * found.force)
+            writer.write_force(part, found.force_s, (newtons or 1.0) * found.force, found.axes)
+        if found.poses:
+            writer.write_poses(part, found.times_s, found.poses)
         about = dict(about)
         if (second := found.second) is not None:
             writer.write_second(part / second.kind, second.frame.tolist(), second.pictures())

@@ -3,7 +3,7 @@
 meta.yaml              scale, stiffness, rest frame, ... (`bench.recording.meta`)
 video.mp4 or frames/*.png
 frames.csv             optional: frame,t_s      (else the video's own presentation times)
-force.csv              optional: t_s,fx_n,fy_n,fz_n
+force.csv              optional: t_s,fx_n,fy_n,fz_n; or one axis, as t_s,fz_n; or t_s,f_n, a size
 masks/NNNNNN.png       optional: white where the tool is, in the frame of that number
 mask.png               optional: the same for all frames that have no mask of their own
 tissue.png             optional: white on all tissue in the rest frame; without it found by motion
@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from bench.recording import meta
+from bench.recording import meta, sensor_table
 from bench.recording.meta import Meta
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
@@ -33,12 +33,13 @@ from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
-from synth.video.read import Picture
+from synth.video.read import Picture, VideoFile
 
 S = TypeVar("S", bound=Section)
-Video = Path | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
+Video = VideoFile | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
 
 _LARGEST_FORCE_N = 50.0
+_LATE_START_S = 2e-3  # of a first picture, from which it is said
 _EPOCH_S = 1e8  # three years, longer than any recording: larger times count from 1970
 
 
@@ -83,13 +84,15 @@ class Recording:
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""
-        first, fps = next(iter(self.numbers()), 0), self.meta.fps
+        fps, by_name = self.meta.fps, dict[int, float]()
+        if fps is not None and not isinstance(self.footage, VideoFile):
+            by_name = file_numbers.still_times(self.footage, fps, [])
         for picture in _pictures(self.footage):
             time_s = picture.time_s
             if self.times_s is not None:
                 time_s = self.times_s.get(picture.index)
             elif time_s is None and fps is not None:
-                time_s = (picture.index - first) / fps
+                time_s = by_name.get(picture.index, picture.index / fps)
             yield replace(picture, time_s=time_s)
 
     def right_frames(self) -> Iterator[Picture]:
@@ -127,11 +130,11 @@ class Recording:
 
 
 def _pictures(files: Video) -> Iterator[Picture]:
-    return video.read_video(files) if isinstance(files, Path) else video.read_pictures(files)
+    return video.read_video(files) if isinstance(files, VideoFile) else video.read_pictures(files)
 
 
 def _numbers(files: Video) -> Collection[int]:
-    return range(video.count_frames(files) or 0) if isinstance(files, Path) else files.keys()
+    return range(video.count_frames(files) or 0) if isinstance(files, VideoFile) else files.keys()
 
 
 def open_recording(folder: Path, phantom: bool = False) -> Recording:
@@ -145,21 +148,28 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     about = meta.read_meta(folder / "meta.yaml")
     if phantom:
         about = about.model_copy(update={"tissue": "phantom"})
-    footage = _find_video(folder, "video", "frames")
-    if not footage:
-        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found")
     notes: list[str] = []
+    footage = _find_video(folder, "video", "frames", about, notes)
+    if not footage:
+        holds = ", ".join(sorted(path.name for path in folder.iterdir())[:8])
+        raise UserError(f"{folder}: neither video.mp4 nor frames/*.png found; it holds {holds}")
     if about.scale_mm_per_px == "unknown":
         about = about.model_copy(update={"young_kpa": None})
         notes.append(UNKNOWN_NOTE)
     frames = _numbers(footage)
-    if not isinstance(footage, Path):
+    if not isinstance(footage, VideoFile):
         notes += file_numbers.describe_gaps(list(frames), "frames/")
     elif (aspect := video.pixel_aspect(footage)) != 1:
         how = f"pixels {aspect:.3g} times as wide as high were made square, in width"
         notes.append(f"the video: {how}; scale and calibration are assumed to be for square pixels")
     times = _frame_times(folder / "frames.csv", frames, notes)
-    force = _force(folder / "force.csv", about, notes)
+    if times is None and isinstance(footage, VideoFile):
+        notes += _describe_start(footage)
+    elif times is None and about.fps is not None and not isinstance(footage, VideoFile):
+        file_numbers.still_times(footage, about.fps, notes)
+    force, axes = _force(folder / "force.csv", about, notes)
+    if axes != "xyz":  # without a direction no component can be compared
+        about = about.model_copy(update={"sensor": about.sensor.size_only()})
     about, times, force = _from_start(about, times, force, notes)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _find_stereo(folder, about)
@@ -173,9 +183,22 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     return found.within(MaskFiles.find(folder / "masks", folder), None)
 
 
+def _describe_start(footage: VideoFile) -> list[str]:
+    """A note on a video whose first picture is not at the start of its file."""
+    late_s = video.find_start(footage)
+    if late_s < _LATE_START_S:
+        return []
+    what = "the start of its file" if footage.from_file else "that picture"
+    return [
+        f"{footage.path.name}: its first picture is {late_s:.3f} s after the start of its file, "
+        "with which sound or "
+        f"pictures that can't be decoded begin: times count from {what} (start: picture or file in meta.yaml)"
+    ]
+
+
 def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     """The right camera's video or pictures, and depth pictures. UserError if meta.yaml does not match."""
-    right = _find_video(folder, "right", "right")
+    right = _find_video(folder, "right", "right", about, [])
     depths = file_numbers.find_stills(folder / "depth", (".png", ".npy"))
     for found, section, key in ((right, about.stereo, "stereo"), (depths, about.depth, "depth")):
         if bool(found) != (section is not None):
@@ -186,16 +209,34 @@ def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
     return right, file_numbers.number_files(depths)
 
 
-def _find_video(folder: Path, name: str, pictures: str) -> Video:
-    """The video NAME.*, or the pictures in a folder; empty: neither. UserError for several."""
-    found: list[Video] = [
-        path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
-    ]
-    if stills := file_numbers.number_files(file_numbers.find_stills(folder / pictures)):
-        found.append(stills)
-    if len(found) > 1:
-        raise UserError(f"{folder}: has several of {name}.mp4 and {pictures}/; keep one of them")
-    return found[0] if found else {}
+def _find_video(folder: Path, name: str, pictures: str, about: Meta, notes: list[str]) -> Video:
+    """The video NAME.*, else the only one, or the pictures in a folder; empty: neither. UserError:
+    several."""
+    films = sorted(path for path in folder.glob("*") if path.suffix.lower() in video.SUFFIXES)
+    films = [path for path in films if not path.name.startswith(".")]
+    named = [path for path in films if path.name.lower().startswith(f"{name}.")]
+    stills = file_numbers.number_files(file_numbers.find_stills(folder / pictures, file_numbers.STILLS))
+    if not named and not stills and name == "video":
+        others = [path for path in films if not path.stem.lower().startswith("right")]
+        if len(others) > 1:
+            some = ", ".join(path.name for path in others[:4])
+            raise UserError(
+                f"{folder}: holds {some}, but no video.mp4: rename the one to be used, or keep only it"
+            )
+        notes += [f"{path.name} is taken for the video" for path in others]
+        named = others
+    if len(named) > 1:
+        some = ", ".join(path.name for path in named[:4])
+        raise UserError(
+            f"{folder}: holds {some}; keep one of them. If they are chapters of one recording, "
+            "move them into a "
+            "folder of their own, and bench import joins it"
+        )
+    if named and stills:
+        raise UserError(f"{folder}: has {named[0].name} and pictures in {pictures}/; keep one of them")
+    if named:
+        return VideoFile(named[0], about.stream, about.start == "file")
+    return stills
 
 
 def _from_start(
@@ -260,11 +301,31 @@ def _rising(time: Floats) -> Mask:
     return np.asarray(forward if forward.sum() >= backward.sum() else backward, bool)
 
 
-def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
-    if not os.path.lexists(path):
-        return None
+def _read_forces(path: Path, notes: list[str]) -> tuple[dict[str, Floats], str]:
+    """Columns t_s, fx_n, fy_n, fz_n, and gx, gy, gz if there, and the measured axes. UserError: no unit."""
     forces = ("fx_n", "fy_n", "fz_n")
-    columns = csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz"))
+    if set(csv_table.read_header(path)) >= {"t_s", *forces}:
+        return csv_table.read_csv(path, ("t_s", *forces), ("gx", "gy", "gz")), "xyz"
+    table = sensor_table.read_forces(path)
+    if not table.in_newtons:
+        raise UserError(
+            f"{path}: the unit of force isn't stated: name its columns fx_n, fy_n, fz_n (or f_n "
+            "for a size) if they "
+            "are in newtons, as `bench import` writes them"
+        )
+    notes += [note.replace(str(path), path.name) for note in table.notes]
+    columns = dict(zip(("t_s", *forces), (table.time_s, *table.force.T), strict=True))
+    if table.gravity is not None:
+        columns |= dict(zip(("gx", "gy", "gz"), table.gravity.T, strict=True))
+    return columns, table.axes
+
+
+def _force(path: Path, about: Meta, notes: list[str]) -> tuple[Force | None, str]:
+    """The samples, and which axes of them are measured, some of "xyz" or empty for a size."""
+    if not os.path.lexists(path):
+        return None, "xyz"
+    columns, axes = _read_forces(path, notes)
+    forces = ("fx_n", "fy_n", "fz_n")
     columns["row"] = np.arange(1.0, len(columns["t_s"]) + 1)
     blank = np.asarray(np.isnan([columns[name] for name in forces]).all(axis=0), bool)
     if 0 < blank.sum() < blank.size:  # rows of other instruments, as in joined tables
@@ -297,4 +358,4 @@ def _force(path: Path, about: Meta, notes: list[str]) -> Force | None:
     directions = [columns[name] for name in ("gx", "gy", "gz") if name in columns]
     gravity = np.stack(directions, axis=1) if len(directions) == 3 else None
     sign = 1.0 if about.sensor.acts_on == "tissue" else -1.0
-    return Force(columns["t_s"], sign * 1000.0 * newtons, gravity)
+    return Force(columns["t_s"], sign * 1000.0 * newtons, gravity), axes

@@ -11,16 +11,18 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from synth.errors import UserError
-from synth.job.types import MembraneState, Positive, Section
+from synth.job.types import MembraneState, Section
 from synth.job.writer import section_lines
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Mistake
 
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
-Point = tuple[FiniteFloat, FiniteFloat]
+Positive = Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)]
+Number = Annotated[FiniteFloat, Field(ge=-1e10, le=1e10)]  # also times since 1970
+Point = tuple[Number, Number]
 PoissonsRatio = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
-Corners = Annotated[int, Field(ge=2)]
-Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Corners = Annotated[int, Field(ge=2, le=1000)]
+Row = tuple[Number, Number, Number]
 
 
 def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
@@ -92,7 +94,7 @@ class SensorMeta(Section):
     """Cut-off of the sensor's low-pass filter (zero-phase, 4th-order Butterworth) [Hz]; null: no filter."""
     free_s: tuple[Span, ...] = ()
     """Spans without contact, (from, to) on the sensor's clock [s], for tare, drift and noise floor."""
-    mass_g: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    mass_g: Annotated[FiniteFloat, Field(ge=0, le=1e6)] = 0.0
     """Mass on the tool's side of a tool-mounted sensor [g], to remove its weight; needs columns gx, gy, gz in
     force.csv: the unit vector along gravity in the sensor's axes."""
 
@@ -106,6 +108,10 @@ class SensorMeta(Section):
             raise ValueError("give turn_s or to_camera or axes: camera, not several of them")
         return self
 
+    def size_only(self) -> SensorMeta:
+        """The same for a sensor of one axis or of a size, whose components can't be compared."""
+        return self.model_copy(update={"axes": "sensor", "to_camera": None, "turn_s": None})
+
     @property
     def in_camera_axes(self) -> bool:
         """Whether force components are along the camera's axes, as recorded or after the rotation."""
@@ -118,8 +124,12 @@ class Sync(Section):
     method: Literal["clock", "offset", "correlate"] = "clock"
     """`clock`: both files have the same clock. `offset`: `offset_s` is known, e.g. from a trigger.
     `correlate`: the offset is found on `calibration_s` by correlating force and motion."""
-    offset_s: FiniteFloat = 0.0
+    offset_s: Number = 0.0
     """Added to the sensor's times to give video times [s]."""
+    rate: Annotated[FiniteFloat, Field(ge=0.01, le=100)] = 1.0
+    """Seconds of video time per second of the sensor's clock, where the video is stamped with another rate than
+    it was taken at: 25/30, 0.8333, if 25 pictures a second are stamped as 30. The sensor's times are multiplied
+    by it before `offset_s` is added."""
     calibration_s: Span | None = None
     """Span of video time that `correlate` uses [s]; it is not scored."""
     search_s: Positive = 0.5
@@ -178,7 +188,12 @@ class Meta(Section):
     """Range of the tissue's Poisson's ratio."""
     fps: Positive | None = None
     """Frames per second, for frames/*.png without frames.csv."""
-    rest_frame: Annotated[int, Field(ge=0)] = 0
+    start: Literal["picture", "file"] = "picture"
+    """What is at t = 0 of a video without frames.csv: its first `picture`, or the start of its `file`, with
+    which sound, or pictures that can't be decoded, may begin earlier."""
+    stream: Annotated[int, Field(ge=0, le=1000)] | None = None
+    """Number of the film in a video that holds several, from 0; covers don't count."""
+    rest_frame: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Number of a frame with the tissue unloaded; displacement is measured from it."""
     press_s: Span | None = None
     """Span of video time with a separate press for calibrating the gain [s]; it is not scored."""

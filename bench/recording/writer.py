@@ -23,10 +23,24 @@ def write_frames(folder: Path, time_s: Floats) -> None:
     _csv(folder / "frames.csv", "frame,t_s", "%d,%.6f", np.column_stack([np.arange(len(time_s)), time_s]))
 
 
-def write_force(folder: Path, time_s: Floats, newtons: Floats) -> None:
-    """Writes force.csv: the sensor's times (N,) s and forces (N, 3) N."""
-    columns = np.column_stack([time_s, newtons])
-    _csv(folder / "force.csv", "t_s,fx_n,fy_n,fz_n", "%.6f,%.9f,%.9f,%.9f", columns)
+def write_force(folder: Path, time_s: Floats, newtons: Floats, axes: str = "xyz") -> None:
+    """Writes force.csv: the sensor's times (N,) s and forces (N, 3) N; of some `axes`, or empty: the size."""
+    chosen = [newtons[:, "xyz".index(axis)] for axis in axes] or [newtons[:, 0]]
+    head = ",".join(["t_s", *(f"f{axis}_n" for axis in axes or ("",))])
+    _csv(folder / "force.csv", head, "%.6f" + len(chosen) * ",%.9f", np.column_stack([time_s, *chosen]))
+
+
+def write_poses(folder: Path, time_s: Floats, poses: Mapping[str, Floats]) -> None:
+    """Writes poses.csv: for each instrument by name the place and the rotation's rows of its pose (T, 4,
+    4)."""
+    parts = [
+        f"{name}_{part}"
+        for name in poses
+        for part in ("x", "y", "z", *(f"r{i}{j}" for i in "123" for j in "123"))
+    ]
+    rows = [np.column_stack([pose[:, :3, 3], pose[:, :3, :3].reshape(-1, 9)]) for pose in poses.values()]
+    columns = np.column_stack([np.arange(len(time_s)), time_s, *rows])
+    _csv(folder / "poses.csv", ",".join(["frame", "t_s", *parts]), "%d,%.6f" + len(parts) * ",%.9g", columns)
 
 
 def write_meta(folder: Path, keys: Mapping[str, object]) -> None:

@@ -50,16 +50,16 @@ def align_sensor(
     if other := clocks.find_other_unit(time_s, force.time_s):
         return AlignedSensor(notes=(f"{other}: nothing is scored",))
     offset_s, found = _find_offset(force, sensor, recording.meta.sync, time_s, speed)
-    rotation, notes = None, list[str]()
+    rotation, notes, rate = None, list[str](), recording.meta.sync.rate
     if sensor.turn_s is not None:
-        rotation = _find_rotation(force, sensor, offset_s, surface)
+        rotation = _find_rotation(force, sensor, offset_s, rate, surface)
         if rotation.refused:
             notes = [f"the sensor's rotation was not found ({rotation.refused}): components are not scored"]
         else:
             span = describe_span(sensor.turn_s)
             notes = [f"the sensor's rotation was found on {span}: {rotation.describe()}"]
             sensor = sensor.model_copy(update={"to_camera": rotation.rows})
-    processed = force_sensor.process_force(force, sensor, offset_s)
+    processed = force_sensor.process_force(force, sensor, offset_s, rate)
     axes = force_sensor.force_at(processed, time_s)
     covered = int(np.isfinite(axes).all(axis=1).sum())
     if 0 < covered < len(time_s):
@@ -87,20 +87,20 @@ def _find_offset(
     if sync.method == "offset" or sync.calibration_s is None:
         return sync.offset_s, None
     inside = (time_s >= sync.calibration_s[0]) & (time_s <= sync.calibration_s[1])
-    smooth = force_sensor.process_force(force, sensor, 0.0)
+    smooth = force_sensor.process_force(force, sensor, 0.0, sync.rate)
     samples = smooth.time_s, smooth.force_mn
     found = clock_sync.find_offset(time_s[inside], speed[inside], *samples, sync.search_s)
     return sync.offset_s if found.refused else found.offset_s, found
 
 
 def _find_rotation(
-    force: Force, sensor: SensorMeta, offset_s: float, surface: SurfaceMotion | None
+    force: Force, sensor: SensorMeta, offset_s: float, rate: float, surface: SurfaceMotion | None
 ) -> SensorRotation:
     """The rotation to the camera's axes for which the tissue moves along the force."""
     if surface is None:
         return find_rotation(np.zeros((0, 1, 2)), np.zeros((0, 1)), np.zeros((0, 3)))
     count = len(surface.time_s)
     moved, visible = (np.stack(parts).astype(np.float64) for parts in (surface.motion, surface.visible))
-    processed = force_sensor.process_force(force, sensor, offset_s)
+    processed = force_sensor.process_force(force, sensor, offset_s, rate)
     at = force_sensor.force_at(processed, np.array(surface.time_s))
     return find_rotation(moved.reshape(count, -1, 2), visible.reshape(count, -1), at)

@@ -30,8 +30,8 @@ class Processed:
     steps: tuple[str, ...]  # of the processing, in order, in words
 
 
-def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processed:
-    """Removes gravity, tare and drift, filters, and adds `offset_s` to the clock, in this order.
+def process_force(force: Force, sensor: SensorMeta, offset_s: float, rate: float = 1.0) -> Processed:
+    """Removes gravity, tare and drift, filters, multiplies the clock by `rate` and adds `offset_s`.
 
     UserError for a contact-free span without samples, or a mass without a unit vector of gravity.
     """
@@ -43,9 +43,11 @@ def process_force(force: Force, sensor: SensorMeta, offset_s: float) -> Processe
     values = _tared(force.time_s, values, sensor, steps)
     values = _smooth(force.time_s, values, sensor.low_pass_hz, steps)
     floor = _floor(force.time_s, values, sensor)
+    if rate != 1:
+        steps.append(f"clock multiplied by {rate:.6g}")
     if offset_s:
         steps.append(f"clock shifted by {offset_s * 1000:+.1f} ms")
-    return Processed(force.time_s + offset_s, values, floor, tuple(steps))
+    return Processed(rate * force.time_s + offset_s, values, floor, tuple(steps))
 
 
 def force_at(processed: Processed, time_s: Floats) -> Floats:

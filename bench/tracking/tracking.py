@@ -218,7 +218,8 @@ class _Forces:
     def finish(self, recording: Recording, found_s: Sequence[Span]) -> None:
         """Computes results that need all frames; `found_s`: contact-free spans besides those stated [s]."""
         about = recording.meta
-        sensor_s = [(a + about.sync.offset_s, b + about.sync.offset_s) for a, b in about.sensor.free_s]
+        rate, offset_s = about.sync.rate, about.sync.offset_s
+        sensor_s = [(rate * a + offset_s, rate * b + offset_s) for a, b in about.sensor.free_s]
         stated = [*about.pulse.free_s, *(sensor_s if about.sync.method != "correlate" else [])]
         times, trusted = np.array(self.out.time_s), np.array(self.out.trusted, bool)
 

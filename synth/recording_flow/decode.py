@@ -20,6 +20,7 @@ from synth.system.stopwatch import Stopwatch
 from synth.video.mask_files import MASKS
 from synth.video.read import Picture, shrink_mask, shrink_picture
 
+DAMAGED = "damaged in the video's file"
 LEAST_COLUMNS = 320  # least width with `shrink` 0: the grids of the networks are no finer
 
 
@@ -94,7 +95,7 @@ class Decoder:
         """Decodes the pictures after the rest frame and yields those to be tracked."""
         for picture in self._pictures:
             if picture.time_s is not None:
-                self.faults.add_decoded(picture.index, picture.time_s, picture.rgb)
+                self.faults.add_decoded(picture.index, picture.time_s, picture.rgb, picture.damaged)
             if reason := self._leave_out(picture):
                 self.left_out[reason] += 1
             else:
@@ -132,6 +133,8 @@ class Decoder:
             self.left_out[reason] += 1
             if picture.time_s is None and picture.index == self._footage.rest_frame:
                 return picture
+        if self.left_out[DAMAGED]:
+            raise UserError(f"{self._footage.name}: every picture from the rest frame on is damaged")
         if self.left_out["without a time"]:
             raise UserError(f"{self._footage.name}: no frame from the rest frame on has a time")
         rest = self._footage.rest_frame
@@ -144,6 +147,8 @@ class Decoder:
             return "before the rest frame"
         if time_s is None:
             return "without a time"
+        if picture.damaged:
+            return DAMAGED
         if self._footage.only is not None and picture.index not in self._footage.only:
             return "outside the selection"
         if time_s <= self._last_s:

@@ -92,6 +92,8 @@ class VideoFaults:
         # Change since the previous picture: mean, minimum and median over parts of the picture.
         self._changes: list[tuple[float, float, float]] = []
         self._blurred: list[float] = []
+        self._damaged: list[float] = []
+        self._decoded = 0
         self._combed: list[float] = []
         level = float(np.percentile(grey[tissue], 95))
         corners = cv2.filter2D(grey, -1, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32))
@@ -108,8 +110,12 @@ class VideoFaults:
         )
         self._rest = [message for wrong, message in rest if wrong]
 
-    def add_decoded(self, index: int, time_s: float, rgb: Pixels) -> None:
-        """Adds a picture (H, W, 3) of the video; every picture in order."""
+    def add_decoded(self, index: int, time_s: float, rgb: Pixels, damaged: bool = False) -> None:
+        """Adds a picture (H, W, 3) of the video; every picture in order. `damaged`: not decoded as it was
+        taken."""
+        self._decoded += 1
+        if damaged:
+            self._damaged.append(time_s)
         self._first += [rgb] * (len(self._first) < stereo_layout.PICTURES)
         one = rgb[::_STRIDE, ::_STRIDE]
         if one.shape == self._last.shape:
@@ -174,6 +180,7 @@ class VideoFaults:
             message = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
             found.append(Finding("error", "pictures", message))
         for times, fault in (
+            (self._damaged, f"damaged in the video's file, of {self._decoded}: they are lost; copy it again"),
             (self._combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
             ([at[k] for k in sorted(again)], "the previous one again: frozen or doubled"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
-from array import array
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,11 @@ from synth.errors import UserError
 from synth.system import checked_file
 
 _LARGEST_BYTES = 512 << 20
+_NOTHING = {"", "nan", "na", "n/a", "#n/a", "#value!", "null", "none", "-", "--", "---"}
+_PLAIN = re.compile(r"[-+]?[0-9][0-9.,]*|[-+]?[.,][0-9]+")  # a number's digits and marks
+_FORTRAN = re.compile(r"([0-9.,])[dD]([-+]?[0-9]+)")
+_SPACES = re.compile("(?<=[0-9])['’\u00a0\u2009\u202f](?=[0-9]{3})")  # thousands of other countries
+_GROUPS = re.compile(r"[-+]?[1-9][0-9]{0,2}([.,])[0-9]{3}(\1[0-9]{3})*")
 
 
 def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Floats]:
@@ -24,7 +29,8 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
 
     Dates of ISO 8601 are seconds since 1970, in UTC unless they state a zone. `path`: with comma or tab, or
     semicolon and then also decimal commas, in UTF-8, or UTF-16 with BOM. `required`: present exactly once.
-    UserError: unreadable, too large, a missing column, no rows, a cell that is not a number.
+    UserError: unreadable, too large, a missing column, no rows, a cell that is not a number, or one such as
+    "1,482" in a table that doesn't show whether it is a thousand.
     """
     header, rows = _split(path)
     missing = [name for name in required if header.count(name) != 1]
@@ -32,7 +38,9 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
         there = ", ".join(header)[:200]
         raise UserError(f"{path}:1: missing column {', '.join(missing)}; the header is {there!r}")
     wanted = [name for name in (*required, *optional) if name in header]
-    columns, values = [header.index(name) for name in wanted], array("d")
+    columns = [header.index(name) for name in wanted]
+    cells: list[list[str]] = [[] for _ in wanted]
+    lines: list[int] = []
     try:
         for row in rows:
             if "".join(row).strip():
@@ -40,12 +48,14 @@ def read_csv(path: Path, required: Sequence[str], optional: Sequence[str] = ()) 
                 if over or len(row) <= max(columns):
                     why = "decimal commas? use points" if over else "cut off?"
                     raise ValueError(f"{len(row)} cells, {len(header)} expected ({why})")
-                values.extend(_number(row[k].strip().replace(",", ".") or "nan") for k in columns)
+                lines.append(rows.line_num)
+                for held, k in zip(cells, columns, strict=True):
+                    held.append(row[k])
     except (ValueError, csv.Error) as error:
         raise UserError(f"{path}:{rows.line_num}: {str(error)[:100]}") from None
-    if not values:
+    if not lines:
         raise UserError(f"{path}: a header but no rows")
-    return dict(zip(wanted, np.array(values).reshape(-1, len(wanted)).T, strict=True))
+    return dict(zip(wanted, parse_columns(path, cells, lines), strict=True))
 
 
 def read_header(path: Path) -> list[str]:
@@ -53,21 +63,112 @@ def read_header(path: Path) -> list[str]:
     return _split(path)[0]
 
 
-def _number(cell: str) -> float:
+def read_lines(path: Path) -> list[str]:
+    """The lines of a table's text: UTF-8, UTF-16 with BOM, else of Windows in the West. UserError: none."""
+    data = checked_file.read_bytes(path, _LARGEST_BYTES)
+    if b"\0" in data[:4096] and data[:2] not in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        raise UserError(f"{path}: is no text: export the table as CSV")
+    wide = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
+        try:
+            return data.decode(encoding).splitlines()
+        except UnicodeDecodeError:
+            continue
+    raise UserError(f"{path}: is not text")
+
+
+def parse_columns(path: Path, columns: Sequence[Sequence[str]], lines: Sequence[int]) -> list[Floats]:
+    """The numbers in the cells of columns, each (N,); `lines`: the file's line of each row, for messages.
+
+    Decimal commas and thousands are told apart by each column's other cells, or else by other columns.
+    UserError: a cell is no number, or may be one of two.
+    """
+    found, marks = [], []
+    for cells in columns:
+        values, odd = np.full(len(cells), np.nan), list[int]()
+        for k, cell in enumerate(cells):
+            try:
+                values[k] = float(cell)
+            except ValueError:
+                odd.append(k)
+        found.append((values, odd))
+        with_commas = any("," in cells[k] for k in odd)
+        marks.append(_decimal_mark(path, cells, lines) if with_commas else ".")
+    certain = {mark for mark in marks if mark in (",", ";")}
+    for cells, (values, odd), mark in zip(columns, found, marks, strict=True):
+        if mark == "?":
+            if len(certain) != 1:
+                k = next(k for k in odd if "," in cells[k])
+                raise UserError(
+                    f"{path}:{lines[k]}: {cells[k].strip()} may be a thousand or have decimals: "
+                    "write numbers "
+                    "with points as decimal marks, and thousands without marks"
+                )
+            mark = certain.copy().pop()
+        if mark == ",":  # points are then thousands
+            odd = sorted({*odd, *(k for k, cell in enumerate(cells) if "." in cell)})
+        for k in odd:
+            try:
+                values[k] = _number(cells[k], "," if mark == "," else ".")
+            except ValueError as error:
+                raise UserError(f"{path}:{lines[k]}: {str(error)[:100]}") from None
+    return [values for values, _ in found]
+
+
+def _decimal_mark(path: Path, cells: Sequence[str], lines: Sequence[int]) -> str:
+    """What commas are in a column that has some: `,` decimal marks, `;` thousands, `?` either.
+
+    UserError if cells contradict each other.
+    """
+    decimal, thousands, whole = 0, 0, False  # the last lines that show it
+    for line, cell in zip(lines, cells, strict=True):
+        text = re.split("[eEdD]", _SPACES.sub("", cell.strip()))[0]
+        if not _PLAIN.fullmatch(text):
+            continue
+        if "," not in text:
+            whole |= "." not in text
+            if "." in text and not _GROUPS.fullmatch(text):
+                thousands = line
+        elif text.count(",") > 1 or -1 < text.find(",") < text.rfind("."):
+            thousands = line
+        elif "." in text or not _GROUPS.fullmatch(text):
+            decimal = line
+    if decimal and thousands:
+        raise UserError(f"{path}: commas are decimal marks in line {decimal}, but thousands by {thousands}")
+    if decimal or thousands:
+        return "," if decimal else ";"
+    # A column of whole numbers below and from a thousand: a program that writes three decimals writes them
+    # all.
+    small = all(
+        len(re.sub("[^0-9]", "", c)) <= 3 for c in cells if "," not in c and _PLAIN.fullmatch(c.strip())
+    )
+    return ";" if whole and small else "?"
+
+
+def _number(cell: str, decimal: str) -> float:
+    text = cell.strip()
+    if text.lower() in _NOTHING:
+        return np.nan
+    text = _FORTRAN.sub(r"\1e\2", _SPACES.sub("", text))
+    group = "," if decimal == "." else "."
+    head = re.split("[eE]", text)[0]
+    if _PLAIN.fullmatch(head):
+        whole, mark, _ = head.partition(decimal)
+        if group in head and not (_GROUPS.fullmatch(whole) and group not in head[len(whole) :]):
+            raise ValueError(f"{cell.strip()!r} is not a number with {decimal!r} as decimal mark")
+        return float(text.replace(group, "").replace(decimal, ".") if mark else text.replace(group, ""))
     try:
-        return float(cell)
+        return float(text)
     except ValueError:
-        if "-" not in cell[1:]:
+        if "-" not in text[1:]:
             raise
-        date = datetime.fromisoformat(cell)
+        date = datetime.fromisoformat(text)
         return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
 def _split(path: Path) -> tuple[list[str], Any]:
     """Column names, and the csv.reader of the rows."""
-    with checked_file.open_file(path, _LARGEST_BYTES) as file:
-        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    lines = checked_file.read_text(path, _LARGEST_BYTES, "utf-16" if wide else "utf-8-sig").splitlines()
+    lines = read_lines(path)
     first = lines[0] if lines else ""
     rows = csv.reader(lines, delimiter=max(",;\t", key=first.count), strict=True)
     try:

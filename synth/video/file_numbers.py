@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from synth.arrays import Floats
 from synth.errors import UserError
 
+STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+"""Suffixes of still pictures."""
 _SEVERAL = "{}: holds {}: keep one series of names (bench import: --use frames='{}')"
+_SINCE_1970_S = 900_000_000, 5_000_000_000  # of the years 1998 to 2128
+_SAME_STEP = 0.03  # of a step to a frame's interval: names are rounded to whole units
 _SPARSE, _SPARE = 10, 1000  # n numbers that span more than 10 n + 1000 are not frame numbers but e.g. times
 
 
@@ -47,6 +52,46 @@ def number_files(paths: Collection[Path]) -> dict[int, Path]:
         first = re.sub("([0-9]+)(.*)", r"\1*", ordered[0].stem) + ordered[0].suffix
         raise UserError(_SEVERAL.format(ordered[0].parent, "each number several times", first))
     return dict(enumerate(ordered))
+
+
+def still_times(files: Mapping[int, Path], fps: float, notes: list[str]) -> dict[int, float]:
+    """Times [s] of numbered pictures from the first one: by the numbers in their names at `fps` a second.
+
+    Numbers that step by a frame's milliseconds, or micro- or nanoseconds, are times. `notes` receives a line
+    if they do, or if they step by more than one, or are not those of frames.
+    """
+    keys = np.array([*files], np.int64)
+    last = [int(part) for path in files.values() for part in re.findall("[0-9]+", path.stem)[-1:]]
+    names = np.array(last if len(last) == len(keys) else keys, object)
+    steps = np.diff(names)
+    if len(steps) and (steps > 0).all() and (step := float(np.median(steps))) > 1:
+        for unit, word in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+            if abs(step * unit * fps - 1) < _SAME_STEP:
+                notes.append(f"the numbers in the pictures' names step by {step:g}: taken for {word}")
+                seconds = [float(number - names[0]) * unit for number in names]
+                return dict(zip(keys.tolist(), seconds, strict=True))
+    steps = np.diff(keys)
+    if len(steps) and steps[0] > 1 and (steps == steps[0]).all():
+        notes.append(
+            f"the pictures' numbers step by {steps[0]}: taken for every {steps[0]}th frame at "
+            f"{fps:g} a second"
+        )
+    elif len(last) == len(keys) and 0 in files and last != keys.tolist():
+        notes.append("the names' numbers are not those of frames: in order, evenly spaced")
+    return {key: (key - int(keys[0])) / fps for key in keys.tolist()}
+
+
+def find_stamps(paths: Collection[Path]) -> Floats | None:
+    """Times since 1970 [s] that are the last numbers in names, (N,); None: they are no such times."""
+    last = [int(part) for path in paths for part in re.findall("[0-9]+", path.stem)[-1:]]
+    if not last or len(last) != len(paths):
+        return None
+    least, most = _SINCE_1970_S
+    for per_second in (1, 1000, 10**6, 10**9):
+        if all(least * per_second < number < most * per_second for number in last):
+            whole = np.array([number // per_second for number in last], np.float64)
+            return whole + np.array([number % per_second for number in last], np.float64) / per_second
+    return None
 
 
 def match_numbers(

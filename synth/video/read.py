@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,13 +18,14 @@ import av
 import cv2
 import numpy as np
 from av.container import InputContainer
+from av.stream import Disposition
 from numpy.typing import NDArray
 
 from synth.arrays import Array, Mask, Pixels
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
-from synth.video.file_numbers import find_stills, number_files
+from synth.video.file_numbers import find_stills, number_files, still_times
 
 A = TypeVar("A", bound=np.generic)
 
@@ -33,6 +38,7 @@ FPS = 25.0  # assumed if a video's times are unknown
 
 _LARGEST_BYTES = 1 << 40
 _WIDEST = 4.0  # largest aspect ratio of a pixel: a larger one is a damaged header
+_PEEKED = 2000  # packets in which a film has more than one picture
 _LABELS = 8  # most levels of a mask of class numbers; more are a soft edge
 
 # Formats that FFmpeg may open: others could make it read further files and addresses.
@@ -47,33 +53,49 @@ class Picture:
     index: int  # position in a video, or the number in the name of a still image
     time_s: float | None  # presentation time on the video's clock [s]; None if the file states none
     rgb: Pixels  # (H, W, 3) uint8
+    damaged: bool = False  # whether packets of it, or of what it was coded from, are missing or wrong
 
 
-def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
-    """Decodes frame by frame; times are the container's presentation times from its start, else of `fps`.
+@dataclass(frozen=True)
+class VideoFile:
+    """A video, and what is chosen of it."""
 
-    Pictures are upright, with square pixels; those before a cut are returned. UserError: not a video, no
-    video stream, or pictures larger than 40 megapixels.
+    path: Path
+    stream: int | None = None  # number of the film, from 0, where the file has several
+    from_file: bool = False  # whether times count from the start of the file, not from the first picture
+
+
+def read_video(path: Path | VideoFile, fps: float | None = None) -> Iterator[Picture]:
+    """Decodes frame by frame; times are the container's presentation times from the first picture, else of
+    `fps`.
+
+    Pictures are upright, with square pixels; those before a cut are returned. After a damaged packet pictures
+    are `damaged` up to the next that is coded without others. UserError: not a video, no video stream,
+    several without a choice, or pictures larger than 40 megapixels.
     """
+    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
+    path = chosen.path
     with _open_video(path) as container:
-        if not container.streams.video:
-            raise UserError(f"{path}: holds no video stream")
-        stream = container.streams.video[0]
+        stream = _film(container, chosen)
         # Two cores at most: a bench machine scores several recordings at a time.
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = 2
         has_times, index = container.format.name != "avi", 0
-        start_s = (container.start_time or 0) / av.time_base if has_times else 0.0
+        start_s = (container.start_time or 0) / av.time_base if has_times and chosen.from_file else None
+        damaged = False
         try:
-            for frame, ticks in _decode(container, stream):
+            for frame, ticks, broken in _decode(container, stream):
                 width = _square_width(frame.width, stream.sample_aspect_ratio)
                 refuse_large(max(width, frame.width), frame.height)
                 rgb = frame.to_ndarray(format="rgb24")
                 if width != frame.width:
                     rgb = np.asarray(cv2.resize(rgb, (width, frame.height), interpolation=cv2.INTER_AREA))
+                stated = None if ticks is None else float(ticks * frame.time_base)
+                start_s = stated if start_s is None and stated is not None else start_s
                 unstated = None if fps is None else index / fps
-                time_s = unstated if ticks is None else float(ticks * frame.time_base) - start_s
-                yield Picture(index, time_s, np.ascontiguousarray(_upright(rgb, frame)))
+                time_s = unstated if stated is None or start_s is None else stated - start_s
+                damaged = broken or frame.is_corrupt or (damaged and not frame.key_frame)
+                yield Picture(index, time_s, np.ascontiguousarray(_upright(rgb, frame)), damaged)
                 index += 1
         except (av.error.FFmpegError, ValueError) as error:
             if index == 0:
@@ -82,15 +104,97 @@ def read_video(path: Path, fps: float | None = None) -> Iterator[Picture]:
             raise UserError(f"{path}: holds no frames")
 
 
-def _decode(container: InputContainer, stream: av.VideoStream) -> Iterator[tuple[av.VideoFrame, int | None]]:
-    """Frames in order of presentation, with their times in ticks."""
+def _decode(
+    container: InputContainer, stream: av.VideoStream
+) -> Iterator[tuple[av.VideoFrame, int | None, bool]]:
+    """Frames in order of presentation, their times in ticks, and whether a packet before them is
+    unreadable."""
     # AVI has one time per packet, in the order of decoding, from which FFmpeg guesses those of presentation.
-    packets = deque[int]()
+    packets, broken, count = deque[int](), False, 0
     for packet in container.demux(stream):
         if container.format.name == "avi" and packet.size and packet.dts is not None:
             packets.append(packet.dts)
-        for frame in packet.decode():
-            yield frame, packets.popleft() if packets else frame.pts
+        try:
+            frames = packet.decode()
+        except av.error.InvalidDataError:
+            if not count:
+                raise
+            broken = True
+            continue
+        for frame in frames:
+            yield frame, packets.popleft() if packets else frame.pts, broken
+            broken, count = False, count + 1
+
+
+def find_films(path: Path) -> list[str]:
+    """The films in a video, in words: its video streams without covers. UserError: it is none."""
+    with _open_video(path) as container:
+        return [
+            f"{stream.width} x {stream.height} {stream.codec_context.name}"
+            for stream in _films(container, path)
+        ]
+
+
+def find_start(path: Path | VideoFile) -> float:
+    """Time of a video's first picture from the start of its file [s], which sound or undecodable pictures may
+    begin; 0 if its format has no times. UserError: it is no video."""
+    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
+    first = next(read_video(replace(chosen, from_file=True)))
+    return first.time_s or 0.0
+
+
+def find_date(path: Path) -> float | None:
+    """When a video says that it was begun [s since 1970]; None if it doesn't. UserError: it is no video."""
+    with _open_video(path) as container:
+        text = container.metadata.get("creation_time", "")
+    return _seconds_since_1970(text)
+
+
+def _seconds_since_1970(text: str) -> float | None:
+    """Of a date such as 2026-11-28T10:02:00.5Z; None: it is none."""
+    try:
+        moment = np.datetime64(text.strip().removesuffix("Z").replace(" ", "T"), "us")
+    except ValueError:
+        return None
+    return None if np.isnat(moment) else float(moment.astype(np.int64)) / 1e6
+
+
+def find_length(path: Path | VideoFile) -> float:
+    """Length that a video states for its film [s]; 0 if none. UserError: it is no video."""
+    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(chosen.path) as container:
+        stream = _film(container, chosen)
+        return float(stream.duration * stream.time_base) if stream.duration else 0.0
+
+
+def _film(container: InputContainer, chosen: VideoFile) -> av.VideoStream:
+    """The film of a video. UserError: there is none, or several and none is chosen."""
+    if not container.streams.video:
+        raise UserError(f"{chosen.path}: holds no video stream")
+    films = _films(container, chosen.path)
+    number = 0 if chosen.stream is None and len(films) == 1 else chosen.stream
+    if number is None or not 0 <= number < len(films):
+        streams = ", ".join(f"{k}: {one.width} x {one.height}" for k, one in enumerate(films))
+        raise UserError(
+            f"{chosen.path}: holds {len(films)} films ({streams}): choose one by stream: in meta.yaml or "
+            "bench import --use stream=NUMBER"
+        )
+    return films[number]
+
+
+def _films(container: InputContainer, path: Path) -> list[av.VideoStream]:
+    """The video streams that are no covers: pictures attached, or single ones next to a film."""
+    streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+    if len(streams) < 2:
+        return streams or [*container.streams.video]
+    counts = dict.fromkeys((one.index for one in streams), 0)
+    with _open_video(path) as again:
+        for packet in islice(again.demux(*again.streams.video), _PEEKED):
+            if packet.size and packet.stream.index in counts:
+                counts[packet.stream.index] += 1
+                if min(counts.values()) > 1:
+                    break
+    return [one for one in streams if counts[one.index] > 1] or streams[:1]
 
 
 def _upright(rgb: Pixels, frame: av.VideoFrame) -> Pixels:
@@ -116,15 +220,17 @@ def read_frames(path: Path, fps: float) -> Iterator[Picture]:
     if not path.is_dir():
         return read_video(path, fps)
     stills = number_files(find_stills(path))
-    first = min(stills)
-    return (replace(one, time_s=(one.index - first) / fps) for one in read_pictures(stills))
+    times = still_times(stills, fps, [])
+    return (replace(one, time_s=times[one.index]) for one in read_pictures(stills))
 
 
-def count_frames(path: Path) -> int | None:
+def count_frames(path: Path | VideoFile) -> int | None:
     """Number of frames stated by the container, else counted; None: no video stream. May raise UserError."""
-    with _open_video(path) as container:
-        if not (stream := next(iter(container.streams.video), None)):
+    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(chosen.path) as container:
+        if not container.streams.video:
             return None
+        stream = _film(container, chosen)
         stated = stream.frames
         with suppress(av.error.FFmpegError):  # those before a cut
             if not stated:
@@ -133,11 +239,13 @@ def count_frames(path: Path) -> int | None:
         return stated or None
 
 
-def pixel_aspect(path: Path) -> float:
+def pixel_aspect(path: Path | VideoFile) -> float:
     """Width over height of a video's pixels, 1 if not stated. UserError if it is not a video."""
-    with _open_video(path) as container:
-        stream = next(iter(container.streams.video), None)
-        return 1.0 if stream is None else _square_width(1 << 20, stream.sample_aspect_ratio) / (1 << 20)
+    chosen = path if isinstance(path, VideoFile) else VideoFile(path)
+    with _open_video(chosen.path) as container:
+        if not container.streams.video:
+            return 1.0
+        return _square_width(1 << 20, _film(container, chosen).sample_aspect_ratio) / (1 << 20)
 
 
 def _square_width(width: int, aspect: Fraction | None) -> int:
@@ -148,6 +256,7 @@ def _square_width(width: int, aspect: Fraction | None) -> int:
 
 def _open_video(path: Path) -> InputContainer:
     checked_file.check_file(path, _LARGEST_BYTES)
+    _refuse_other(path)
     try:
         # With "file:" a colon in the path is not taken for a protocol.
         container: InputContainer = av.open(f"file:{path}", options=_CONTAINERS)
@@ -156,6 +265,43 @@ def _open_video(path: Path) -> InputContainer:
         return container
     except (av.error.FFmpegError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable video ({_reason(error)})") from None
+
+
+def _refuse_other(path: Path) -> None:
+    """Raises UserError for a file that is no video by its first bytes, or one whose index is missing."""
+    with checked_file.open_file(path, _LARGEST_BYTES) as file:
+        head = file.read(512)
+        if not head.strip(b"\0"):
+            what = "is empty" if not head else "begins with zeros: it was not copied or downloaded to its end"
+            raise UserError(f"{path}: {what}")
+        if head.startswith(b"version https://git-lfs"):
+            raise UserError(f"{path}: a pointer of Git LFS, not the video: git lfs pull fetches it")
+        if head.lstrip()[:9].lower() in (b"<!doctype", b"<html>\n<h") or head.lstrip().lower().startswith(
+            b"<html"
+        ):
+            raise UserError(f"{path}: a web page, not the video: download it again")
+        if head.startswith((b"/annex/", b".git/annex/", b"../.git/annex/")):
+            raise UserError(f"{path}: a pointer of git-annex, not the video: git annex get fetches it")
+        if head[4:8] == b"ftyp" and not _has_index(file):
+            raise UserError(
+                f"{path}: an MP4 without its index (moov), as after a recorder's power failure or "
+                "an unfinished "
+                "copy: copy it again, or repair it with a whole video of the same camera (untrunc)"
+            )
+
+
+def _has_index(file: BufferedReader) -> bool:
+    """Whether an MP4's boxes, of [ISO 14496-12, 4.2], include moov."""
+    size, at = os.fstat(file.fileno()).st_size, 0
+    while at + 8 <= size:
+        file.seek(at)
+        length, name = struct.unpack(">I4s", file.read(8))
+        if name == b"moov":
+            return True
+        if length == 1:
+            length = struct.unpack(">Q", file.read(8).rjust(8, b"\0"))[0]
+        at += length if length >= 8 else size
+    return False
 
 
 def read_pictures(paths: Mapping[int, Path]) -> Iterator[Picture]:

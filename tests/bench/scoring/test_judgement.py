@@ -74,6 +74,10 @@ SENSORS = {
     "saturated": (PRESS.clip(-9, 2.0), "warning", "sensor"),
     "0.6 s late": (np.roll(PRESS, 6, axis=0), "error", "clocks"),
     "a clock 8% slow": (at(0.92 * TIME), "error", "clocks"),
+    "stamped 30 for 25": (at(TIME / 1.2), "error", "clocks"),
+    "stamped 30 for 25, and late": (at((TIME - 0.5) / 1.2), "error", "clocks"),
+    "stamped 25 for 30": (at(1.2 * TIME), "error", "clocks"),
+    "stamped 24 for 30": (at(0.8 * TIME), "error", "clocks"),
     "backwards": (PRESS[::-1], "error", "clocks"),
     "0.5 s of the video missing": (np.concatenate([PRESS[:55], PRESS[50:115]]), "warning", "clocks"),
 }
@@ -99,6 +103,19 @@ def test_a_sensor_that_contradicts_the_video_is_found(case: str) -> None:
         assert "error" not in {severity for severity, _ in findings(doubtful, methods)}
     wrong, severity, cause = SENSORS[case]
     assert (severity, cause) in findings(wrong, methods)
+
+
+def test_two_contacts_suffice_for_a_rate_and_an_offset() -> None:
+    load = np.exp(-(((TIME - 2) / 0.4) ** 2)) + 0.8 * np.exp(-(((TIME - 7) / 0.7) ** 2))
+    force = load[:, None] * [1.0, -2.0, 4.0]
+    # The video, taken at 25 a second and stamped as 30, is 0.5 s late.
+    axes = np.stack([np.interp((TIME - 0.5) / 0.8333, TIME, axis) for axis in force.T], axis=1)
+    methods = 0.9 * axes, 1.1 * axes
+    bounds = np.linalg.norm(methods[0], axis=1)[:, None] * [0.6, 1.4]
+    moved = np.linalg.norm(axes, axis=1) ** 0.9
+    sensor = SensorMotion(TIME, force, moved, methods, 3, methods[0], bounds, force[0])
+    found = [one for check in SENSOR_CHECKS for one in check(sensor) if one.cause == "clocks"]
+    assert any("0.8333" in one.message for one in found)
 
 
 def test_a_video_that_starts_under_load_rests_elsewhere() -> None:
