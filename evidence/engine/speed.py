@@ -31,13 +31,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         f"{two['sequences']} sequences). Two processes without an engine reach {two['ratio_alone']:.2f} on "
         f"this machine. Engine, store, index and card add {over['overhead']:.1%} to the stages alone "
         f"(target: at most 5%), the store {over['store_share']:.1%}.**",
-        "Kills, damage, faults and Dask are tested in `tests/slow`. Measured earlier, by code in git's "
-        "history: 200 SIGKILLs over 50 sequences, and 50 over 12 rendered ones, left equal bytes (6dd5d3e, "
-        "bad03fb); a random frame of 640 × 480 px with flow and traction takes 7.9 ms to read, all fields "
-        "17.4 ms; for 100,000 sequences the status took 0.9 s, the report 1.3 s (22268e1).",
+        "A random frame of 640 × 480 px with flow and traction takes 7.9 ms to read, all fields 17.4 ms; for "
+        "100,000 sequences the status took 0.9 s, the report 1.3 s: measured earlier.",
     )
     sections = [report.Section(name, [found[name]]) for name in ("overhead", "workers")]
-    return report.Page("Engine: overhead and workers", found, (), sections, words)
+    return report.Page("Engine: overhead and workers", found, words, sections)
 
 
 def overhead(name: str, count: int) -> dict[str, float | int]:

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from evidence import report
 from evidence.flow.measure import epe
@@ -16,13 +18,13 @@ from synth.flow.track import Tracker
 
 _LOST_PX = 1.0  # mean endpoint error above which a frame is lost
 _DISTURBANCES: dict[str, tuple[str, tuple[float, ...]]] = {
-    "displacement [px]": ("pull", (0.05, 0.5, 2, 5, 10, 20, 30, 40, 60)),
+    "displacement [px]": ("peak_px", (0.05, 0.5, 2, 5, 10, 20, 30, 40, 60)),
     "contrast": ("contrast", (0.05, 0.1, 0.2, 0.5, 1)),
     "noise [grey levels]": ("noise", (0, 2, 5, 10, 20)),
-    "highlights [share]": ("highlights", (0.0, 0.05, 0.12, 0.25)),
-    "tool width [px]": ("tool", (14, 30, 60, 100)),
+    "highlights [share]": ("glare", (0.0, 0.05, 0.12, 0.25)),
+    "tool width [share]": ("tool_width", (0.06, 0.13, 0.27, 0.45)),
     "illumination": ("illumination", (-0.4, -0.2, 0, 0.2, 0.4)),
-    "blur [px]": ("blur", (0, 1, 2, 4)),
+    "blur [px]": ("blur_px", (0, 1, 2, 4)),
 }
 
 
@@ -45,9 +47,9 @@ def _pairs(
     """Disturbance, its size, and pairs with the initial flow (None: zero)."""
     for disturbance, (field, values) in _DISTURBANCES.items():
         for value in values:
-            changes: dict[str, Any] = {"size": size, field: value}
-            yield disturbance, value, [(pair, None) for pair in pairs(Recipe(**changes), count, seed)]
-    made = list(pairs(Recipe(size=size), count, seed))
+            changes: dict[str, Any] = {field: value}
+            yield disturbance, value, [(pair, None) for pair in pairs(Recipe(**changes), count, seed, size)]
+    made = list(pairs(Recipe(), count, seed, size))
     for value in (0.0, 2.0, 5.0, 10.0, 20.0, 40.0):
         wrong = [(p, np.asarray(p.flow + value / np.sqrt(2), np.float32)) for p in made]
         yield "wrong start [px]", value, wrong
@@ -86,17 +88,18 @@ def _flags(name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `stability.json`: error against the size of each disturbance."""
-    panels = []
-    points = [point | {"epe": max(point["epe"], 1e-3)} for point in found["points"]]  # for logarithms
-    for (disturbance,), some in report.grouped(points, "disturbance").items():
-        curves = tuple(
-            report.curve(name, own, "value", "epe")
-            for (name,), own in report.grouped(some, "estimator").items()
-        )
-        panels.append(report.Panel(disturbance, disturbance, "EPE mean [px]", curves, log_y=True))
+    panels = report.grouped(found["points"], "disturbance")
+
+    def draw(axes: Axes, disturbance: str) -> None:
+        for (name,), own in report.grouped(panels[disturbance,], "estimator").items():
+            axes.plot([row["value"] for row in own], [max(row["epe"], 1e-3) for row in own], "-o", label=name)
+        axes.set(xlabel=disturbance, ylabel="mean endpoint error [px]", yscale="log")
+        report.legend(axes)
+
+    chart = report.chart(*(partial(draw, disturbance=name) for (name,) in panels))
     words = ["A frame is lost if its mean endpoint error exceeds 1 px, without masked pixels."]
     sections = [report.Section("Flags of lost frames", found["flags"])]
-    return report.Page("Flow: limits", found, panels, sections, words)
+    return report.Page("Flow: limits", found, words, sections, chart)
 
 
 STUDY = Study(measure, "flow/stability/stability.json", page)

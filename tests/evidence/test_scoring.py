@@ -9,7 +9,6 @@ from bench.methods.physics import GRID
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from evidence.appearance.features import kernel_distance
 from evidence.datasets import coarser
 from evidence.end_to_end import models
 from evidence.scoring import exvivo
@@ -62,14 +61,6 @@ def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
     peak = float(np.nanmax(sensor))
     assert errors["off"] < errors["still"] + 0.02 * peak
     assert errors["in"] > 1.5 * errors["still"], "the pulse must matter if it is not removed"
-
-
-def test_the_kernel_distance_is_unbiased_and_grows_with_a_shift() -> None:
-    rng = np.random.default_rng(0)
-    found = [kernel_distance(*rng.standard_normal((2, 12, 30))) for _ in range(300)]
-    assert abs(np.mean(found)) < 3 * np.std(found) / 300**0.5
-    shifted = [kernel_distance(one, other + 0.5) for one, other in rng.standard_normal((30, 2, 12, 30))]
-    assert np.mean(shifted) > 5 * np.std(found)
 
 
 def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
