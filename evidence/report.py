@@ -233,27 +233,41 @@ def _draw_intervals(axes: Axes, title: str, unit: str, rows: Mapping[str, Sequen
     axes.grid(visible=False, axis="y")
 
 
-def scatter(
-    axes: Axes, groups: Mapping[str, Sequence[Row]], x: str, y: str, label: str = "", factor: float = 1.0
-) -> None:
+def scatter(axes: Axes, groups: Mapping[str, Sequence[Row]], x: str, y: str, label: str = "") -> None:
     """Points of rows by group, with the Pareto front of x and y, of which less is better.
 
-    Rows with a true `default` are ringed. `label`: text of points, with the row's keys in braces; `factor`:
-    on y. Rows whose y is None are left out.
+    Rows with a true `default` are ringed. `label`: text with the row's keys in braces, of points on the front
+    that have room.
     """
-    groups = {name: [row for row in rows if row[y] is not None] for name, rows in groups.items()}
-    points = [(row[x], factor * row[y]) for rows in groups.values() for row in rows]
-    best = [points[k] for k in front(points)]
+    points = {(row[x], row[y]): row for rows in groups.values() for row in rows}
+    best = [[*points][k] for k in front([*points])]
     axes.plot(*zip(*best, strict=True), "--", color="#9aa3ad", linewidth=1)
     for name, rows in groups.items():
-        xs, ys = [row[x] for row in rows], [factor * row[y] for row in rows]
-        (drawn,) = axes.plot(xs, ys, " ", marker="o", label=name)
-        for row, place in zip(rows, zip(xs, ys, strict=True), strict=True):
+        (drawn,) = axes.plot([row[x] for row in rows], [row[y] for row in rows], " ", marker="o", label=name)
+        for row in rows:
             if row.get("default"):
-                axes.plot(*place, "o", markersize=11, fillstyle="none", color=drawn.get_color())
-            if label and (row.get("default") or place in best):
-                words = label.format_map(row)
-                axes.annotate(words, place, (5, 4), textcoords="offset points", fontsize=7)
+                axes.plot(row[x], row[y], "o", markersize=11, fillstyle="none", color=drawn.get_color())
+    taken: list[np.ndarray[Any, Any]] = []
+    for place in sorted(best, key=lambda place: not points[place].get("default")) if label else ():
+        at = axes.transLimits.transform(axes.transScale.transform(place))
+        if all((abs(at - other) > (0.3, 0.05)).any() for other in taken):
+            text = label.format_map(points[place])
+            axes.annotate(text, place, (5, 4), textcoords="offset points", fontsize=7)
+            taken.append(at)
+
+
+def set_log(axes: Axes, names: str = "xy") -> None:
+    """Logarithmic axes whose ticks are plain numbers."""
+    from matplotlib import ticker
+
+    for name in names:
+        getattr(axes, f"set_{name}scale")("log")
+        axis = getattr(axes, f"{name}axis")
+        low, high = axis.get_data_interval()
+        few = math.log10(high / low) < 1.7
+        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1,), numticks=6))
+        axis.set_minor_locator(ticker.NullLocator())
+        axis.set_major_formatter("{x:.4g}")
 
 
 def legend(axes: Axes) -> None:

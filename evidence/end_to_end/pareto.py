@@ -266,7 +266,8 @@ def _draw(axes: Axes, found: Mapping[str, Any], part: str) -> None:
         axes.vlines(row["cpu_s"], *ends, color="#c9ced6", zorder=0)
     report.scatter(axes, groups, "cpu_s", "error")
     axes.axhline(100 * found[f"{part}zero"], linestyle=":", color="#3b3f46", label="zero force")
-    axes.set(title=f"Error of {_WHAT[part]} (rings: defaults)", xlabel="CPU s a frame", yscale="log")
+    axes.set(title=f"Error of {_WHAT[part]} (rings: defaults)", xlabel="CPU s a frame")
+    report.set_log(axes, "y")
     axes.set_ylabel("RMSE [% of the whole force]")
     report.legend(axes)
 

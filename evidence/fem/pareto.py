@@ -134,8 +134,9 @@ def page(found: Mapping[str, Any]) -> report.Page:
 
     def draw_cost(axes: Axes) -> None:
         groups = {law: own for (law,), own in report.grouped(rows, "law").items()}
-        report.scatter(axes, groups, "ms_a_frame", "error %", "{law}, {tets}")
         axes.set(xlabel="CPU ms a frame", ylabel="error [%]", xscale="log", yscale="log")
+        report.scatter(axes, groups, "ms_a_frame", "error %", "{law}, {tets}")
+        report.set_log(axes)
         report.legend(axes)
 
     def draw_laws(axes: Axes) -> None:
@@ -146,7 +147,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
             worst = {load: 100 * max(errors) for load, errors in loads.items() if None not in errors}
             axes.plot([*worst], [*worst.values()], "-o", label=law)
         axes.set(title="Against neo-Hookean, worst direction", xlabel="P = F/(E a2)", ylabel="error [%]")
-        axes.set(xscale="log", yscale="log")
+        report.set_log(axes)
         report.legend(axes)
 
     sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]

@@ -63,8 +63,9 @@ def page(found: Mapping[str, Any]) -> report.Page:
     groups = {family: own for (family,), own in report.grouped(found["rows"], "family").items()}
 
     def draw(axes: Axes, key: str, what: str) -> None:
-        report.scatter(axes, groups, "cpu_s", key, "{setting}")
         axes.set(xlabel="CPU time [s]", ylabel=what, xscale="log", yscale="log")
+        report.scatter(axes, groups, "cpu_s", key, "{setting}")
+        report.set_log(axes)
         report.legend(axes)
 
     chart = report.chart(

@@ -93,7 +93,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
     def draw(axes: Axes, disturbance: str) -> None:
         for (name,), own in report.grouped(panels[disturbance,], "estimator").items():
             axes.plot([row["value"] for row in own], [max(row["epe"], 1e-3) for row in own], "-o", label=name)
-        axes.set(xlabel=disturbance, ylabel="mean endpoint error [px]", yscale="log")
+        axes.set(xlabel=disturbance, ylabel="mean endpoint error [px]")
+        report.set_log(axes, "y")
         report.legend(axes)
 
     chart = report.chart(*(partial(draw, disturbance=name) for (name,) in panels))

@@ -115,8 +115,9 @@ def page(found: Mapping[str, Any]) -> report.Page:
     }
 
     def draw(axes: Axes, key: str, what: str) -> None:
-        report.scatter(axes, groups, "cpu_s", key, "{spp} spp")
         axes.set(xlabel="CPU s a picture", ylabel=what, xscale="log", yscale="log")
+        report.scatter(axes, groups, "cpu_s", key, "{spp} spp")
+        report.set_log(axes)
         report.legend(axes)
 
     chart = report.chart(
