@@ -54,7 +54,7 @@ def train(
     for file in sequences:
         for again in range(2):
             made[f"{file.stem}_{again}"] = lambda file=file, again=again: _varied(
-                _load(file), np.random.default_rng([*file.stem.encode(), again]), again, depth
+                dict(np.load(file)), np.random.default_rng([*file.stem.encode(), again]), again, depth
             )
     rendered = set(made)
     made |= {f"g{i:04d}": lambda i=i: (_drawn_depth if depth else _drawn)(i) for i in range(drawn)}
@@ -70,13 +70,6 @@ def train(
         frames += len(one["x"])
     net, steps = fit(found, depth, minutes, seed)
     return net, {"examples": len(made), "frames": frames, "steps": steps}
-
-
-def _load(file: Path) -> Frames:
-    """Images, masks, calibration and truth of a rendered sequence."""
-    with np.load(file) as arrays:
-        frames = dict(arrays)
-    return frames | {name: frames[name].astype(np.float32) for name in ("flow", "motion")}
 
 
 def _warped(index: int) -> Frames:
@@ -321,7 +314,7 @@ def _resized(frames: Frames, share: float) -> Frames:
     masks = {name: a for name, a in frames.items() if a.dtype == bool and a.ndim > 2}
     small = {name: resize(a.astype(np.uint8), cv2.INTER_NEAREST) > 0 for name, a in masks.items()}
     tissue = resize(frames["tissue"][None].astype(np.uint8), cv2.INTER_NEAREST)[0] > 0
-    flow = resize(frames["flow"], cv2.INTER_LINEAR) * np.float32(size / old)
+    flow = resize(frames["flow"].astype(np.float32), cv2.INTER_LINEAR) * np.float32(size / old)
     rgb = resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC)
     return small | {"tissue": tissue, "flow": flow, "rgb": rgb}
 

@@ -44,15 +44,9 @@ def pack_model(
 ) -> ModelCard:
     """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
 
-    Args:
-        model: folder of `learn train`.
-        folder: of the pretrained network, `MODELS` and its name; replaced if it exists.
-        commit: of the code that trained it.
-        metrics: name and value of each measurement, with its unit.
-        limits: known limits, a sentence each.
-
-    Raises:
-        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is written then.
+    `model`: folder of `learn train`; `folder`: `MODELS` and the network's name, replaced if it exists;
+    `commit`: of the code that trained it; `metrics`: values with their units; `limits`: a sentence each.
+    Raises UserError, and writes nothing, if the model is damaged or larger than `LARGEST_BYTES`.
     """
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)

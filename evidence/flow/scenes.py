@@ -64,7 +64,6 @@ class Recipe:
     contrast: float = 1.0  # factor on the surface's contrast
     illumination: float = 0.1  # largest relative change of brightness, with an equal gradient over the image
     bulge: float = 0.0  # relative brightening at the contact
-    blur_px: float = 0.0  # defocus of moved frames, standard deviation
 
 
 CLEAN = Recipe(tool="", glare=0.0, illumination=0.0, noise=0.0)  # nothing but motion
@@ -323,8 +322,6 @@ class Stage:
             light = 1 + change * (ramp + 0.5 * ramp[:, None])[..., None]
             picture = np.asarray(picture * light, np.float32)
         picture, tool = self._tool(picture, amplitude, flow)
-        if recipe.blur_px and amplitude:
-            picture = cv2.GaussianBlur(np.asarray(picture, np.float32), (0, 0), recipe.blur_px)
         scope, cover = np.ones((size, size), bool), np.zeros((size, size), bool)
         if recipe.scope:
             scope = np.linalg.norm(grid - size / 2, axis=-1) < 0.48 * size
