@@ -55,6 +55,7 @@ def make(
     counts = {"randomized": randomized, "mission": mission}
     files = {job: list(_render(job, count, folder / "sequences")) for job, count in counts.items()}
     sequences = [file for some in files.values() for file in some]
+    generator = " ".join(sorted({str(np.load(file)["generator"]) for file in sequences}))
     about = {"seed": seed, "sequences": {job: len(some) for job, some in files.items()}}
     below: dict[str, str] = {}
     for part in (segmentation, correction, depth_correction):
@@ -74,7 +75,7 @@ def make(
             else:
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
-            export(net, made, card | data | {"generator": provenance.fingerprint()}, part.CHANNELS)
+            export(net, made, card | data | {"generator": generator}, part.CHANNELS)
         weights = folder / "made" / f"{name}.onnx"
         weights.parent.mkdir(exist_ok=True)
         for suffix in (".onnx", ".json"):
@@ -115,4 +116,5 @@ def _rendered(job: str, index: int) -> dict[str, Any]:
     left, right = scene.view, scene.renderer.right
     assert right is not None
     lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
-    return found | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+    more = {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+    return found | lenses | more | {"generator": provenance.fingerprint()}

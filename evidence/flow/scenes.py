@@ -307,8 +307,10 @@ class Stage:
             return np.asarray(amplitude * self.peak_px * self.field.at(at) + jump, np.float32)
 
         source = grid
-        for _ in range(40 if recipe.slope <= 0.5 else 400):  # s = y - u(s): a contraction, as |grad u| < 1
-            source = grid - moved(source)
+        for _ in range(400):  # s = y - u(s): a contraction, as |grad u| < 1
+            before, source = source, grid - moved(source)
+            if np.abs(source - before).max() < 1e-5:
+                break
         flow = moved(grid)
         where = [(source[..., k] + _MARGIN + 0.5) * _FINE - 0.5 for k in (1, 0)]
         skin = [map_coordinates(c, where, order=3, mode="mirror", prefilter=False) for c in self.skin]
