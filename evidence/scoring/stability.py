@@ -27,12 +27,13 @@ from evidence import report
 from evidence.study import Study
 from learn import load_model
 from learn.inference.shipped import choose_model
-from synth.arrays import Floats
+from synth.arrays import Floats, Pixels
 from synth.dataset.store import Dataset
 from synth.engine.run import render_job
 from synth.errors import UserError
 from synth.job import reader
 from synth.job.schema import FemSection
+from synth.system.checked_file import read_picture
 
 _TISSUE: dict[str, dict[str, Any]] = {
     "plain": {},
@@ -209,12 +210,16 @@ def _table(file: Path) -> Floats:
     return np.loadtxt(file, delimiter=",", skiprows=1)
 
 
+def _read(file: Path) -> Pixels:
+    return np.asarray(read_picture(file)[..., ::-1], np.uint8)
+
+
 def _each(change: Callable[[Picture, int], Any], camera: str = "frames") -> Change:
     """A change of each image of a camera and its number."""
 
     def apply(folder: Path) -> None:
         for k, file in enumerate(sorted((folder / camera).iterdir())):
-            picture = change(np.asarray(cv2.imread(str(file)))[..., ::-1], k)
+            picture = change(_read(file), k)
             cv2.imwrite(str(file), np.clip(picture, 0, 255).astype(np.uint8)[..., ::-1])
 
     return apply
@@ -314,7 +319,7 @@ def _compressed(folder: Path) -> None:
     time_s = _table(folder / "frames.csv")[:, 1]
     for name, video in (("frames", "video.mp4"), ("right", "right.mp4")):
         if (folder / name).is_dir():
-            pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted((folder / name).iterdir())]
+            pictures = (_read(file) for file in sorted((folder / name).iterdir()))
             writer.write_video(folder / video, pictures, time_s, crf=51)
             shutil.rmtree(folder / name)
 
