@@ -101,7 +101,7 @@ WEIGHTS := runs/weights
 FORCES := arch.levels=3 arch.dropout=0 arch.relative=true arch.confidence=true arch.membrane=true arch.output=vector loss=mse-frame \
 	  batch=16 learning_rate=1.5e-3 epochs=90 surface_motion_mm=0.7 frames=0 epoch_frames=4000 --labels $(WEIGHTS)/labels
 weights: setup
-	$(BIN)/python -m evidence weights $(WEIGHTS)
+	$(BIN)/python -m weights make $(WEIGHTS)
 	$(BIN)/synth render mission -o $(WEIGHTS)/mission sequences=244 seed=56
 	$(BIN)/synth render randomized -o $(WEIGHTS)/labels sequences=330 seed=56
 	$(BIN)/learn train $(WEIGHTS)/mission $(FORCES) --preset stereo -o $(WEIGHTS)/made/stereo

@@ -29,7 +29,7 @@ from synth.system.config_file import section_of
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 PROGRAMS = ("synth", "learn", "bench")
-PACKAGES = (*PROGRAMS, "evidence")
+PACKAGES = (*PROGRAMS, "evidence", "weights")
 _WRITTEN = "Written by `make docs`; do not edit."
 # The text between the two markers in CONTRIBUTING.md, and after the third in mkdocs.yml, is generated.
 _TABLE = ("<!-- packages: written by `make docs` -->", "<!-- end of packages -->")

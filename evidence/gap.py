@@ -281,13 +281,14 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Errors of the trainings on the flow of recordings, and the tables."""
     ((flow, one),) = found["flows"].items()
-    charts, words = [], []
+    charts: list[tuple[str, str, dict[str, Any]]] = []
+    words = []
     for where, name in _PLACES.items():
-        bars = []
+        bars = {}
         for kind, test in (("I", f"I{where}"), *((kind, f"R{where}") for kind in KINDS)):
             value = one["errors"][_KEY][kind][test]
-            bars.append(report.Row(f"{kind} on {test}", value["mean"], (value["low"], value["high"])))
-        charts.append(report.Chart(name, _UNIT, tuple(bars)))
+            bars[f"{kind} on {test}"] = value["mean"], value["low"], value["high"]
+        charts.append((name, _UNIT, bars))
         shares, (low, high) = (one[name][key] for key in ("closed", "noise_less_real"))
         words.append(
             f"{name}: training on recovered flow closes {_closed(shares['R'])} of the gap, with fitted noise "
@@ -303,8 +304,6 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(
         "Sim-to-real gap: training on recovered flow",
         found,
-        charts,
-        [report.Section(f"{flow}: {_UNIT}", rows)],
         (
             f"**Flow by {flow}; {'. '.join(words)}.**",
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
@@ -315,6 +314,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
             f"networks a training: {found['seeds']}; 95% BCa intervals.",
         ),
+        [report.Section(f"{flow}: {_UNIT}", rows)],
+        report.interval_charts(*charts),
     )
 
 

@@ -1,14 +1,11 @@
-"""Networks of studies: cross-validation folds that share no anatomy, stored trainings, export."""
+"""Networks of studies: cross-validation folds that share no anatomy, stored trainings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
-from evidence import cache, report
-from evidence.flow.networks import write_onnx
+from evidence import cache
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
@@ -51,20 +48,3 @@ def fit(
     model = folder / f"{name}-{cache.key(settings.model_dump(), used, versions=('CLIPS', 'TRAINING'))}"
     train(clips, split, settings, model, device=device)
     return load_model(model)
-
-
-def follow(average: torch.nn.Module, net: torch.nn.Module, share: float) -> None:
-    """Moves the mean of weights and of batch statistics by a share towards those of a network."""
-    with torch.no_grad():
-        for mean, now in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
-            if mean.is_floating_point():
-                mean.lerp_(now, share)
-
-
-def export(net: torch.nn.Module, weights: Path, card: Mapping[str, Any], channels: int) -> None:
-    """Writes a network of `flow.networks` with its number of inputs, and next to it its card."""
-    weights.parent.mkdir(parents=True, exist_ok=True)
-    write_onnx(net, weights, channels)
-    card = {**card, "parameters": sum(p.numel() for p in net.parameters()), "torch": torch.__version__}
-    report.save(weights.parent, f"{weights.stem}.json", card)
-    print(card)

@@ -25,6 +25,7 @@ from synth.arrays import Floats, Ints, Mask, Pixels
 from synth.errors import UserError
 from synth.fit.fitting import fit_camera
 from synth.fit.photograph import Photograph, read_photograph
+from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.tune.search import changed
 
@@ -109,11 +110,12 @@ def measure(
     width_mm: float = 110.0,
     frames: int = 5,
     seed: int = 31,
+    job: str = "",
 ) -> dict[str, Any]:
     """AUC of a patch classifier, photograph against rendered crops; two controls should be near 0.5.
 
     Fitted cameras are tested on sectors that `synth fit` did not use. `outline`, `width_mm`: of the cortex in
-    the photograph; `frames`: number of rendered sequences, one frame each.
+    the photograph; `frames`: number of rendered sequences, one frame each; `job`: also compared.
     """
     (theirs, places), rng = of_photograph(photo, outline, width_mm), np.random.default_rng(seed)
     away = places - places.mean(axis=0)
@@ -135,6 +137,8 @@ def measure(
     pictures, label, fold, both = against(read_job({}, frames, seed, width_mm))
     for name, of in ablated(pictures).items():
         add(f"default job{name}", of, label, fold, both)
+    if job:
+        add(job, *against(changed(as_job(job), {"sequences": frames, "seed": seed})))
     for k in (1, 2, 3):
         add(f"control: labels shuffled, {k}", pictures, shuffled(label, fold, rng), fold, both)
     found: dict[str, list[float]] = {}
@@ -154,15 +158,15 @@ def measure(
 def page(found: Mapping[str, Any]) -> report.Page:
     """Mean AUC of every set of crops, with the range over folds."""
     rows = found["rows"]
-    bars = tuple(report.Row(row["crops"], row["auc"], tuple(row["ends"])) for row in rows)
-    chart = report.Chart("1: separable, 0.5: not separable", "AUC, lowest to highest fold", bars)
+    bars = {row["crops"]: (row["auc"], *row["ends"]) for row in rows}
+    chart = report.intervals("1: separable, 0.5: not separable", "AUC, lowest to highest fold", bars)
     table = [
         {"crops": row["crops"], "count": row["count"], "AUC": report.mean_cell([row["auc"], *row["ends"]])}
         for row in rows
     ]
     words = (f"**AUC of the default job: {rows[0]['auc']:.2f}.** Mean and range over folds.",)
     return report.Page(
-        "Rendered crops against a photograph's", found, [chart], [report.Section("", table)], words
+        "Rendered crops against a photograph's", found, words, [report.Section("", table)], chart
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from sklearn.decomposition import TruncatedSVD
 
 from evidence import cache, report, status, training
@@ -224,13 +225,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(
         "Learning curves",
         found,
-        [_panel(own, f"{name}, {_NAMES[cameras]}") for (name, cameras), own in groups.items()],
-        [report.Section(heading, _table(rows, part)) for part, heading in _PARTS.items()],
         (
             f"**Least error of the force: {'; '.join(starmap(_verdict, groups.items()))}.**",
             "Root mean square error relative to that of the force, mean over sequences with 95% interval. "
             f"The tables are of {last}. Generation takes {found['generation_cpu_s']:.1f} CPU-s a sequence.",
         ),
+        [report.Section(heading, _table(rows, part)) for part, heading in _PARTS.items()],
+        report.chart(*(partial(_draw, group=group, rows=own) for group, own in groups.items())),
     )
 
 
@@ -240,12 +241,13 @@ def _verdict(group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> str:
     return f"{group[0]}, {_NAMES[group[1]]}: {error} with {best['model']} on {best['size']} sequences"
 
 
-def _panel(rows: Sequence[Mapping[str, Any]], title: str) -> report.Panel:
-    curves = []
+def _draw(axes: Axes, group: tuple[Any, ...], rows: Sequence[Mapping[str, Any]]) -> None:
     for (model,), own in report.grouped(rows, "model").items():
-        x, y = zip(*sorted((row["size"], row["whole"][0]) for row in own), strict=True)
-        curves.append(report.Curve(model, x, y))
-    return report.Panel(title, "fitted sequences", "error of the force", tuple(curves), log_x=True)
+        sizes, errors = zip(*sorted((row["size"], row["whole"][0]) for row in own), strict=True)
+        axes.plot(sizes, errors, "-o", label=model)
+    axes.set(title=f"{group[0]}, {_NAMES[group[1]]}", xlabel="fitted sequences", ylabel="error of the force")
+    axes.set_ylim(0)
+    report.legend(axes)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], part: str) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import typer
+from matplotlib.axes import Axes
 
 from bench.methods.physics import GRID
 from evidence import cache, datasets, report
@@ -242,8 +243,6 @@ def page(found: Mapping[str, Any]) -> report.Page:
     return report.Page(
         "Which part of a whole pipeline pays?",
         found,
-        [_panel(found, part) for part in PARTS],
-        [report.Section("", [_cells(row) for row in ridge])],
         (
             f"**Across the line of sight the error of ridge is {least[0]:.0f} to {most[0]:.0f}% with flow by "
             f"{flow}, for every law, mesh and number of paths, and {least[1]:.0f} to {most[1]:.0f}% with "
@@ -253,20 +252,24 @@ def page(found: Mapping[str, Any]) -> report.Page:
             f"of {100 * found['zero']:.0f}%, across the line of sight of {100 * found['across_zero']:.0f}%. "
             "CPU time: least measured for a frame of data, its flow and an estimate.",
         ),
+        [report.Section("", [_cells(row) for row in ridge])],
+        report.chart(*(functools.partial(_draw, found=found, part=part) for part in PARTS)),
     )
 
 
-def _panel(found: Mapping[str, Any], part: str) -> report.Panel:
-    """A curve for each model, a dot for each pipeline, and the error of zero force."""
-    curves = []
-    for (model,), own in report.grouped(found["rows"], "model").items():
-        drawn = report.curve(model, own, "cpu_s", f"{part}rmse", _NAME, (1, 100))
-        ends = tuple((100 * row[f"{part}low"], 100 * row[f"{part}high"]) for row in own)
-        curves.append(replace(drawn, ends=ends, named=False))
-    costs, level = [row["cpu_s"] for row in found["rows"]], 100 * found[f"{part}zero"]
-    curves.append(report.Curve("zero force", (min(costs), max(costs)), (level, level)))
-    title, unit = f"Error of {_WHAT[part]} (rings: defaults)", "RMSE [% of the whole force]"
-    return report.Panel(title, "CPU s a frame", unit, tuple(curves), log_y=True, front=True)
+def _draw(axes: Axes, found: Mapping[str, Any], part: str) -> None:
+    """A dot with its interval for each pipeline, and the error of zero force."""
+    rows = [row | {"error": 100 * row[f"{part}rmse"]} for row in found["rows"]]
+    groups = {model: own for (model,), own in report.grouped(rows, "model").items()}
+    for row in rows:
+        ends = (100 * row[f"{part}{end}"] for end in ("low", "high"))
+        axes.vlines(row["cpu_s"], *ends, color="#c9ced6", zorder=0)
+    report.scatter(axes, groups, "cpu_s", "error")
+    axes.axhline(100 * found[f"{part}zero"], linestyle=":", color="#3b3f46", label="zero force")
+    axes.set(title=f"Error of {_WHAT[part]} (rings: defaults)", xlabel="CPU s a frame")
+    report.set_log(axes, "y")
+    axes.set_ylabel("RMSE [% of the whole force]")
+    report.legend(axes)
 
 
 def _cells(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from evidence import report
 from evidence.fem import case as fem_case
@@ -129,22 +130,29 @@ def sequence(law: str) -> Row:
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Error of mesh and law against cost, and the largest error of each law by load."""
-    rows, laws = found["rows"], found["laws"]
-    cost, by_load = [], []
-    for (law,), own in report.grouped(rows, "law").items():
-        mine = [row for row in own if row["error"] is not None]
-        cost.append(report.curve(law, mine, "ms_a_frame", "error", "{law}, {tets}", (1, 100)))
-        errors = {load: [r["error"] for r in laws if (r["law"], r["load"]) == (law, load)] for load in _LOADS}
-        complete = {load: 100 * max(each) for load, each in errors.items() if each and None not in each}
-        if complete:
-            by_load.append(report.Curve(law, tuple(complete), tuple(complete.values())))
-    title, worst = "Physics: error against cost", "Laws against neo-Hookean, worst"
-    panels = [
-        report.Panel(title, "CPU ms a frame", "error [%]", tuple(cost), True, True, front=True),
-        report.Panel(worst, "P = F/(E a2)", "error [%]", tuple(by_load), True, True),
-    ]
+    rows = [row | {"error %": 100 * row["error"]} for row in found["rows"] if row["error"] is not None]
+
+    def draw_cost(axes: Axes) -> None:
+        groups = {law: own for (law,), own in report.grouped(rows, "law").items()}
+        axes.set(xlabel="CPU ms a frame", ylabel="error [%]", xscale="log", yscale="log")
+        report.scatter(axes, groups, "ms_a_frame", "error %", "{law}, {tets}")
+        report.set_log(axes)
+        report.legend(axes)
+
+    def draw_laws(axes: Axes) -> None:
+        for (law,), own in report.grouped(found["laws"], "law").items():
+            loads = {
+                load: [row["error"] for row in each] for (load,), each in report.grouped(own, "load").items()
+            }
+            worst = {load: 100 * max(errors) for load, errors in loads.items() if None not in errors}
+            axes.plot([*worst], [*worst.values()], "-o", label=law)
+        axes.set(title="Against neo-Hookean, worst direction", xlabel="P = F/(E a2)", ylabel="error [%]")
+        report.set_log(axes)
+        report.legend(axes)
+
     sections = [report.Section(name, found[name]) for name in ("rows", "sequence")]
-    return report.Page(title, found, panels, sections)
+    chart = report.chart(draw_cost, draw_laws)
+    return report.Page("Physics: error against cost", found, (), sections, chart)
 
 
 STUDY = Study(measure, "fem/pareto/pareto.json", page, needs=("mesh", "mechanics"), timed=True)

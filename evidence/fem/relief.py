@@ -1,9 +1,11 @@
 """Discretisation error of default scenes: the default mesh against refined ones."""
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from evidence import report
 from evidence.study import Study
@@ -73,15 +75,16 @@ def summarise(rows: list[Row], sizes: list[int]) -> list[Row]:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Deviation from the finest mesh, by number of tetrahedra."""
     rows = [row for row in found["summary"] if row["scenes"]]
-    sizes = tuple(float(row["tets"]) for row in rows)
-    curves = tuple(
-        report.Curve(f"{of}, {which}", sizes, tuple(100 * row[f"{of}_{which}"] for row in rows))
-        for of in ("peak", "mean")
-        for which in ("median", "worst")
-    )
-    title = "Default scenes against the finest mesh"
-    panel = report.Panel(title, "tetrahedra", "displacement [%]", curves)
-    return report.Page(title, found, [panel], [report.Section("Summary", found["summary"])])
+
+    def draw(axes: Axes) -> None:
+        for kind, which in product(("peak", "mean"), ("median", "worst")):
+            errors = [100 * row[f"{kind}_{which}"] for row in rows]
+            axes.plot([row["tets"] for row in rows], errors, "-o", label=f"{kind}, {which}")
+        axes.set(xlabel="tetrahedra", ylabel="displacement [%]", ylim=(0, None))
+        report.legend(axes)
+
+    title, sections = "Default scenes against the finest mesh", [report.Section("Summary", found["summary"])]
+    return report.Page(title, found, (), sections, report.chart(draw))
 
 
 STUDY = Study(measure, "fem/relief/relief.json", page, needs=("mesh", "mechanics"))

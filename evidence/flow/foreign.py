@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from evidence import report
-from evidence.flow.foreign_scenes import Frame, Recipe, recipes, video
 from evidence.flow.measure import epe
+from evidence.flow.scenes import Frame, Recipe, recipes, video
 from evidence.study import Study
 from synth.arrays import Array, Mask
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
@@ -109,11 +109,11 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `recordings.json`."""
     limited = [row for row in found["summary"] if row["target"]]
-    rows = tuple(report.Row(row["what"], row["measured"], (row["low"], row["high"])) for row in limited)
-    charts = [report.Chart(f"{found['half']} half, 95% intervals over videos", "measured", rows)]
+    rows = {row["what"]: (row["measured"], row["low"], row["high"]) for row in limited}
+    chart = report.intervals(f"{found['half']} half, 95% intervals over videos", "measured", rows)
     words = ["Photographs and drawn phantoms, warped in closed form, none of them tuned on."]
     sections = [report.Section("", found["summary"])]
-    return report.Page("Flow: videos not made by our renderer", found, charts, sections, words)
+    return report.Page("Flow: videos not made by our renderer", found, words, sections, chart)
 
 
 STUDY = Study(measure, "flow/recordings/recordings.json", page, needs=("flow", "score"))

@@ -6,21 +6,26 @@ from typing import Any
 
 import cv2
 import torch
+from matplotlib.axes import Axes
 
 from evidence import report
 from evidence.flow.measure import mean_errors
 from evidence.flow.scenes import Recipe, pairs
 from evidence.study import Study
-from synth.flow.estimator import Estimator
+from synth.flow.estimator import Estimator, create
 from synth.flow.opencv import Dis, OpenCvTvl1
 from synth.flow.tvl1 import Tvl1, TVL1Settings
 
 
-def measure(count: int = 4, seed: int = 2613) -> dict[str, Any]:
-    """Endpoint and divergence error against milliseconds on `count` pairs; seed 6 was tuned on."""
+def measure(count: int = 4, seed: int = 2613, also: str = "") -> dict[str, Any]:
+    """Endpoint and divergence error against milliseconds on `count` pairs; seed 6 was tuned on.
+
+    `also`: names of further estimators, separated by commas.
+    """
     made = list(pairs(Recipe(), count, seed))
     rows: list[dict[str, Any]] = []
-    for family, label, estimator, warm in _candidates():
+    others = [(name, "", create(name), None) for name in also.split(",") if name]
+    for family, label, estimator, warm in [*_candidates(), *others]:
         about = {"family": family, "setting": label, "default": "(default)" in label}
         rows.append(about | mean_errors(estimator, made, warm=warm))
     on = "warped procedural cortex, 224², 10 px pull, tool, highlights; CPU time of one thread"
@@ -55,16 +60,18 @@ def _candidates() -> list[tuple[str, str, Estimator, float | None]]:
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `pareto.json`."""
-    panels = []
-    for key, title, unit in (
-        ("mean", "endpoint error", "EPE mean [px]"),
-        ("divergence", "divergence error", "relative RMS"),
-    ):
-        curves = tuple(
-            report.curve(family, own, "cpu_s", key, "{setting}", (1e3, 1))
-            for (family,), own in report.grouped(found["rows"], "family").items()
-        )
-        panels.append(report.Panel(f"Flow: {title}", "CPU time [ms]", unit, curves, True, True, front=True))
+    groups = {family: own for (family,), own in report.grouped(found["rows"], "family").items()}
+
+    def draw(axes: Axes, key: str, what: str) -> None:
+        axes.set(xlabel="CPU time [s]", ylabel=what, xscale="log", yscale="log")
+        report.scatter(axes, groups, "cpu_s", key, "{setting}")
+        report.set_log(axes)
+        report.legend(axes)
+
+    chart = report.chart(
+        lambda axes: draw(axes, "mean", "mean endpoint error [px]"),
+        lambda axes: draw(axes, "divergence", "divergence, relative RMS error"),
+    )
     shown = ("family", "setting", "default", "mean", "contact", "divergence", "cpu_s")
     rows = [{key: row[key] for key in shown} for row in found["rows"]]
     best = min(rows, key=lambda row: float(row["mean"]))
@@ -72,7 +79,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         f"**Least endpoint error: {best['family']}, {best['setting']}, {best['mean']:.3f} px in "
         f"{best['cpu_s']:.3f} CPU-s.** Errors in px, of the divergence relative to its RMS; {found['on']}."
     ]
-    return report.Page("Flow: error against time", found, panels, [report.Section("", rows)], words)
+    return report.Page("Flow: error against time", found, words, [report.Section("", rows)], chart)
 
 
 STUDY = Study(

@@ -79,22 +79,21 @@ _TARGETS = (
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Draws `stereo.json`: values relative to their targets, z-scores, every row."""
-    shares, scores = {}, {}
+    shares: dict[str, list[float]] = {}
+    scores: dict[str, list[float]] = {}
     for row in found["rows"]:
         for key, what, limits in _TARGETS:
             if row["size"] in limits:
-                shares[f"{what}: {row['data']}"] = abs(row[key]) / limits[row["size"]]
+                shares[f"{what}: {row['data']}"] = [abs(row[key]) / limits[row["size"]]]
         for part in ("depth", "across"):
-            scores[f"{part}, 68%: {row['data']}"] = row[f"{part}_z68"]
-            scores[f"{part}, 95%: {row['data']}"] = row[f"{part}_z95"] / 2
-    charts = [
-        report.Chart("Target reached if at most 1", "measured / target", report.bars(shares)),
-        report.Chart("Calibrated at 1", "quantile of |error| / deviation, over 1 and 2", report.bars(scores)),
-    ]
-    met = sum(value <= 1 for value in shares.values())
+            scores[f"{part}, 68%: {row['data']}"] = [row[f"{part}_z68"]]
+            scores[f"{part}, 95%: {row['data']}"] = [row[f"{part}_z95"] / 2]
+    calibrated = "Calibrated at 1", "quantile of |error| / deviation, over 1 and 2", scores
+    chart = report.interval_charts(("Target reached if at most 1", "measured / target", shares), calibrated)
+    met = sum(value <= 1 for (value,) in shares.values())
     words = [f"**{met} of {len(shares)} targets are reached.** *z*: quantiles of |error| / deviation."]
     sections = [report.Section("", found["rows"])]
-    return report.Page("Stereo: motion in three dimensions", found, charts, sections, words)
+    return report.Page("Stereo: motion in three dimensions", found, words, sections, chart)
 
 
 STUDY = Study(

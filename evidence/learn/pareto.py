@@ -5,12 +5,14 @@ Without --dataset only times.
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -166,7 +168,9 @@ def flops(arch: Architecture, size: int) -> float:
 def page(found: Mapping[str, Any]) -> report.Page:
     """Pareto fronts, one for each grid, and the table."""
     rows = found["rows"]
-    panels = [panel for name in OTHERS if (panel := _panel(rows, name)) is not None]
+    drawn = (
+        report.chart(*(partial(_draw, name=name, rows=rows) for name in OTHERS)) if found["trained"] else ""
+    )
     table = [
         {"network": f"w{one['width']} stem{one['stem']} depth{one['levels']} {one['size']}²"}
         | {"preset": preset_of(one) or None, "parameters [M]": one["parameters"] / 1e6}
@@ -183,29 +187,23 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "on a CPU.",
     )
     sections = [report.Section(found["device"], table)]
-    return report.Page("Networks: time and error", found, panels, sections, words)
+    return report.Page("Networks: time and error", found, words, sections, drawn)
 
 
-def _panel(rows: Sequence[Mapping[str, Any]], name: str) -> report.Panel | None:
+def _draw(axes: Axes, name: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Paired differences from a preset, which are smaller than the spread over sequences."""
-    own = [one for one in rows if one["size"] == PRESETS[name].size and "against" in one]
-    curves = []
-    for (stem,), part in sorted(report.grouped(own, "stem").items()):
-        curves.append(
-            report.Curve(
-                f"stem of {stem}",
-                tuple(one["ms_p50"] for one in part),
-                tuple(100 * one["against"][0] for one in part),
-                tuple(f"w{one['width']} depth{one['levels']} {preset_of(one)}" for one in part),
-                ringed=tuple(k for k, one in enumerate(part) if preset_of(one)),
-                ends=tuple((100 * one["against"][1], 100 * one["against"][2]) for one in part),
-            )
-        )
-    if not curves:
-        return None
-    title = f"Networks on {PRESETS[name].size}² and the preset {name}"
-    error = "map RMSE, difference from the preset's [%]"
-    return report.Panel(title, "median time a frame [ms]", error, tuple(curves), front=True)
+    rows = [
+        {**row, "difference": 100 * row["against"][0], "default": preset_of(row)}
+        for row in rows
+        if row["size"] == PRESETS[name].size and "against" in row
+    ]
+    for row in rows:
+        axes.vlines(row["ms_p50"], *(100 * end for end in row["against"][1:]), color="#c9ced6", zorder=0)
+    groups = {f"stem of {stem}": own for (stem,), own in sorted(report.grouped(rows, "stem").items())}
+    report.scatter(axes, groups, "ms_p50", "difference", "w{width} depth{levels} {default}")
+    axes.set(title=f"Networks on {PRESETS[name].size}² and the preset {name}")
+    axes.set(xlabel="median time a frame [ms]", ylabel="map RMSE, difference from the preset's [%]")
+    report.legend(axes)
 
 
 STUDY = Study(

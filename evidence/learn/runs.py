@@ -82,7 +82,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         report.Section("Difference from squared error, paired by sequences", less),
     ]
     words = ("Networks of width 16 on a 64² grid, ideal flow, in equal steps on the same batches.",)
-    return report.Page("Losses", found, (), sections, words)
+    return report.Page("Losses", found, words, sections)
 
 
 def row(name: str, runs: Sequence[Mapping[str, Any]], base: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

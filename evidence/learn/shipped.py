@@ -1,22 +1,14 @@
-"""Errors of the pretrained networks in and out of distribution, and the coverage of their intervals.
+"""Errors of the pretrained networks in and out of distribution, and the coverage of their intervals."""
 
-With `--pack` they are written into the package, each with a card of these figures.
-"""
-
-import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evidence import report, status
 from evidence.curves.experiment import figures
 from evidence.end_to_end import models
 from evidence.study import Study
-from learn import checkpoint
-from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
@@ -24,76 +16,20 @@ from learn.inference import shipped
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
 from synth.errors import UserError
-from synth.system.checked_file import folder_bytes, write_whole
 
 _LEVEL = 0.9
-LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
-_LIMITS = (
-    "Trained on rendered images alone, without recordings of real tissue.",
-    "Force is proportional to Young's modulus and has at least its relative error.",
-    "A membrane (pia) carries load that is not visible at the surface: errors are largest with a membrane.",
-)
-_MONOCULAR = (
-    "The force along the line of sight is hardly visible with one camera; its interval is wide.",
-    "On recordings made with another finite-element code and another renderer its error is about that of "
-    "physics in `bench score` (docs/results/learn/foreign/monocular).",
-)
 
 
-def measure(
-    data: list[Path], models: Path = shipped.MODELS, cache: Path | None = None, pack: bool = False
-) -> dict[str, Any]:
+def measure(data: list[Path], models: Path = shipped.MODELS, cache: Path | None = None) -> dict[str, Any]:
     """Errors and coverage of networks on the first dataset, which they were fitted on, and on others.
 
-    `models`: folder of mono and stereo; `cache`: folder for packed arrays; `pack`: write the networks into
-    the package.
+    `models`: folder of mono and stereo; `cache`: folder for packed arrays.
     """
     rows = []
     for name in shipped.NAMES:
-        folder = models / name
-        predictor = load_model(folder)
-        own = [_row(predictor, root, cache) for root in data]
-        rows += [{"model": name} | row for row in own]
-        if pack:
-            limits = _LIMITS if predictor.card.settings.arch.depth else (*_LIMITS, *_MONOCULAR)
-            pack_model(folder, shipped.MODELS / name, report.commit(), listed(own), limits)
+        predictor = load_model(models / name)
+        rows += [{"model": name} | _row(predictor, root, cache) for root in data]
     return {"data": status.data(*data), "rows": rows}
-
-
-def pack_model(
-    model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
-) -> ModelCard:
-    """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
-
-    Args:
-        model: folder of `learn train`.
-        folder: of the pretrained network, `MODELS` and its name; replaced if it exists.
-        commit: of the code that trained it.
-        metrics: name and value of each measurement, with its unit.
-        limits: known limits, a sentence each.
-
-    Raises:
-        UserError: the model is damaged, or larger than `LARGEST_BYTES`; nothing is written then.
-    """
-    net, card = checkpoint.read_model(model)
-    shutil.rmtree(folder, ignore_errors=True)
-    card = checkpoint.write_model(folder, card, net.state_dict())
-    line = shipped.describe(card)
-    licence = f"{shipped.LICENCE}, as of the code: trained on this project's renders alone"
-    rows = {"data (hash of its sequences)": shipped.hash_data(card), "licence": licence, "commit": commit}
-    rows |= metrics
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
-    bullets = "\n".join(f"- {one}" for one in limits)
-    head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
-    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
-    size = folder_bytes(folder)
-    if size > LARGEST_BYTES:
-        shutil.rmtree(folder)
-        raise UserError(
-            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
-            "train it with a smaller arch.width"
-        )
-    return card
 
 
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:
@@ -154,12 +90,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
         f"{report.percent(row['whole'])} with {row['model']} on {row['data']}" for row in found["rows"]
     )
     words = (f"**Error of the force: {worst}.** All sequences are held out from training and calibration.",)
-    charts = []
-    for title, key in _CHARTS:
-        known = {f"{row['model']}: {row['data']}": np.array(row[key], float) for row in found["rows"]}
-        bars = tuple(report.Row(name, mean, (low, high)) for name, (mean, low, high) in known.items())
-        charts.append(report.Chart(title, "share", bars))
-    return report.Page("The pretrained networks", found, charts, sections, words)
+    parts = [
+        (title, "share", {f"{row['model']}: {row['data']}": row[key] for row in found["rows"]})
+        for title, key in _CHARTS
+    ]
+    return report.Page("The pretrained networks", found, words, sections, report.interval_charts(*parts))
 
 
 _CHARTS = (("Error of the force's size", "force_size"), ("Coverage of 90% intervals", "covered_size"))

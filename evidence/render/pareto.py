@@ -7,6 +7,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from evidence import report
 from evidence.render.case import Case, case
@@ -106,22 +107,26 @@ def frame_cost(ours: Case, frames: int) -> dict[str, float]:
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """Flow error and noise against time."""
-    panels = []
-    groups = report.grouped(found["rows"], "width", "integrator", "vertices")
-    for key, unit in (
-        ("flow_median_px", "flow error, median [px]"),
-        ("noise", "noise / mean"),
-        ("noise_clipped", "noise / mean, clipped"),
-    ):
-        curves = tuple(
-            report.curve(f"{kind}, {width} px, {vertices} vertices", own, "cpu_s", key, "{spp} spp")
-            for (width, kind, vertices), own in groups.items()
-        )
-        title = f"Render: {unit}"
-        panels.append(report.Panel(title, "CPU s a picture", unit, curves, True, True, front=True))
+    groups = {
+        f"{kind}, {width} px, {vertices} vertices": own
+        for (width, kind, vertices), own in report.grouped(
+            found["rows"], "width", "integrator", "vertices"
+        ).items()
+    }
+
+    def draw(axes: Axes, key: str, what: str) -> None:
+        axes.set(xlabel="CPU s a picture", ylabel=what, xscale="log", yscale="log")
+        report.scatter(axes, groups, "cpu_s", key, "{spp} spp")
+        report.set_log(axes)
+        report.legend(axes)
+
+    chart = report.chart(
+        lambda axes: draw(axes, "flow_median_px", "flow error, median [px]"),
+        lambda axes: draw(axes, "noise_clipped", "noise / mean, clipped"),
+    )
     tables = [report.Section("All settings", found["rows"])]
     tables += [report.Section("A whole frame", [found["frame"]])]
-    return report.Page("Rendering: flow error and noise against time", found, panels, tables)
+    return report.Page("Rendering: flow error and noise against time", found, (), tables, chart)
 
 
 STUDY = Study(

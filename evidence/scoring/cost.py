@@ -77,7 +77,7 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     """Time by stage and in total."""
     stages = {name: spent for name, spent in tree["timings"].items() if isinstance(spent, Mapping)}
     memory = sum(value for name, value in tree["timings"].items() if name.endswith("peak_rss_mb"))
-    bars = report.bars({name: spent["wall_s"] for name, spent in stages.items()})
+    times = {name: [spent["wall_s"]] for name, spent in stages.items()}
     width, height = tree["size"]
     words = (
         f"**{tree['wall_s']:.0f} s, {tree['wall_s'] / tree['seconds']:.1f} times the recording's length, and "
@@ -87,9 +87,9 @@ def page(tree: Mapping[str, Any]) -> report.Page:
         "Accuracy: [fusion of network and physics](fusion/README.md), [degraded recordings]"
         "(stability/README.md).",
     )
-    chart = report.Chart("By stage, in two parallel processes", "wall time [s]", bars)
+    chart = report.intervals("By stage, in two parallel processes", "wall time [s]", times)
     rows = [{"stage": name} | dict(spent) for name, spent in stages.items()]
-    return report.Page("Scoring: time and memory", tree, [chart], (report.Section("", rows),), words)
+    return report.Page("Scoring: time and memory", tree, words, (report.Section("", rows),), chart)
 
 
 STUDY = Study(measure, "scoring/results.json", page, ("learn/models/mono",), needs=("score",), timed=True)

@@ -127,7 +127,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
         "known membrane: in the data). *Force*: root mean square error of the vector relative to that of the "
         "force, so no force has 100%. *Bias*: relative to the peak. 95% intervals over sequences.",
     )
-    return report.Page("Fusion of network and physics", found, [], [report.Section("", rows)], words)
+    return report.Page("Fusion of network and physics", found, words, [report.Section("", rows)])
 
 
 STUDY = Study(

@@ -137,14 +137,14 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
 
 def page(tree: Mapping[str, Any]) -> report.Page:
     """Error of each method after removal relative to that on still tissue, and a table."""
-    rows, bars, worst = [], [], 0.0
+    rows, bars, worst = [], {}, 0.0
     for (name,), own in report.grouped(tree["rows"], "method").items():
         mae = {w: np.array([row[f"{w}_mn"] for row in own]) for w in ("still", "pulse", "removed")}
         left, off = (mae[what] / mae["still"] for what in ("pulse", "removed"))
         row = {"method": name} | {f"{what} [mN]": f"{values.mean():.2f}" for what, values in mae.items()}
         rows.append(row | {"pulse / still": f"{left.max():.2f}", "removed / still": f"{off.max():.2f}"})
         worst = max(worst, float(off.max()))
-        bars.append(report.Row(name, float(np.median(off)), (float(off.min()), float(off.max()))))
+        bars[name] = float(np.median(off)), float(off.min()), float(off.max())
     waves = [one for row in tree["rows"] for one in row.get("found", ())]
     shown = ", ".join(f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz" for one in waves)
     on_still = sum(len(row.get("found_on_still", ())) for row in tree["rows"])
@@ -152,8 +152,6 @@ def page(tree: Mapping[str, Any]) -> report.Page:
     return report.Page(
         "Pulse removal",
         tree,
-        [report.Chart(title, "error / error on still tissue", tuple(bars))],
-        (report.Section("", rows),),
         (
             f"**With the pulse removed, the error of a method is at most {worst:.2f} times its error on "
             f"still tissue (target: {_TARGET:g}).** Detected, by recording: {shown}; on still "
@@ -162,6 +160,8 @@ def page(tree: Mapping[str, Any]) -> report.Page:
             f"40 mN on linear tissue. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz, breath {_BREATH[0]:g} mm "
             f"at {_BREATH[1]:g} Hz. Mean absolute error; ratios of the worst recording.",
         ),
+        (report.Section("", rows),),
+        report.intervals(title, "error / error on still tissue", bars),
     )
 
 

@@ -23,7 +23,7 @@ POINTWISE = 1.0
 """Part of lambda, in units of mu, that acts at quadrature points; the remainder acts on elements' means,
 against locking (Nagtegaal, Parks & Rice, Comput. Meth. Appl. Mech. Eng. 4, 1974). Chosen on discs pressed
 into a half-space at nu 0.49: radial motion next to the disc is off by a quarter at 1,600 to 5,000 tetrahedra;
-with all of lambda at points by twice its own size, with none by 60% (`python -m evidence fem.half_space`).
+with all of lambda at points by twice its own size, with none by 60%.
 docs/results/fem checks it on a block that was not used for this choice."""
 
 

@@ -6,7 +6,7 @@ flow and its agreement, changes of light and colour, and the remaining steps of 
 (IJCAI 1981) over two windows, in brightness and in colour, each without the mean change of the window. All
 are in pixels or ratios, so that little of the renderer's appearance can be learnt. The outputs are the
 correction and the logarithm of its variance (Kendall and Gal, NeurIPS 2017, eq. 5, with Student's
-distribution). `evidence.flow.correction_training` trains the weights, stored next to this file with a card.
+distribution). `weights.correction_training` trains the weights, stored next to this file with a card.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Small networks in ONNX files, run by ONNX Runtime on one thread.
 
-PyTorch trains them (`evidence.flow.networks`). To run them it takes longer, and to import more than the flow
+PyTorch trains them (`weights.networks`). To run them it takes longer, and to import more than the flow
 of a short sequence.
 """
 

@@ -3,7 +3,7 @@
 A U-Net (O. Ronneberger et al., MICCAI 2015) takes a frame together with the rest frame, so that it sees what
 appeared, and returns a probability per class and pixel. It was trained on domain-randomised renders and on
 instruments, shadows and objects drawn over other pictures (D. Dwibedi et al., "Cut, paste and learn", ICCV
-2017); `python -m evidence weights` trains such a network, the card next to the weights says from what.
+2017); `python -m weights make` trains such a network, the card next to the weights says from what.
 """
 
 from __future__ import annotations

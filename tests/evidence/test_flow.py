@@ -1,16 +1,15 @@
 """Measurements of flow: errors, ground truth of scenes and videos, figures of stereo."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from evidence.flow import foreign, segmentation_training
-from evidence.flow.foreign_scenes import Recipe, recipes, video
+from evidence.flow import foreign
 from evidence.flow.measure import errors
-from evidence.flow.scenes import CLEAN, Pair, inverse, pairs, pixels, pull_field
-from evidence.flow.scenes import Recipe as Pull
+from evidence.flow.scenes import CLEAN, Field, Pair, inverse, pairs, pixels, recipes, video
 from evidence.flow.stereo import figures
-from synth.flow import segmentation
 
 
 def known(flow: np.ndarray, hidden: np.ndarray, contact: np.ndarray) -> Pair:
@@ -40,7 +39,7 @@ def test_scene_agrees_with_its_flow() -> None:
     x, y = np.moveaxis(pixels(*pair.flow.shape[:2]) + pair.flow, -1, 0)
     moved = map_coordinates(pair.now[..., 1].astype(float), (y, x), order=3, mode="nearest")
     assert np.abs(moved - pair.rest[..., 1])[8:-8, 8:-8].mean() < 0.8  # rounding to 8 bits twice
-    field = pull_field(Pull(size=96))
+    field = 10 * Field.draw("pull", 96, np.random.default_rng(0)).at(pixels(96, 96))
     source = inverse(field)
     there = [map_coordinates(field[..., c], (source[..., 1], source[..., 0]), order=1) for c in (0, 1)]
     assert np.abs(source + np.stack(there, -1) - pixels(96, 96))[4:-4, 4:-4].max() < 0.01
@@ -48,7 +47,9 @@ def test_scene_agrees_with_its_flow() -> None:
 
 def test_video_agrees_with_its_flow() -> None:
     """The current frame warped by the flow is the rest frame, up to the light."""
-    plain = Recipe(0, "drawn grey", "", False, "twist", 3.0, "white", 0.0, False, False, 0, 0.0, ())
+    plain = replace(
+        CLEAN, surface="drawn grey", motion="twist", peak_px=3.0, reach=0.0, slope=0.5, bulge=0.08
+    )
     rest, *later = video(plain, 96, 6)
     one = max(later, key=lambda shown: shown.amplitude)
     assert np.linalg.norm(one.flow, axis=-1).max() > 1.0
@@ -69,17 +70,6 @@ def test_detected_masks_help_on_average_of_the_tuning_half() -> None:
     found = {row["what"]: row["measured"] for row in rows}
     assert found["EPE / that without masks"] < 0.95
     assert found["largest share of unobstructed tissue masked"] < 0.2
-
-
-def test_a_batch_holds_what_the_segmentation_is_given_turned_with_its_classes() -> None:
-    rng = np.random.default_rng(2)  # which mirrors
-    frame, rest = rng.integers(0, 256, (2, 160, 224, 3), np.uint8)
-    bright = np.float32(frame.sum(-1, keepdims=True) > 400).repeat(3, -1)
-    one = segmentation_training.packed((frame, rest, bright, 1 - bright))[None]
-    inputs, classes, weights = segmentation_training.batch(one, rng)
-    assert np.allclose(np.sort(inputs.ravel()), np.sort(segmentation.prepare(frame, rest).ravel()), atol=1e-5)
-    light = inputs[0, :3].sum(0)
-    assert light[classes[0, 0] == 1].min() > light[weights[0, 0] == 1].max()
 
 
 def test_errors_bias_and_z_scores_of_stereo_are_those_put_in() -> None:

@@ -4,15 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_recording import Maker
 
 from bench.methods.physics import GRID
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
+from bench.recording import writer
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from evidence.appearance.features import kernel_distance
 from evidence.datasets import coarser
 from evidence.end_to_end import models
-from evidence.scoring import exvivo
+from evidence.scoring import exvivo, stability
 from evidence.scoring import pulse as experiment
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView
@@ -64,17 +65,34 @@ def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
     assert errors["in"] > 1.5 * errors["still"], "the pulse must matter if it is not removed"
 
 
-def test_the_kernel_distance_is_unbiased_and_grows_with_a_shift() -> None:
-    rng = np.random.default_rng(0)
-    found = [kernel_distance(*rng.standard_normal((2, 12, 30))) for _ in range(300)]
-    assert abs(np.mean(found)) < 3 * np.std(found) / 300**0.5
-    shifted = [kernel_distance(one, other + 0.5) for one, other in rng.standard_normal((30, 2, 12, 30))]
-    assert np.mean(shifted) > 5 * np.std(found)
-
-
 def test_a_coarser_grid_preserves_force_and_motion(clips: list[Clip]) -> None:
     wide = coarser(clips[2], 2)
     fine = clips[2].density.sum((2, 3)) * Grid(32).pitch_mm ** 2
     np.testing.assert_allclose(wide.density.sum((2, 3)) * Grid(16).pitch_mm ** 2, fine, rtol=1e-4, atol=1e-6)
     largest = [np.abs(c.displacement["ideal"]).max() for c in (clips[2], wide)]
     assert largest[1] == pytest.approx(largest[0], rel=0.1)
+
+
+def test_neither_another_finding_nor_a_wide_interval_clears_a_wrong_force() -> None:
+    row = {"error": 0.9, "usual": 0.05, "width": 2.0, "findings": ["foreground: a hand"], "named": False}
+    assert stability.is_silent(row)
+    assert not stability.is_silent(row | {"named": True})
+    assert not stability.is_silent(row | {"error": None}), "held back"
+    assert not stability.is_silent(row | {"usual": 0.85}), "the undegraded recording errs as much"
+    assert not stability.is_silent(row | {"named": None}), "there is no cause to name"
+
+
+def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
+    folder = Maker(tmp_path)(frames=24, meta={"membrane": "stripped"})
+    meta = stability.read_meta(folder)
+    meta["sensor"]["free_s"] = [[0.0, 0.2]]
+    writer.write_meta(folder, meta)
+    case = {"given": 2, "cameras": 2}
+    base = stability.degrade(folder, None, case, tmp_path)
+    assert "membrane" not in stability.read_meta(base)
+    before = [frame.rgb.copy() for frame in open_recording(base).frames()]
+    change, _ = stability.MONOCULAR["4 frames dropped"]
+    dropped = open_recording(stability.degrade(folder, change, case, tmp_path))
+    after = [frame.rgb.copy() for frame in dropped.frames()]
+    assert len(after) == 20
+    assert (after[8] == before[12]).all()

@@ -14,7 +14,6 @@ from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
-from evidence.scoring import cost as phantom
 from synth.recording_flow.decode import RecordingFlowSettings
 
 GAIN_MN_PER_PX = 40.0
@@ -22,8 +21,20 @@ SENSOR_HZ = 100.0
 
 
 def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
-    """`phantom.texture` of a seed."""
-    return phantom.texture(height, width, np.random.default_rng(seed))
+    """Band-pass filtered noise in the colours of tissue, (H, W, 3)."""
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)
+    grey = 110 + 45 * fine / fine.std()
+    return np.asarray(np.clip(grey[..., None] * [1.1, 0.7, 0.6], 0, 210), np.uint8)
+
+
+def pushed(rest: NDArray[np.uint8], peak_px: float) -> NDArray[np.uint8]:
+    """The texture (H, W, 3) moved to the right by a bump of `peak_px` at the centre."""
+    height, width = rest.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    bump = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / (2 * (0.18 * height) ** 2))
+    source = (x - peak_px * bump).astype(np.float32)
+    return np.asarray(cv2.remap(rest, source, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), np.uint8)
 
 
 def force_curve(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -51,7 +62,7 @@ class Maker:
         (folder / "frames").mkdir(parents=True)
         time = np.arange(frames) / fps
         rest = texture(*size)
-        pictures = [phantom.pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
+        pictures = [pushed(rest, f / GAIN_MN_PER_PX) for f in force_curve(time)]
         if footage == "png":
             for k, rgb in enumerate(pictures):
                 cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
@@ -68,7 +79,7 @@ class Maker:
 
 
 class Bump:
-    """The inverse of `phantom.pushed`: the exact force from the displacement at the centre."""
+    """The inverse of `pushed`: the exact force from the displacement at the centre."""
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         length = np.linalg.norm(frame.flow, axis=-1)

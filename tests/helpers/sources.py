@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("synth", "learn", "bench", "evidence")
+PACKAGES = ("synth", "learn", "bench", "evidence", "weights")
 
 
 def sources(*packages: str) -> list[Path]:

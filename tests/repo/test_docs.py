@@ -30,7 +30,8 @@ PAGES = [
     if page.relative_to(ROOT).parts[:2] not in (("docs", "results"), ("docs", "reference"))
 ]
 PLUG_INS = ("flow", "law", "method")
-OURS = re.compile(r"(?<![\w./@-])(?:synth|learn|bench|evidence|tests|examples)/[\w/]+(?:\.[a-z0-9]+)*")
+_TOP = "synth|learn|bench|evidence|weights|tests|examples"
+OURS = re.compile(rf"(?<![\w./@-])(?:{_TOP})/[\w/]+(?:\.[a-z0-9]+)*")
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:

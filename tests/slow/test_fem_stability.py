@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pressed_brain as fem_case
 import pytest
 
-from evidence.fem import case as fem_case
 from synth.errors import UserError
 from synth.fem.equilibrium import InvertedElement, NoEquilibrium
 from synth.fem.mesh import tetrahedra

@@ -1,6 +1,6 @@
 """Vessels of the pia: veins along the sulci, arteries from trunks that cross the patch down to arterioles.
 
-Densities and calibres were compared with an intra-operative photograph (`evidence.render.vessels`); the other
+Densities and calibres were compared with an intra-operative photograph; the other
 numbers were chosen by eye on it.
 """
 

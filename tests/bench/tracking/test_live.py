@@ -12,6 +12,7 @@ import pytest
 from command import run
 from fake_model import write_model
 from fake_recording import texture
+from warped_cortex import Recipe, Stage
 
 from bench.cli import app
 from bench.methods.network import Model
@@ -19,7 +20,6 @@ from bench.recording.folder import open_recording
 from bench.recording.writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
-from evidence.flow.scenes import Recipe, Stage
 from learn.training.threads import set_threads
 from synth.arrays import Mask, Pixels
 from synth.recording_flow.decode import Footage, RecordingFlowSettings

@@ -11,12 +11,12 @@ import torch
 from command import run
 
 import learn
-from evidence.learn.shipped import LARGEST_BYTES, pack_model
 from learn import checkpoint
 from learn.cli import app
 from learn.inference import shipped
 from synth.flow.estimator import name_motion
 from synth.system.checked_file import folder_bytes
+from weights.pack import LARGEST_BYTES, pack_model
 
 
 @pytest.fixture

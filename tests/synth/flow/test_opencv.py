@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tiny_package
+from warped_cortex import cortex
 
-from evidence.flow.scenes import cortex
 from synth.errors import UserError
 from synth.flow import estimator, track
 from synth.job.schema import Job

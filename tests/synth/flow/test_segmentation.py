@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from warped_cortex import Recipe, pairs
 
-from evidence.flow.networks import CorrectionNet, SegmentationNet, write_onnx
-from evidence.flow.scenes import Recipe, pairs
 from synth.errors import UserError
 from synth.flow import correction, onnx_network, segmentation
 from synth.flow.segmentation import segment, with_highlights
 from synth.flow.stereo import depth_correction
+from weights.networks import CorrectionNet, SegmentationNet, write_onnx
 
 Picture = NDArray[np.uint8]
 ON_VESSEL = pytest.mark.xfail(strict=True, reason="it is taken for an instrument, and those are given")

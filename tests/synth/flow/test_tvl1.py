@@ -9,8 +9,8 @@ import scipy.sparse as sp
 import torch
 import torch.nn.functional as F
 from scipy.sparse.linalg import spsolve
+from warped_cortex import CLEAN, Recipe, Stage, noise_field, pairs
 
-from evidence.flow.scenes import CLEAN, Recipe, Stage, noise_field, pairs
 from synth.flow import correction, image, track, tvl1
 from synth.flow.image import Level
 from synth.flow.tvl1 import Tvl1, TVL1Settings

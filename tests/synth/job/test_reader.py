@@ -70,7 +70,6 @@ def test_the_identity_does_not_depend_on_the_number_of_sequences() -> None:
 
 
 HOME = Path(__file__).resolve().parents[3]
-CURVES = HOME / "evidence" / "curves"
 
 
 @pytest.mark.parametrize("name", reader.names())
@@ -81,7 +80,7 @@ def test_a_named_job_is_read_and_drawn(name: str) -> None:
 
 
 def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data() -> None:
-    paths = ("mission", f"{CURVES}/mission-bench.yaml", f"{CURVES}/mission-ood.yaml")
+    paths = ("mission", f"{HOME}/weights/mission-bench.yaml", f"{HOME}/evidence/curves/mission-ood.yaml")
     train, bench, ood = map(reader.load_job, paths)
     assert not set(ood.appearance.families) & {*train.appearance.families, *bench.appearance.families}
     assert ood.anatomy.gyrus_mm[1] <= train.anatomy.gyrus_mm[0]

@@ -1,6 +1,6 @@
-"""Weights of all learned parts below the force, from nothing: segmentation, correction of flow and of depth.
+"""The networks below the force, from nothing: segmentation, correction of flow and of depth.
 
-    make weights
+    python -m weights make FOLDER
 
 Every sequence, example and checkpoint is a file in a folder: an interrupted run continues. Cards state the
 generator, the data, the seed and the hash of the weights that were used below.
@@ -18,9 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from evidence import training
-from evidence.flow import correction_training, segmentation_training
-from evidence.study import Study
 from learn.training.threads import choose_device
 from synth.dataset import provenance
 from synth.errors import UserError
@@ -29,13 +26,15 @@ from synth.flow.stereo import depth_correction
 from synth.job import reader
 from synth.sequence.simulation import simulate
 from synth.system import checked_file
+from weights import correction_training, segmentation_training
+from weights.networks import export
 
 _FIRST = {"randomized": 3000, "mission": 2000}  # of their sequences: others train forces
 _BASELINES_MM = 24, 24, 24, 14, 34
 _STORED = "rgb", "rgb_right", "tool", "tool_right", "glare", "flow", "visible", "motion", "shadow"
 
 
-def measure(
+def make(
     folder: Path,
     randomized: int = 75,
     mission: int = 60,
@@ -53,11 +52,11 @@ def measure(
     settings or weights below differ.
     """
     device = choose_device(device).type
-    generator, counts = _generator(folder), {"randomized": randomized, "mission": mission}
+    counts = {"randomized": randomized, "mission": mission}
     files = {job: list(_render(job, count, folder / "sequences")) for job, count in counts.items()}
     sequences = [file for some in files.values() for file in some]
-    about = {"generator": generator, "seed": seed}
-    about["sequences"] = {job: len(some) for job, some in files.items()}
+    generator = " ".join(sorted({str(np.load(file)["generator"]) for file in sequences}))
+    about = {"seed": seed, "sequences": {job: len(some) for job, some in files.items()}}
     below: dict[str, str] = {}
     for part in (segmentation, correction, depth_correction):
         name = part.__name__.rpartition(".")[2]
@@ -76,22 +75,13 @@ def measure(
             else:
                 examples = folder / f"examples-{key}"
                 net, data = correction_training.train(examples, sequences, drawn, minutes, seed, depth=depth)
-            training.export(net, made, card | data, part.CHANNELS)
+            export(net, made, card | data | {"generator": generator}, part.CHANNELS)
         weights = folder / "made" / f"{name}.onnx"
         weights.parent.mkdir(exist_ok=True)
         for suffix in (".onnx", ".json"):
             shutil.copy(made.with_suffix(suffix), weights.with_suffix(suffix))
         vars(part).update(WEIGHTS=made)  # the next part learns from what is recovered with these
         below[name] = hashlib.sha256(checked_file.read_bytes(weights, 2**22)).hexdigest()[:16]
-
-
-def _generator(folder: Path) -> str:
-    """Fingerprint of the generator that began the folder of sequences."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / "generator.txt"
-    if not file.exists():
-        file.write_text(provenance.fingerprint())
-    return file.read_text()
 
 
 def _render(job: str, count: int, folder: Path) -> Iterator[Path]:
@@ -126,7 +116,5 @@ def _rendered(job: str, index: int) -> dict[str, Any]:
     left, right = scene.view, scene.renderer.right
     assert right is not None
     lenses = {"K": left.K, "dist": left.distortion, "Kr": right.K, "distr": right.distortion}
-    return found | lenses | {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
-
-
-STUDY = Study(measure, steps=())
+    more = {"baseline": baseline_mm, "pressed": pressed, "tissue": scene.tissue}
+    return found | lenses | more | {"generator": provenance.fingerprint()}

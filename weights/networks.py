@@ -7,13 +7,16 @@ latter corrects depth too (`synth.flow.stereo.depth_correction`).
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from evidence import report
 from synth.flow import correction, segmentation
 
 _BLOCK = 4  # px: the finest level of the segmentation holds blocks of as many pixels in its channels
@@ -96,6 +99,23 @@ def write_onnx(net: nn.Module, file: Path, channels: int) -> None:
         cast = onnx.helper.make_node("Cast", [f"{name} half"], [name], to=onnx.TensorProto.FLOAT)
         model.graph.node.insert(0, cast)
     onnx.save(model, file)
+
+
+def export(net: nn.Module, file: Path, card: Mapping[str, Any], channels: int) -> None:
+    """Writes a network with its number of inputs as ONNX, and next to it its card."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_onnx(net, file, channels)
+    card = {**card, "parameters": sum(p.numel() for p in net.parameters()), "torch": torch.__version__}
+    report.save(file.parent, f"{file.stem}.json", card)
+    print(card)
+
+
+def follow(average: nn.Module, net: nn.Module, share: float) -> None:
+    """Moves the mean of weights and of batch statistics by a share towards those of a network."""
+    with torch.no_grad():
+        for mean, now in zip(average.state_dict().values(), net.state_dict().values(), strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(now, share)
 
 
 class _Residual(nn.Module):

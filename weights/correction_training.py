@@ -17,21 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evidence import training
-from evidence.flow import scenes as drawn_scenes
-from evidence.flow.foreign_scenes import photographs_of
-from evidence.flow.networks import CorrectionNet
-from evidence.flow.scenes import (
-    Recipe,
-    dilated,
-    inside,
-    inverse,
-    jpeg,
-    noise_field,
-    pixels,
-    resampled,
-    sensed,
-)
+from evidence.flow import scenes
+from evidence.flow.scenes import Field, dilated, inside, inverse, jpeg, noise_field, pixels, resampled, sensed
 from synth.arrays import Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow import correction, image
@@ -42,6 +29,7 @@ from synth.flow.stereo.rig import Intrinsics, StereoRig
 from synth.flow.stereo.track import Moved, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
+from weights.networks import CorrectionNet, follow
 
 Pairs = tuple[tuple[int, int], ...]
 Frames = dict[str, Any]  # arrays of a sequence, by name
@@ -58,7 +46,7 @@ def train(
 ) -> tuple[CorrectionNet, dict[str, Any]]:
     """The network of flow or depth after some CPU-minutes, and its data in numbers.
 
-    `sequences`: files of `evidence.weights`; `drawn`: number of drawn pairs; warped ones are a quarter of it.
+    `sequences`: files of `weights.chain`; `drawn`: number of drawn pairs; warped ones are a quarter of it.
     """
     examples.mkdir(parents=True, exist_ok=True)
     describe, repeats = (depth_example, 1) if depth else (example, 3)  # a drawn pair is a single frame
@@ -66,7 +54,7 @@ def train(
     for file in sequences:
         for again in range(2):
             made[f"{file.stem}_{again}"] = lambda file=file, again=again: _varied(
-                _load(file), np.random.default_rng([*file.stem.encode(), again]), again, depth
+                dict(np.load(file)), np.random.default_rng([*file.stem.encode(), again]), again, depth
             )
     rendered = set(made)
     made |= {f"g{i:04d}": lambda i=i: (_drawn_depth if depth else _drawn)(i) for i in range(drawn)}
@@ -84,24 +72,17 @@ def train(
     return net, {"examples": len(made), "frames": frames, "steps": steps}
 
 
-def _load(file: Path) -> Frames:
-    """Images, masks, calibration and truth of a rendered sequence."""
-    with np.load(file) as arrays:
-        frames = dict(arrays)
-    return frames | {name: frames[name].astype(np.float32) for name in ("flow", "motion")}
-
-
 def _warped(index: int) -> Frames:
     """A pair with a pull under a tool, on drawn cortex."""
     rng = np.random.default_rng([77, index])
-    recipe = Recipe(
-        size=int(rng.choice([192, 224])),
-        pull=float(rng.uniform(1, 14)),
+    size = int(rng.choice([192, 224]))
+    recipe = scenes.Recipe(
+        peak_px=float(rng.uniform(1, 14)),
         noise=float(rng.choice([0.5, 1.5, 3])),
         contrast=float(rng.uniform(0.4, 1)),
-        highlights=float(rng.uniform(0, 0.08)),
+        glare=float(rng.uniform(0, 0.08)),
     )
-    pair = next(drawn_scenes.pairs(recipe, 1, 9000 + index))
+    pair = next(scenes.pairs(recipe, 1, 9000 + index, size))
     hidden = np.stack([~pair.rest_usable, ~pair.now_usable])
     return _pair([pair.rest, pair.now], hidden, pair.flow, pair.inside, pair.hidden, pair.inside)
 
@@ -127,7 +108,7 @@ def _drawn(index: int) -> Frames:
         after = np.where(bar[..., None] > 0, rng.uniform(40, 200), after)
     rgb = [jpeg(sensed(one, noise, rng), quality) for one in (before, after)]
     hidden, there = np.stack([np.zeros_like(bar, bool), dilated(bar > 0, 3)]), inside(flow)
-    covered = drawn_scenes.at_rest(hidden[1], flow) > 0.5
+    covered = scenes.at_rest(hidden[1], flow) > 0.5
     return _pair(rgb, hidden, flow, there, covered, there if rng.random() < 0.5 else np.ones_like(there))
 
 
@@ -200,8 +181,8 @@ def draw_texture(size: int, rng: np.random.Generator) -> Any:
         rough = rng.uniform(0, 10) * noise_field(square, float(rng.uniform(4, 20)), rng)
         return cv2.GaussianBlur(leaves, (0, 0), float(rng.uniform(0.7, 2))) + rough[..., None]
     if kind == 2:
-        return 255 * drawn_scenes.cortex(size, rng)
-    photographs, tint = photographs_of("tuning", 384), np.eye(3) + rng.normal(0, 0.25, (3, 3))
+        return 255 * scenes.cortex(size, rng)
+    photographs, tint = scenes.photographs_of("tuning", 384), np.eye(3) + rng.normal(0, 0.25, (3, 3))
     one = photographs[int(rng.integers(len(photographs)))]
     part = int(rng.integers(192, 385))
     top, left = rng.integers(0, 385 - part, 2)
@@ -213,10 +194,8 @@ def draw_motion(size: int, rng: np.random.Generator) -> Any:
     """Displacement (H, W, 2) px of a pull, a smooth field, an affine motion, or none."""
     kind = rng.integers(4)
     if kind == 0:
-        direction, reach = float(rng.uniform(0, 2 * np.pi)), float(rng.uniform(0.06, 0.2))
-        return drawn_scenes.pull_field(
-            Recipe(size=size, pull=float(rng.uniform(0.2, 10)), direction=direction, reach=reach)
-        )
+        field = Field.draw("pull", size, rng, float(rng.uniform(0.06, 0.2)))
+        return float(rng.uniform(0.2, 10)) * field.at(pixels(size, size))
     if kind == 1:
         period = float(rng.uniform(0.4, 1.5) * size)
         return np.stack([noise_field((size, size), period, rng) for _ in range(2)], -1) * rng.uniform(0.1, 3)
@@ -335,7 +314,7 @@ def _resized(frames: Frames, share: float) -> Frames:
     masks = {name: a for name, a in frames.items() if a.dtype == bool and a.ndim > 2}
     small = {name: resize(a.astype(np.uint8), cv2.INTER_NEAREST) > 0 for name, a in masks.items()}
     tissue = resize(frames["tissue"][None].astype(np.uint8), cv2.INTER_NEAREST)[0] > 0
-    flow = resize(frames["flow"], cv2.INTER_LINEAR) * np.float32(size / old)
+    flow = resize(frames["flow"].astype(np.float32), cv2.INTER_LINEAR) * np.float32(size / old)
     rgb = resize(frames["rgb"], cv2.INTER_AREA if share < 1 else cv2.INTER_CUBIC)
     return small | {"tissue": tissue, "flow": flow, "rgb": rgb}
 
@@ -376,7 +355,7 @@ def fit(examples: list[Frames], depth: bool, minutes: float, seed: int) -> tuple
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
         optimiser.step()
         steps += 1
-        training.follow(average, net, max(0.002, 9 / (steps + 10)))
+        follow(average, net, max(0.002, 9 / (steps + 10)))
     return average.eval(), steps
 
 

@@ -18,14 +18,12 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from evidence import training
-from evidence.flow import paste
-from evidence.flow.correction_training import draw_motion, draw_texture
-from evidence.flow.foreign_scenes import photographs_of
-from evidence.flow.networks import SegmentationNet
-from evidence.flow.scenes import jpeg, noise_field
+from evidence.flow.scenes import jpeg, noise_field, photographs_of
 from synth.arrays import Map, Pixels
 from synth.flow.segmentation import CLASSES
+from weights import paste
+from weights.correction_training import draw_motion, draw_texture
+from weights.networks import SegmentationNet, follow
 
 _SIZE = 224, 160  # px of examples, width and height
 _PHOTOGRAPH = 384  # px, side of photographs
@@ -236,7 +234,7 @@ def train(
         torch.nn.utils.clip_grad_norm_(net.parameters(), 2.0)
         optimiser.step()
         schedule.step()
-        training.follow(average, net, max(0.001, 1 / (step + 1)))
+        follow(average, net, max(0.001, 1 / (step + 1)))
         recent.append(loss.detach())
         if (step + 1) % 100 == 0:
             mean = float(torch.stack([*recent]).mean())

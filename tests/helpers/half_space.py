@@ -1,14 +1,10 @@
 """Discs on the half-space, bare against closed forms and under a membrane against Hankel integrals."""
 
-from collections.abc import Mapping
-from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.special import ellipe, ellipk, j0, j1
 
-from evidence import report
-from evidence.study import Study
 from synth.arrays import Floats
 from synth.fem import surface_embedding
 from synth.fem.membrane import MembraneSheet
@@ -19,19 +15,8 @@ from synth.job import schema
 
 Row = dict[str, Any]
 _RADIUS_MM = 4.5
-_POISSONS = (0.4, 0.45, 0.49)
 _RINGS, _SPOKES = 60, 96
-_SHEETS = (0.0, 50.0)
 _WIDE_MM = (800.0, 800.0, 480.0)  # a membrane spreads the load: its far field is not the bare half-space's
-
-
-def measure(tets: str = "1600,5000") -> Row:
-    """Error of surface displacement under uniform, Hertz and tangential discs, bare and with a membrane.
-
-    `tets`: tetrahedra of the meshes.
-    """
-    settings = product((int(n) for n in tets.split(",")), _POISSONS, _SHEETS)
-    return {"rows": [row for setting in settings for row in errors(*setting)]}
 
 
 def errors(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
@@ -163,23 +148,3 @@ def point_loads(points: Floats, at: Floats, share: Floats, way: Floats, poisson:
                 ]
             )
     return out
-
-
-def page(found: Mapping[str, Any]) -> report.Page:
-    """Largest error of the discs, inside and outside, with and without a membrane."""
-    rows = found["rows"]
-    panels = []
-    for part in ("u_z", "u_r", "u_x"):
-        worst: dict[str, dict[float, float]] = {}
-        for row in rows:
-            if row["part"].startswith(part):
-                errors = worst.setdefault(f"nu {row['poisson']}, membrane {row['sheet_mm']:g} mm", {})
-                errors[row["tets"]] = max(errors.get(row["tets"], 0.0), 100 * row["error"])
-        curves = tuple(
-            report.Curve(name, tuple(errors), tuple(errors.values())) for name, errors in worst.items()
-        )
-        panels.append(report.Panel(f"{part}, worst", "tetrahedra", "error [%]", curves, log_y=True))
-    return report.Page("Discs on the half-space", found, panels)
-
-
-STUDY = Study(measure, "fem/half-space/half-space.json", page, needs=("mesh", "mechanics"))

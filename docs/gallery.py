@@ -1,4 +1,4 @@
-"""Images of the gallery: families, instruments, lights, cameras and scenery side by side."""
+"""Draws the images of the gallery: families, instruments, lights, cameras and scenery side by side."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,8 +7,6 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 
-from evidence import report
-from evidence.study import Study
 from synth.arrays import Pixels
 from synth.job.reader import load_job
 from synth.job.schema import Family, Job
@@ -50,7 +48,7 @@ _SCENERY: dict[str, str] = {
 _CAPTION_PX = 24
 
 
-def measure(out: Path = report.CHECKOUT / "docs", seed: int = 7, width: int = 640, quality: int = 50) -> None:
+def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, quality: int = 50) -> None:
     """Draws families x instruments and lights x cameras as the images of docs/gallery.md.
 
     `width`: of a tile [px]; `quality`: of WebP.
@@ -106,4 +104,5 @@ def _save(file: Path, rows: list[list[Pixels]], quality: int) -> None:
     cv2.imwrite(str(file), picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
-STUDY = Study(measure)
+if __name__ == "__main__":
+    draw()

@@ -1,0 +1,69 @@
+"""Networks of forces packed into the package, each with a card of its figures and limits."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from evidence import report
+from evidence.learn.shipped import listed, measure
+from learn import checkpoint
+from learn.checkpoint import ModelCard
+from learn.inference import shipped
+from learn.inference.predict import load_model
+from synth.errors import UserError
+from synth.system.checked_file import folder_bytes, write_whole
+
+LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
+_LIMITS = (
+    "Trained on rendered images alone, without recordings of real tissue.",
+    "Force is proportional to Young's modulus and has at least its relative error.",
+    "A membrane (pia) carries load that is not visible at the surface: errors are largest with a membrane.",
+)
+_MONOCULAR = (
+    "The force along the line of sight is hardly visible with one camera; its interval is wide.",
+    "On recordings made with another finite-element code and another renderer its error is about that of "
+    "physics in `bench score` (docs/results/learn/foreign/monocular).",
+)
+
+
+def pack(models: Path, data: list[Path], cache: Path | None = None) -> None:
+    """Measures the networks of a folder (mono and stereo) and writes them into the package.
+
+    `data`: the dataset that they were fitted on, then others; `cache`: folder for packed arrays.
+    """
+    rows = measure(data, models, cache)["rows"]
+    for name in shipped.NAMES:
+        own = [row for row in rows if row["model"] == name]
+        stereo = load_model(models / name).card.settings.arch.depth
+        limits = _LIMITS if stereo else (*_LIMITS, *_MONOCULAR)
+        pack_model(models / name, shipped.MODELS / name, report.commit(), listed(own), limits)
+
+
+def pack_model(
+    model: Path, folder: Path, commit: str, metrics: Mapping[str, str], limits: Sequence[str]
+) -> ModelCard:
+    """Writes a pretrained network: weights.safetensors, config.json and a card, README.md.
+
+    `model`: folder of `learn train`; `folder`: `MODELS` and the network's name, replaced if it exists;
+    `commit`: of the code that trained it; `metrics`: values with their units; `limits`: a sentence each.
+    Raises UserError, and writes nothing, if the model is damaged or larger than `LARGEST_BYTES`.
+    """
+    net, card = checkpoint.read_model(model)
+    shutil.rmtree(folder, ignore_errors=True)
+    card = checkpoint.write_model(folder, card, net.state_dict())
+    line = shipped.describe(card)
+    licence = f"{shipped.LICENCE}, as of the code: trained on this project's renders alone"
+    rows = {"data (hash of its sequences)": shipped.hash_data(card), "licence": licence, "commit": commit}
+    rows |= metrics
+    table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
+    bullets = "\n".join(f"- {one}" for one in limits)
+    head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
+    write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
+    size = folder_bytes(folder)
+    if size > LARGEST_BYTES:
+        shutil.rmtree(folder)
+        raise UserError(
+            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
+            "train it with a smaller arch.width"
+        )
+    return card
