@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from bench.importers.formats import list_endings
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
 
@@ -179,7 +180,7 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, pictures' folder."),
+        Argument(help=f"A video, {list_endings()}, or a folder of pictures or of a ROS 2 bag."),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from bench.importers.formats import BAG, IMPORTERS, PLAIN
 from bench.recording import clocks, writer
 from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
@@ -28,13 +28,6 @@ PLAIN_ROLES = ("frames", "frame_time", "force", "fps", "right", "calibration")
 """Of loose files: `fps` is the rate of pictures without times; `frames` and `right` may be patterns."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
 STILLS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-_BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
-_MAKERS = {
-    ".mha": "bench.importers.igsio",
-    **dict.fromkeys((".h5", ".hdf5"), "bench.importers.hdf5"),
-    **dict.fromkeys((".bag", ".mcap", ".db3"), _BAG),
-    **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
-}
 _LEAST_PX = 8
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 10.0
@@ -80,23 +73,26 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     use = dict(use or {})
     if not source.is_dir():
         checked_file.check_file(source, LARGEST_BYTES)
-    maker = _MAKERS.get(source.suffix.lower())
+    ending = source.suffix.lower()[1:]
     if source.is_dir():
         bag, recording = ((source / name).is_file() for name in ("metadata.yaml", "meta.yaml"))
         pictures_only = not recording and find_stills(source, STILLS)
-        maker = _BAG if bag else _PLAIN if pictures_only else None
-    if maker is None:
-        known = ", ".join(sorted(_MAKERS))
+        ending = "bag" if bag else "npy" if pictures_only else ""
+    if ending not in IMPORTERS.names():
+        known = ", ".join(f".{name}" for name in sorted(IMPORTERS.names()))
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
-    is_bag = maker == _BAG
-    roles = {_BAG: BAG_ROLES, _PLAIN: PLAIN_ROLES}.get(maker, (*ROLES, "calibration"))
+    place = IMPORTERS.own.get(ending, "")
+    is_bag = place == BAG
+    roles = {BAG: BAG_ROLES, PLAIN: PLAIN_ROLES}.get(place, (*ROLES, "calibration"))
     if unknown := sorted(set(use) - set(roles)):
         raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
     calibration = None if is_bag else use.pop("calibration", None)
     with _damage_as_user_error(source):
-        found: Intake = import_module(maker).read_source(source, use)
+        found: Intake = IMPORTERS.load_as_is(ending)(source, use)
+        if not isinstance(found, Intake):
+            raise TypeError(f"{IMPORTERS.label(ending)} returned {type(found).__name__}, expected Intake")
         _refuse_odd(source, found)
         right = found.second.pictures() if found.second and found.second.kind == "right" else ()
         bits, notes = 16, list(found.notes)

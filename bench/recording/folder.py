@@ -34,6 +34,7 @@ from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture
+from synth.video.suffixes import SUFFIXES
 
 S = TypeVar("S", bound=Section)
 Video = Path | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
@@ -189,7 +190,7 @@ def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
 def _find_video(folder: Path, name: str, pictures: str) -> Video:
     """The video NAME.*, or the pictures in a folder; empty: neither. UserError for several."""
     found: list[Video] = [
-        path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in video.SUFFIXES
+        path for path in sorted(folder.glob(f"{name}.*")) if path.suffix.lower() in SUFFIXES
     ]
     if stills := file_numbers.number_files(file_numbers.find_stills(folder / pictures)):
         found.append(stills)

@@ -158,7 +158,7 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
         run(["-m", "synth", *shlex.split(line)])
     for title, text in blocks(page, "python"):
         packages = re.findall(r"^(?:from|import) (\w+)", text, re.M)
-        if all(map(importlib.util.find_spec, packages)):  # LeRobot's may not be there
+        if all(map(importlib.util.find_spec, packages)):
             script = tmp_path / Path(title or "block.py").name
             script.write_text(GIVEN.get(page.stem, "") + text)
             run([script.name])
