@@ -64,7 +64,7 @@ def score(
     from bench.scoring import score as scoring
     from bench.scoring.result import as_json
     from learn.inference.shipped import choose_model
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
     from synth.video.mask_files import read_choice
 
     others = _pairs("--also", also, "NAME=FOLDER")
@@ -72,7 +72,7 @@ def score(
     opened = open_recording(recording, phantom).within(files, _rectangle(region))
     folder = out or Path(f"{opened.name}-score")
     # NumPy's BLAS too: its threads would compete with the flow for the same cores.
-    threadpool_limits(set_threads(None))
+    threadpool_limits(choose_threads())
     result = scoring.score(
         opened,
         model or choose_model(opened.has_stereo),
@@ -286,7 +286,7 @@ def live(
     from bench.methods.network import Model
     from bench.tracking import live
     from learn.inference.shipped import choose_model
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
     from synth.flow.estimator import name_motion
     from synth.recording_flow.decode import Footage, RecordingFlowSettings
     from synth.recording_flow.flow import open_flow_process
@@ -300,11 +300,11 @@ def live(
     footage = Footage(partial(read_video, video, FPS), str(video), tissue, files.read if files else None)
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
-    threadpool_limits(set_threads(None))
+    threadpool_limits(choose_threads())
     method = None if model is None else Model(model)
     for note in [] if method is None else method.predictor.card.doubt(name_motion(flow)):
         typer.echo(f"warning: network: {note}", err=True)
-    with open_flow_process(set_threads) as process:
+    with open_flow_process() as process:
         stream = live.stream_video(
             footage,
             RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),

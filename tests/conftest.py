@@ -1,11 +1,11 @@
 """For every test: one thread a process, and what lies in tests/slow is slow."""
 
+import os
 from pathlib import Path
 
 import pytest
-import torch
 
-torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before PyTorch is imported, by those tests that use it
 pytest_plugins = ["clip_fixtures"]
 
 SLOW = Path(__file__).parent / "slow"

@@ -21,13 +21,14 @@ from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
 from learn.inference import shipped
+from learn.inference.convert import add_onnx
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
 from synth.errors import UserError
-from synth.system.checked_file import folder_bytes, write_whole
+from synth.system.checked_file import write_whole
 
 _LEVEL = 0.9
-LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
+LARGEST_BYTES = 4_000_000  # of a file of a pretrained network
 _LIMITS = (
     "Trained on rendered images alone, without recordings of real tissue.",
     "Force is proportional to Young's modulus and has at least its relative error.",
@@ -77,18 +78,19 @@ def pack_model(
     """
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
-    card = checkpoint.write_model(folder, card, net.state_dict())
+    checkpoint.write_model(folder, card, net.state_dict())
+    card = add_onnx(folder)
     line = shipped.describe(card)
     rows = {"data (hash of its sequences)": shipped.hash_data(card), "commit": commit, **metrics}
     table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
     bullets = "\n".join(f"- {one}" for one in limits)
     head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
     write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
-    size = folder_bytes(folder)
+    size = max(file.stat().st_size for file in folder.iterdir())
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
         raise UserError(
-            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
+            f"{model}: has a file of {size / 1e6:.1f} MB, at most {LARGEST_BYTES / 1e6:g} may be shipped; "
             "train it with a smaller arch.width"
         )
     return card

@@ -191,7 +191,7 @@ def _encode(path: Path, images: Pixels, codec: tuple[int, str, int]) -> None:
 
 @cache
 def _model(stereo: bool) -> Any:
-    return load_model(choose_model(stereo), quick=True)
+    return load_model(choose_model(stereo))
 
 
 def _scored(folder: Path, peak_mn: float) -> dict[str, Any]:

@@ -20,7 +20,6 @@ from bench.recording.writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from evidence.flow.scenes import Recipe, Stage
-from learn.training.threads import set_threads
 from synth.arrays import Mask, Pixels
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess, LocalFlow
@@ -43,7 +42,7 @@ def test_flow_in_another_process_gives_the_same_results_in_order() -> None:
         return results
 
     here = watched(None)
-    with closing(FlowProcess(set_threads)) as process:
+    with closing(FlowProcess()) as process:
         there = watched(process)
     assert [one.index for one in there] == [one.index for one in here] == [1, 2, 3, 4]
     assert [one.largest_px for one in there] == [one.largest_px for one in here]
