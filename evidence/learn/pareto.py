@@ -62,7 +62,7 @@ def measure(
     }
 
 
-def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
+def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, ...], dict[str, Any]]:
     """Errors of `OTHERS`, trained with the loss and dropout of their preset, else as `base_settings`, fold 0.
 
     Returns:
