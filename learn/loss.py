@@ -46,14 +46,14 @@ class Frames:
         """Squared error of each cell over `spread`, summed over components, (B, 1, N, N)."""
         return ((self.prediction - self.target) / self.spread * self.mask).square().sum(1, keepdim=True)
 
-    def mean(self, values: Tensor) -> Tensor:
-        """Mean of (B, 1, N, N) over the masked cells."""
-        return values.sum() / self.mask.sum()
+    def mean(self, values: Tensor, components: int = 1) -> Tensor:
+        """Mean over the masked cells, and over components whose sum is (B, 1, N, N) `values`."""
+        return values.sum() / (self.mask.sum() * components)
 
 
 def mse(frames: Frames) -> Tensor:
     """Squared error."""
-    return frames.mean(frames.squared()) / frames.prediction.shape[1]
+    return frames.mean(frames.squared(), frames.prediction.shape[1])
 
 
 def mse_frame(frames: Frames) -> Tensor:
@@ -68,16 +68,17 @@ def antighost(frames: Frames) -> Tensor:
     true = _length(frames.target)
     over_predicted = (true < LOW * frames.unit) & (_length(frames.prediction.detach()) > true)
     weighed = frames.squared() * (1 + (FALSE_POSITIVE - 1) * over_predicted)
-    error = frames.mean(weighed) / frames.prediction.shape[1]
+    error = frames.mean(weighed, frames.prediction.shape[1])
     return 0.7 * error + 0.3 * unexplained(frames.prediction, frames.target, frames.mask, frames.spread)
 
 
 def off_target(frames: Frames) -> Tensor:
     """`mse_frame` and a linear penalty on off-target force, with constants chosen in docs/results/learn."""
+    fit = mse_frame(frames)
     weight = OFF_TARGET * min(max((frames.progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
     contact_free = frames.mask * (_length(frames.target) < FREE * frames.unit)
     penalty = weight * frames.mean(_length(frames.prediction).abs() * contact_free) / frames.spread
-    return mse_frame(frames) + penalty
+    return fit + penalty
 
 
 @dataclass(frozen=True)
