@@ -70,16 +70,15 @@ def train_command(
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
     from learn.inference.shipped import find_model
-    from learn.settings import preset as named
+    from learn.settings import change_preset
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
-    from synth.system.config_file import override
 
     set_threads(threads)
     device = choose_device(accelerator)
     dataset, given = _split_arguments(str(dataset), changes or [])
-    settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
+    settings = change_preset(preset, given)
     begin = read_model(find_model(start)) if start else None
     with made_folder(out, disk_needed(out, settings)):
         clips, split = _divided([dataset, *(also or [])], labels or [], settings, cache)

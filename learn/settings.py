@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -16,6 +16,7 @@ from learn.network.shape import Shape
 from synth.errors import InvalidValue, UserError, did_you_mean
 from synth.job.types import NonNegative, Positive, Section
 from synth.system import checked_file
+from synth.system.config_file import override
 
 Count = Annotated[int, Field(ge=0)]
 AtLeastOne = Annotated[int, Field(ge=1)]
@@ -107,6 +108,20 @@ def preset(name: str, **changes: Any) -> TrainingSettings:
     if name not in PRESETS:
         raise UserError(f"unknown preset {name!r}: one of {', '.join(PRESETS)}")
     return replace(PRESETS[name], **changes)
+
+
+def change_preset(name: str, changes: Mapping[str, str]) -> TrainingSettings:
+    """A preset with values from a command line, by `key` or `arch.key`.
+
+    For another kind of network only what all kinds share is kept of the preset's `arch`. UserError: no such
+    preset, network or key, or a wrong value.
+    """
+    base = preset(name)
+    if (network := changes.get("network", base.network)) != base.network:
+        load_network(network)
+        shared = base.arch.model_dump(include=base.arch.model_fields_set.intersection(Shape.model_fields))
+        base = replace(base, network=network, arch=shared)
+    return override(base, [f"{key}={value}" for key, value in changes.items()])
 
 
 def as_changes(words: Iterable[str]) -> tuple[dict[str, str], list[str]]:

@@ -19,7 +19,7 @@ from learn.inference.predict import Predictor, input_names, load_model
 from learn.network.registry import NETWORKS, Network, build
 from learn.network.ridge import LinearMap, solve
 from learn.network.shape import LinearShape, Shape
-from learn.settings import TrainingSettings, preset
+from learn.settings import TrainingSettings, change_preset, preset
 from learn.split import Split
 from learn.training.train import train
 from synth.errors import Caution, UserError
@@ -155,6 +155,15 @@ def test_another_network_goes_through_the_same_door(
 def test_a_wrong_setting_of_a_network_is_named(start: str, change: str) -> None:
     with pytest.raises(UserError, match=change.partition("=")[0].replace(".", r"\.")):
         override(preset(start), [change])
+
+
+def test_a_preset_of_one_kind_of_network_is_a_start_for_another() -> None:
+    settings = change_preset("stereo", {"network": "ridge", "arch.cells": "8", "size": "64"})
+    assert settings.arch == LinearShape(cells=8, confidence=True, depth=True)
+    assert settings.input == preset("stereo").input
+    assert change_preset("cpu", {"epochs": "3"}) == preset("cpu", epochs=3)
+    with pytest.raises(UserError, match="nonesuch"):
+        change_preset("cpu", {"network": "nonesuch"})
 
 
 def test_faults_of_another_package_are_one_line_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
