@@ -1,3 +1,5 @@
+from .importers.registry import Intake as Intake
+from .importers.registry import SecondView as SecondView
 from .methods.protocol import ForceEstimate as ForceEstimate
 from .methods.protocol import FrameMotion as FrameMotion
 from .methods.protocol import Method as Method

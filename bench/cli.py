@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json as json_
+import math
 import shlex
 import sys
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
+from bench.importers.formats import list_endings
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
 
@@ -63,7 +66,7 @@ def score(
     from bench.scoring import score as scoring
     from bench.scoring.result import as_json
     from learn.inference.shipped import choose_model
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
     from synth.video.mask_files import read_choice
 
     others = _pairs("--also", also, "NAME=FOLDER")
@@ -71,7 +74,7 @@ def score(
     opened = open_recording(recording, phantom).within(files, _rectangle(region))
     folder = out or Path(f"{opened.name}-score")
     # NumPy's BLAS too: its threads would compete with the flow for the same cores.
-    threadpool_limits(set_threads(None))
+    threadpool_limits(choose_threads())
     result = scoring.score(
         opened,
         model or choose_model(opened.has_stereo),
@@ -179,7 +182,7 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, pictures' folder."),
+        Argument(help=f"A video, {list_endings()}, or a folder of pictures or of a ROS 2 bag."),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
@@ -274,50 +277,65 @@ def _pairs(option: str, words: list[str] | None, form: str) -> dict[str, str]:
 
 @app.command(epilog="Example: bench live video.mp4 --model model --scale 0.05 --young 1.5")
 def live(
-    video: Annotated[Path, Argument(help="Its first frame is at rest; tissue.png next to it: the mask.")],
+    video: Annotated[Path, Argument(help="Or a camera: its number, or /dev/video0. It begins at rest.")],
     model: ModelFolder = None,
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; needed with a model.")] = None,
     young: Young = None,
     flow: Backend = "tvl1",
-    shrink: Annotated[int, Option(min=1, max=8, help="Reduce frames by this factor.")] = 1,
+    shrink: Annotated[int, Option(min=0, max=64, help="Shrink frames first; 0: to 160 columns.")] = 0,
     masks: Masks = "auto",
+    tissue: Annotated[
+        Path | None, Option(help="Picture, white on tissue. Default: tissue.png next to a video.")
+    ] = None,
+    seconds: Annotated[float | None, Option(min=0.1, help="Of a camera. Default: until Ctrl-C.")] = None,
     every: Annotated[bool, Option("--every", help="Process every frame, however late.")] = False,
     json: Json = False,
 ) -> None:
-    """Computes masks, flow and force while a video plays: latency percentiles and dropped frames."""
+    """Computes masks, flow and force of a camera or a video as it plays: latency, and dropped frames."""
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
     from bench.tracking import live
+    from bench.tracking.capture import Camera, is_camera
     from learn.inference.shipped import choose_model
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
     from synth.flow.estimator import name_motion
-    from synth.recording_flow.decode import Footage, RecordingFlowSettings
+    from synth.recording_flow.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
     from synth.recording_flow.flow import open_flow_process
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
     from synth.video.read import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
-    drawn = video.parent / "tissue.png"
-    tissue = partial(read_mask, drawn) if drawn.exists() else None
-    footage = Footage(partial(read_video, video, FPS), str(video), tissue, files.read if files else None)
+    filmed = is_camera(video)
+    if filmed and (files or every):
+        raise UserError(f"{video}: a camera has no files of masks, and its frames don't wait for --every")
+    if seconds is not None and not filmed:
+        raise UserError(f"--seconds: {video} is no camera")
+    drawn = tissue or (None if filmed else video.parent / "tissue.png")
+    mask = partial(read_mask, drawn) if drawn and (tissue or drawn.exists()) else None
     # Without a scale there is no force: flow alone is requested.
     model = model or (choose_model(stereo=False) if scale else None)
-    threadpool_limits(set_threads(None))
+    threadpool_limits(choose_threads())
     method = None if model is None else Model(model)
     for note in [] if method is None else method.predictor.card.doubt(name_motion(flow)):
         typer.echo(f"warning: network: {note}", err=True)
-    with open_flow_process(set_threads) as process:
+    with ExitStack() as stack:
+        process = stack.enter_context(open_flow_process())
+        camera = stack.enter_context(closing(Camera(video))) if filmed else None
+        read = partial(read_video, video, FPS) if camera is None else camera.pictures
+        footage = Footage(read, str(video), mask, files.read if files else None)
         stream = live.stream_video(
             footage,
-            RecordingFlowSettings(flow, shrink, rate_hz=None, pulse=False, masks=kind),
+            RecordingFlowSettings(flow, shrink, None, False, kind, LIVE_COLUMNS),
             method=method,
             scale_mm_per_px=read_scale(scale),
             young_kpa=young,
             paced=not every,
             report=(lambda frame: None) if json else _print_frame,
             flow=process,
+            camera=camera,
+            seconds=seconds or math.inf,
         )
     summary = stream.summary()
     for one in stream.findings:

@@ -1,6 +1,7 @@
-"""A trained model on disk: config.json, weights.safetensors, history.jsonl and, for resuming, last.pt.
+"""A trained model on disk: config.json, weights.safetensors, network.onnx, history.jsonl; to resume, last.pt.
 
-The card, config.json, holds a hash of the weights and one of itself, so that a change of either is detected.
+The card, config.json, holds hashes of the weights, of the ONNX network that `learn predict` and `bench` run,
+and of itself, so that a change of any is detected. PyTorch is imported only where weights are used.
 """
 
 from __future__ import annotations
@@ -16,16 +17,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
+import numpy as np
 from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
-from safetensors import torch as safetensors
-from torch import Tensor
+from safetensors import numpy as safetensors
 
 from learn.data.clips import RECOVERED, sources
 from learn.data.grid import Scales
-from learn.network.d2fnet import Architecture, D2FNet
+from learn.network.registry import build
 from learn.settings import TrainingSettings
 from learn.uncertainty.intervals import Intervals
 from synth.errors import UserError, as_user_error
@@ -36,10 +36,14 @@ from synth.system import checked_file
 from synth.system.checked_file import write_whole
 from synth.system.config_file import first_mistake
 
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
 _FORMAT = "sulcus-model"
 _LARGEST_BYTES = 100_000_000  # of config.json, which lists the training sequences: a million of them
 _LARGEST_WEIGHTS = 64 << 30
-_WEIGHTS, _NEXT = "weights.safetensors", "weights.next.safetensors"
+_LARGEST_ONNX = 2 << 30  # that the format allows
+_WEIGHTS, _NEXT, _ONNX = "weights.safetensors", "weights.next.safetensors", "network.onnx"
 _digest: Any = partial(hashlib.blake2b, digest_size=16)
 _GAINS, _MODULI, _SCALES = (0.01, 100.0), (1e-3, 1e4), (1e-9, 1e9)  # limits of a card's numbers
 USED = ("fit", "select", "intervals", "start")  # parts of `ModelCard.split` that it must not be scored on
@@ -66,6 +70,7 @@ class ModelCard:
     """Factor on the network's map: the slope through the origin of the true on the predicted total force, on
     the select sequences at the stored epoch."""
     weights_hash: str = ""  # of the file of weights; empty before the first epoch is stored
+    onnx_hash: str = ""  # of network.onnx, made from these weights; empty: there is none
     intervals: Intervals | None = None  # prediction intervals; None if not fitted
     no_intervals: str = ""  # why they could not be fitted; else empty
     motion: list[str] = field(default_factory=list)
@@ -102,8 +107,8 @@ def write_card(folder: Path, card: ModelCard) -> None:
 def write_model(folder: Path, card: ModelCard, state: Mapping[str, Tensor]) -> ModelCard:
     """Writes weights and card atomically and returns the card with the weights' hash."""
     folder.mkdir(parents=True, exist_ok=True)
-    data = safetensors.save({k: v.contiguous() for k, v in state.items()})
-    card = replace(card, weights_hash=_digest(data).hexdigest())
+    data = safetensors.save({name: np.asarray(value, order="C") for name, value in state.items()})
+    card = replace(card, weights_hash=_digest(data).hexdigest(), onnx_hash="")
     _write(folder / _NEXT, data)
     write_card(folder, card)
     os.replace(folder / _NEXT, folder / _WEIGHTS)
@@ -146,8 +151,28 @@ def _refuse_absurd(card: ModelCard, file: Path) -> None:
             raise UserError(f"{file}: {name} {value:g}: must be from {low:g} to {high:g}")
 
 
+def write_onnx(folder: Path, card: ModelCard, data: bytes) -> ModelCard:
+    """Writes the ONNX network of a model's weights, and the card, which is returned with its hash."""
+    card = replace(card, onnx_hash=_digest(data).hexdigest())
+    _write(folder / _ONNX, data)
+    write_card(folder, card)
+    return card
+
+
+def read_onnx(folder: Path, card: ModelCard) -> bytes | None:
+    """A model's ONNX network; None: it has none. UserError if it is damaged or of other weights."""
+    if not card.onnx_hash:
+        return None
+    data = checked_file.read_bytes(folder / _ONNX, _LARGEST_ONNX)
+    if _digest(data).hexdigest() != card.onnx_hash:
+        raise UserError(f"{folder / _ONNX}: not the network that config.json was written for, or damaged")
+    return data
+
+
 def read_tensors(path: Path) -> dict[str, Any]:
     """The tensors and plain values that `torch.save` wrote, by name, on the CPU. UserError for others."""
+    import torch
+
     with checked_file.open_file(path, _LARGEST_WEIGHTS) as file, as_user_error(f"{path}: corrupt checkpoint"):
         with zipfile.ZipFile(file) as archive:  # PyTorch ignores checksums
             if sum(entry.file_size for entry in archive.infolist()) > os.fstat(file.fileno()).st_size:
@@ -166,38 +191,45 @@ def read_tensors(path: Path) -> dict[str, Any]:
 
 def save_tensors(file: Path, tree: Mapping[str, Any]) -> None:
     """Writes tensors and plain values atomically. Raises UserError if the file can't be written."""
+    import torch
+
     buffer = io.BytesIO()
     torch.save(dict(tree), buffer)
     _write(file, buffer.getvalue())
 
 
-def read_model(folder: Path) -> tuple[D2FNet, ModelCard]:
+def read_model(folder: Path) -> tuple[nn.Module, ModelCard]:
     """The trained network, in evaluation mode on the CPU, and its card. UserError: damaged or edited."""
+    import torch
+
     card = read_card(folder)
     file = _find_weights(folder, card)
     with as_user_error(f"{file}: corrupt weights"):
         state = safetensors.load(checked_file.read_bytes(file, _LARGEST_WEIGHTS))
-    if _shapes(card.settings.arch) != {name: value.shape for name, value in state.items()}:
+    if _shapes(card.settings) != {name: value.shape for name, value in state.items()}:
         raise UserError(f"{file}: the weights are not those of the network in config.json")
-    if not all(torch.isfinite(v).all() for v in state.values()):
+    if not all(np.isfinite(value).all() for value in state.values()):
         raise UserError(f"{file}: the weights hold NaN or infinity")
-    model = D2FNet(card.settings.arch)
-    model.load_state_dict(state)
+    model = build(card.settings.network, card.settings.arch)
+    model.load_state_dict({name: torch.from_numpy(value) for name, value in state.items()})
     return model.eval(), card
 
 
-def disk_needed(folder: Path, arch: Architecture) -> int:
-    """Upper bound of the bytes that training `arch` still adds to `folder`."""
-    numbers = sum(math.prod(shape) for shape in _shapes(arch).values())
-    # Weights, and last.pt with them and two moments of each; all twice during replacement. And logs.
-    needed = 2 * 4 * 4 * numbers + 2_000_000
-    written = (folder / name for name in (_WEIGHTS, "last.pt"))
+def disk_needed(folder: Path, settings: TrainingSettings) -> int:
+    """Upper bound of the bytes that a training still adds to `folder`."""
+    numbers = sum(math.prod(shape) for shape in _shapes(settings).values())
+    # Weights, ONNX, and last.pt with the weights and two moments of each; all twice during replacement. Logs.
+    needed = 2 * 5 * 4 * numbers + 2_000_000
+    written = (folder / name for name in (_WEIGHTS, _ONNX, "last.pt"))
     return max(needed - sum(file.stat().st_size for file in written if file.is_file()), 1)
 
 
-def _shapes(arch: Architecture) -> dict[str, torch.Size]:
+def _shapes(settings: TrainingSettings) -> dict[str, tuple[int, ...]]:
+    import torch
+
     with torch.device("meta"):  # without memory
-        return {name: value.shape for name, value in D2FNet(arch).state_dict().items()}
+        state = build(settings.network, settings.arch).state_dict()
+    return {name: tuple(value.shape) for name, value in state.items()}
 
 
 def _find_weights(folder: Path, card: ModelCard) -> Path:

@@ -59,29 +59,28 @@ def train_command(
     also: Annotated[list[Path] | None, Option(help="A further training dataset; repeat for more.")] = None,
     labels: Annotated[list[Path] | None, Option(help="A dataset of which only the truth is used.")] = None,
     start: Annotated[str | None, Option(help="A model to start from: a folder, mono or stereo.")] = None,
-    preset: Annotated[str, Option(help="tiny, cpu, live or paper; stereo or stereo-live.")] = "cpu",
+    preset: Annotated[str, Option(help="tiny, cpu, live, paper or ridge; stereo or stereo-live.")] = "cpu",
     accelerator: Annotated[str, Option(help="cpu, cuda or auto.")] = "auto",
     threads: Threads = None,
     cache: Cache = None,
     json: Json = False,
 ) -> None:
-    """Train D2FNet on a dataset. The same command continues an interrupted run."""
+    """Train a network on a dataset. The same command continues an interrupted run."""
     from learn.checkpoint import disk_needed, read_model
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
     from learn.inference.shipped import find_model
-    from learn.settings import preset as named
+    from learn.settings import change_preset
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
     from synth.system.checked_file import made_folder
-    from synth.system.config_file import override
 
     set_threads(threads)
     device = choose_device(accelerator)
     dataset, given = _split_arguments(str(dataset), changes or [])
-    settings = override(named(preset), [f"{key}={value}" for key, value in given.items()])
+    settings = change_preset(preset, given)
     begin = read_model(find_model(start)) if start else None
-    with made_folder(out, disk_needed(out, settings.arch)):
+    with made_folder(out, disk_needed(out, settings)):
         clips, split = _divided([dataset, *(also or [])], labels or [], settings, cache)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
@@ -173,10 +172,9 @@ def eval_command(
     from learn.evaluation.tables import coverage_table, score_table
     from learn.inference.predict import load_model
     from learn.split import choose_unseen, find_unit
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
 
-    set_threads(threads)
-    predictor = load_model(model)
+    predictor = load_model(model, threads=choose_threads(threads))
     source = predictor.readable(input or scored_source(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
@@ -232,18 +230,17 @@ def predict_command(
     from learn.inference.apply import open_source
     from learn.inference.motion import VideoOptions
     from learn.inference.prediction_file import predict_files
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
     from synth.recording_flow.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
-    set_threads(threads)
     named, source = (None, model) if source is None else (model, source)
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
     found = []
-    opened = open_source(source, named, options, input)
+    opened = open_source(source, named, options, input, choose_threads(threads))
     for one in predict_files(*opened, source, out, young, membrane, overlay):
         found.append(one)
         if not json:
@@ -270,12 +267,11 @@ def calibrate_command(
     from learn.inference.apply import calibrate
     from learn.inference.motion import motions
     from learn.inference.predict import load_model
-    from learn.training.threads import set_threads
+    from learn.training.threads import choose_threads
 
-    set_threads(threads)
     if wrong := [one for one in data if one.suffix not in (".npz", ".zarr")]:
         raise UserError(f"{wrong[0]}: not a press (.zarr or .npz); intervals are fitted by `learn train`")
-    predictor = load_model(model)
+    predictor = load_model(model, threads=choose_threads(threads))
     presses = [motion for one in data for motion in motions(one, predictor.stored(input))]
     young = {press.name: calibrate(predictor, press) for press in presses}
     if json:
@@ -292,9 +288,9 @@ def export_command(
 ) -> None:
     """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export
-    from learn.inference.predict import load_model
+    from learn.inference.shipped import find_model
 
-    worst = export(load_model(model), file)
+    worst = export(find_model(model), file)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
 
 

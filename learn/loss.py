@@ -13,20 +13,15 @@ forces are of its size; R² by frame makes up for that, as it divides an error b
 
 from __future__ import annotations
 
-from typing import Literal
-
-import torch
-from torch import Tensor
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from synth.errors import UserError
 
-Loss = Literal["mse", "mse-frame", "antighost", "off-target"]
-"""`mse`: squared error. `mse-frame`: squared error and 1 − R² of each frame, in equal parts. `antighost`
-(name and loss of Heraoui et al.): squared error, weighted more where a low force is over-predicted, and 1 −
-R² of the batch. `off-target`: `mse-frame` and a linear penalty on off-target force, with constants chosen in
-docs/results/learn."""
-R2_SHARE = {"mse": 0.0, "mse-frame": 0.5, "antighost": 0.3, "off-target": 0.5}
-"""Weight of the R² term; the squared error has the rest. (Heraoui et al.: 0.3.)"""
+if TYPE_CHECKING:  # settings name a loss without PyTorch: only methods of tensors are used below
+    from torch import Tensor
+
 FALSE_POSITIVE = 3.0  # `antighost`: weight of squared over-prediction of a low force (Heraoui et al.: 3)
 LOW = 0.05  # `antighost`: a low force is under this share of `unit` (Heraoui et al. compare the frame's mean)
 OFF_TARGET = 8.0  # `off-target`: weight of the mean off-target force density, in units of `spread`
@@ -36,42 +31,94 @@ RAMP = (0.25, 0.75)
 start a network first learns to predict no force."""
 
 
-def full(kind: Loss, progress: float) -> bool:
-    """Whether the loss has its full weights at a point 0..1 of the run."""
-    return kind != "off-target" or progress >= RAMP[1]
+@dataclass(frozen=True)
+class Frames:
+    """Predicted and true maps of a batch, in physical units, and the constants of the training data."""
+
+    prediction: Tensor  # (B, C, N, N) mN/mm² at 1 kPa, as the next
+    target: Tensor
+    mask: Tensor  # (B, 1, N, N) 0/1
+    unit: float  # mN/mm²
+    spread: float  # mN/mm²
+    progress: float = 1.0  # point 0..1 of the run
+
+    def squared(self) -> Tensor:
+        """Squared error of each cell over `spread`, summed over components, (B, 1, N, N)."""
+        return ((self.prediction - self.target) / self.spread * self.mask).square().sum(1, keepdim=True)
+
+    def mean(self, values: Tensor, components: int = 1) -> Tensor:
+        """Mean over the masked cells, and over components whose sum is (B, 1, N, N) `values`."""
+        return values.sum() / (self.mask.sum() * components)
+
+
+def mse(frames: Frames) -> Tensor:
+    """Squared error."""
+    return frames.mean(frames.squared(), frames.prediction.shape[1])
+
+
+def mse_frame(frames: Frames) -> Tensor:
+    """Squared error and 1 − R² of each frame, in equal parts."""
+    by_frame = unexplained(frames.prediction, frames.target, frames.mask, frames.spread, by_frame=True)
+    return 0.5 * mse(frames) + 0.5 * by_frame
+
+
+def antighost(frames: Frames) -> Tensor:
+    """Name and loss of Heraoui et al.: squared error, weighted more where a low force is over-predicted, and
+    three tenths of 1 − R² of the batch."""
+    true = _length(frames.target)
+    over_predicted = (true < LOW * frames.unit) & (_length(frames.prediction.detach()) > true)
+    weighed = frames.squared() * (1 + (FALSE_POSITIVE - 1) * over_predicted)
+    error = frames.mean(weighed, frames.prediction.shape[1])
+    return 0.7 * error + 0.3 * unexplained(frames.prediction, frames.target, frames.mask, frames.spread)
+
+
+def off_target(frames: Frames) -> Tensor:
+    """`mse_frame` and a linear penalty on off-target force, with constants chosen in docs/results/learn."""
+    fit = mse_frame(frames)
+    weight = OFF_TARGET * min(max((frames.progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
+    contact_free = frames.mask * (_length(frames.target) < FREE * frames.unit)
+    penalty = weight * frames.mean(_length(frames.prediction).abs() * contact_free) / frames.spread
+    return fit + penalty
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A training loss."""
+
+    of: Callable[[Frames], Tensor]
+    full_from: float = 0.0  # share of the run from which it has its full weights
+
+
+LOSSES = {
+    "mse": Loss(mse),
+    "mse-frame": Loss(mse_frame),
+    "antighost": Loss(antighost),
+    "off-target": Loss(off_target, RAMP[1]),
+}
+"""All losses by their names in the settings of a training."""
+
+
+def full(name: str, progress: float) -> bool:
+    """Whether a loss has its full weights at a point 0..1 of the run."""
+    return progress >= LOSSES[name].full_from
 
 
 def loss(
     prediction: Tensor,
     target: Tensor,
     mask: Tensor,
-    kind: Loss,
+    name: str,
     unit: float,
     spread: float,
     progress: float = 1.0,
 ) -> Tensor:
-    """The loss over all masked cells of a batch, at a point 0..1 of the run.
+    """The loss of a name over all masked cells of a batch; arguments as of `Frames`.
 
-    `prediction`, `target`: (B, C, N, N) mN/mm² at 1 kPa; `mask`: (B, 1, N, N) 0/1; `unit`, `spread`: in
-    mN/mm² too. Raises UserError if the mask is empty.
+    Raises UserError if the mask is empty.
     """
-    cells = mask.sum()
-    if cells == 0:
+    if mask.sum() == 0:
         raise UserError("a batch has no tissue cell: check the tissue masks")
-    squared = ((prediction - target) / spread * mask).square().sum(1, keepdim=True)
-    if kind == "antighost":
-        low = _length(target) < LOW * unit
-        over_predicted = low & (_length(prediction.detach()) > _length(target))
-        squared = squared * torch.where(over_predicted, FALSE_POSITIVE, 1.0)
-    fit, share = squared.sum() / (cells * prediction.shape[1]), R2_SHARE[kind]
-    r2 = off_target = squared.new_zeros(())
-    if share > 0:
-        r2 = unexplained(prediction, target, mask, spread, by_frame=kind != "antighost")
-    if kind == "off-target":
-        weight = OFF_TARGET * min(max((progress - RAMP[0]) / (RAMP[1] - RAMP[0]), 0.0), 1.0)
-        contact_free = mask * (_length(target) < FREE * unit)
-        off_target = weight * ((_length(prediction).abs() * contact_free).sum() / cells) / spread
-    return (1 - share) * fit + share * r2 + off_target
+    return LOSSES[name].of(Frames(prediction, target, mask, unit, spread, progress))
 
 
 def unexplained(

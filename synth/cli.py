@@ -13,6 +13,7 @@ import typer
 from typer import Argument, Option
 
 from synth.errors import UserError, as_user_error
+from synth.publish.export.registry import EXPORTERS
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -304,10 +305,7 @@ def export(
     target: Annotated[Path, Argument(help="The new folder.")],
     to: Annotated[
         str,
-        Option(
-            help="folder, hf, webdataset, lerobot, endonerf, tapvid, flow-pairs, hdf5, d2fnet-npz, vtu or "
-            "video."
-        ),
+        Option(help=f"{', '.join(EXPORTERS.names())}."),
     ] = "folder",
     overlay: Annotated[
         list[str] | None, Option(help="Of a video: flow, recovered, force, none. [default: flow and force]")

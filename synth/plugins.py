@@ -1,15 +1,16 @@
-"""Plug-ins: flow estimators and material laws of other packages, found by entry points."""
+"""Plug-ins of other packages by name, found by entry points: estimators, laws, networks, formats, methods."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from synth.errors import InvalidValue, UserError, as_user_error, did_you_mean
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 STORED = object()
 """Validation context of a stored job: reading a dataset needs none of the plug-ins that created it."""
@@ -22,6 +23,8 @@ def check_answer(
 
     UserError that begins with `label` and `what` for anything else.
     """
+    import numpy as np  # here: command lines list plug-ins in their help
+
     with as_user_error(f"{label}: {what}"):
         array = np.asarray(found, np.float32)
         if array.shape != shape:
@@ -80,11 +83,20 @@ class Registry:
 
         UserError: there is none, or any exception of its package.
         """
+        thing = self.load_as_is(name)
+        if name in self._added or not callable(thing):
+            return thing
+        with as_user_error(self.label(name)):
+            return thing()
+
+    def load_as_is(self, name: str) -> Any:
+        """The object registered under `name` itself, not called. UserError as `load`."""
         if name in self._added:
             return self._added[name]
+        if name in self.own:  # a library that it lacks is reported by the caller
+            return self._point(name).load()
         with as_user_error(self.label(name)):
-            found = self._point(name).load()
-            return found() if callable(found) else found
+            return self._point(name).load()
 
     def _points(self) -> dict[str, EntryPoint]:
         return {point.name: point for point in entry_points(group=self.group)}

@@ -9,11 +9,12 @@ from evidence.learn.shipped import listed, measure
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.inference import shipped
+from learn.inference.convert import add_onnx
 from learn.inference.predict import load_model
 from synth.errors import UserError
-from synth.system.checked_file import folder_bytes, write_whole
+from synth.system.checked_file import write_whole
 
-LARGEST_BYTES = 4_000_000  # of all files of a pretrained network
+LARGEST_BYTES = 4_000_000  # of a file of a pretrained network
 _LIMITS = (
     "Trained on rendered images alone, without recordings of real tissue.",
     "Force is proportional to Young's modulus and has at least its relative error.",
@@ -50,7 +51,8 @@ def pack_model(
     """
     net, card = checkpoint.read_model(model)
     shutil.rmtree(folder, ignore_errors=True)
-    card = checkpoint.write_model(folder, card, net.state_dict())
+    checkpoint.write_model(folder, card, net.state_dict())
+    card = add_onnx(folder)
     line = shipped.describe(card)
     licence = f"{shipped.LICENCE}, as of the code: trained on this project's renders alone"
     rows = {"data (hash of its sequences)": shipped.hash_data(card), "licence": licence, "commit": commit}
@@ -59,11 +61,11 @@ def pack_model(
     bullets = "\n".join(f"- {one}" for one in limits)
     head = f"# {folder.name}\n\n{line[:1].upper()}{line[1:]}.\n\n| what | |\n| --- | --- |\n"
     write_whole(folder / "README.md", f"{head}{table}\n\nLimits:\n\n{bullets}\n".encode())
-    size = folder_bytes(folder)
+    size = max(file.stat().st_size for file in folder.iterdir())
     if size > LARGEST_BYTES:
         shutil.rmtree(folder)
         raise UserError(
-            f"{model}: is {size / 1e6:.1f} MB, a pretrained network at most {LARGEST_BYTES / 1e6:g}; "
+            f"{model}: has a file of {size / 1e6:.1f} MB, at most {LARGEST_BYTES / 1e6:g} may be shipped; "
             "train it with a smaller arch.width"
         )
     return card

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import import_module
 from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from bench.importers.formats import BAG, IMPORTERS, PLAIN
 from bench.recording import clocks, writer
 from bench.recording.sensor_table import find_bias
 from synth.arrays import Array, Floats, Ints, Pixels
@@ -35,13 +35,6 @@ PLAIN_ROLES = (
 film in a video with several; `start=file` counts a video's times from the start of its file, as sound may,
 not from its first picture."""
 BAG_ROLES = ("frames", "force", "right", "depth", "calibration", "right_calibration")  # topics
-_BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
-_MAKERS = {
-    ".mha": "bench.importers.igsio",
-    **dict.fromkeys((".h5", ".hdf5"), "bench.importers.hdf5"),
-    **dict.fromkeys((".bag", ".mcap", ".db3"), _BAG),
-    **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
-}
 _LEAST_PX = 8
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 10.0
@@ -93,21 +86,24 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     use = dict(use or {})
     if not source.is_dir():
         checked_file.check_file(source, LARGEST_BYTES)
-    maker = _MAKERS.get(source.suffix.lower())
+    ending = source.suffix.lower()[1:]
     if source.is_dir():
-        maker = _folder_maker(source)
-    if maker is None:
-        known = ", ".join(sorted(_MAKERS))
+        ending = _folder_ending(source)
+    if ending not in IMPORTERS.names():
+        known = ", ".join(f".{name}" for name in sorted(IMPORTERS.names()))
         raise UserError(
             f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
         )
-    is_bag = maker == _BAG
-    roles = {_BAG: BAG_ROLES, _PLAIN: PLAIN_ROLES}.get(maker, (*ROLES, "calibration"))
+    place = IMPORTERS.own.get(ending, "")
+    is_bag = place == BAG
+    roles = {BAG: BAG_ROLES, PLAIN: PLAIN_ROLES}.get(place, (*ROLES, "calibration"))
     if unknown := sorted(set(use) - set(roles)):
         raise UserError(f"--use {unknown[0]}=...: {source.name} has only {', '.join(roles)}")
     calibration = None if is_bag else use.pop("calibration", None)
     with _damage_as_user_error(source):
-        found: Intake = import_module(maker).read_source(source, use)
+        found: Intake = IMPORTERS.load_as_is(ending)(source, use)
+        if not isinstance(found, Intake):
+            raise TypeError(f"{IMPORTERS.label(ending)} returned {type(found).__name__}, expected Intake")
         _refuse_odd(source, found)
         right = found.second.pictures() if found.second and found.second.kind == "right" else ()
         bits, notes = 16, list(found.notes)
@@ -142,14 +138,14 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     return replace(found, notes=tuple(notes))
 
 
-def _folder_maker(source: Path) -> str | None:
+def _folder_ending(source: Path) -> str:
     """The reader of a folder: of a ROS 2 bag, or of pictures or videos; None: a recording, or neither."""
     names = [path.suffix.lower() for path in source.glob("*") if not path.name.startswith(".")]
     if (source / "metadata.yaml").is_file() or any(suffix in (".mcap", ".db3") for suffix in names):
-        return _BAG
+        return "bag"
     is_recording = (source / "meta.yaml").is_file()
     has_pictures = find_stills(source, STILLS) or any(suffix in video.SUFFIXES for suffix in names)
-    return _PLAIN if has_pictures and not is_recording else None
+    return "npy" if has_pictures and not is_recording else ""
 
 
 def _calibrated(found: Intake, file: Path) -> Intake:

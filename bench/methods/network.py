@@ -21,8 +21,8 @@ class Model:
     """A model of `learn train`. Without a known E its forces are those of tissue of 1 kPa."""
 
     def __init__(self, model: Path | Predictor) -> None:
-        """`model`: itself, or its folder, loaded as an optimised graph."""
-        self.predictor: Predictor = load_model(model, quick=True) if isinstance(model, Path) else model
+        """`model`: itself, or its folder."""
+        self.predictor: Predictor = load_model(model) if isinstance(model, Path) else model
         self._estimator: tuple[MethodContext, ForceEstimator] | None = None
 
     @property

@@ -34,6 +34,7 @@ from synth.video import read as video
 from synth.video.mask_files import MaskFiles
 from synth.video.pixel_scale import UNKNOWN_NOTE
 from synth.video.read import Picture, VideoFile
+from synth.video.suffixes import SUFFIXES
 
 S = TypeVar("S", bound=Section)
 Video = VideoFile | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
@@ -212,7 +213,7 @@ def _find_stereo(folder: Path, about: Meta) -> tuple[Video, dict[int, Path]]:
 def _find_video(folder: Path, name: str, pictures: str, about: Meta, notes: list[str]) -> Video:
     """The video NAME.*, else the only one, or the pictures in a folder; empty: neither. UserError:
     several."""
-    films = sorted(path for path in folder.glob("*") if path.suffix.lower() in video.SUFFIXES)
+    films = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
     films = [path for path in films if not path.name.startswith(".")]
     named = [path for path in films if path.name.lower().startswith(f"{name}.")]
     stills = file_numbers.number_files(file_numbers.find_stills(folder / pictures, file_numbers.STILLS))

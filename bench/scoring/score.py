@@ -22,7 +22,6 @@ from bench.scoring.result import Result, as_json
 from bench.tracking.tracking import Progress
 from learn import Predictor
 from learn.inference.shipped import choose_model, find_model
-from learn.training.threads import set_threads
 from synth.arguments import checked
 from synth.errors import UserError
 from synth.recording_flow.decode import RecordingFlowSettings
@@ -81,7 +80,7 @@ def score(
         flow, used = None, settings or Settings()
         # Another process is given an estimator by its name.
         if own_process and isinstance(used.backend, str) and (frames or _LONG) >= _LONG:
-            flow = stack.enter_context(open_flow_process(set_threads))
+            flow = stack.enter_context(open_flow_process())
         network = None if model is None else Model(model)
         chosen = _choose_methods(network, model, methods or {}, baselines)
         scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))

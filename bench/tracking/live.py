@@ -1,20 +1,23 @@
-"""`bench live`: a video as a stream, masked and tracked frame by frame, with the latency of each stage."""
+"""`bench live`: a camera or a video as a stream, masked and tracked frame by frame, with its latency."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from bench.methods.protocol import Method, MethodContext
+from bench.tracking.capture import Camera
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, problems
 from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.passes import Pace, VideoPass
 from synth.video.pixel_scale import StatedScale, pixel_mm
 
 
@@ -36,7 +39,7 @@ class Stream:
     """Results of a stream."""
 
     frames: list[LiveFrame] = field(default_factory=list)
-    dropped: int = 0
+    dropped: int = 0  # frames that arrived while another was processed
     size: tuple[int, int] = (0, 0)  # height, width of the downsampled pictures [px]
     findings: tuple[Finding, ...] = ()
 
@@ -62,47 +65,78 @@ def stream_video(
     paced: bool = True,
     report: Callable[[LiveFrame], None] = lambda frame: None,
     flow: LocalFlow | None = None,
+    camera: Camera | None = None,
+    seconds: float = math.inf,
 ) -> Stream:
-    """Tracks a video as a stream; the first frame is the rest frame.
+    """Tracks a video or a camera as a stream; the first frame is the rest frame.
 
     `settings`: without a limit on the rate and search for pulsation. `scale_mm_per_px`: of the original
     pixels; "unknown": forces are correct up to a factor, for any E. `paced`: whether frames that arrive while
     another is processed are dropped. `report`: called with every frame. `flow`: as of `track_recording`.
+    `camera`: that the footage is of: the stream ends after so many `seconds`, or on Ctrl-C.
     UserError for an unreadable video, fewer than two frames, or a method without a scale.
     """
     if method is not None and scale_mm_per_px is None:
         raise UserError("a model requires --scale (mm per pixel, or unknown): forces depend on it")
-    pace = _VideoClock(paced)
+    pace = _VideoClock(paced) if camera is None else _CameraClock(camera)
     video = VideoPass(footage, settings, flow=flow, pace=pace)
     stream = Stream(size=(video.rest.tissue.shape[0], video.rest.tissue.shape[1]))
     mm_per_px = pixel_mm(scale_mm_per_px or 1.0, video.rest.size[1]) * video.rest.shrink
     young = None if scale_mm_per_px == "unknown" else young_kpa
     scene = MethodContext(video.rest.tissue, mm_per_px, young, recovered_by=name_motion(settings.backend))
-    for found in video.frames():
-        if found.is_rest:
-            continue
-        began, force = time.perf_counter(), None
-        if method is not None and found.trusted:
-            force = method(found, scene, False).size_mn
-        end, visible = time.perf_counter(), found.confidence > 0
-        frame = LiveFrame(
-            index=found.index,
-            latency_s=end - pace.arrivals_s.pop(found.index),
-            stages_s={"mask": found.masking_s, "flow": found.wall_s, "force": end - began},
-            confidence=float(found.confidence[visible].mean()) if visible.any() else 0.0,
-            trusted=found.trusted,
-            largest_px=float(np.hypot(*found.flow[visible].T).max()) if visible.any() else 0.0,
-            force_mn=force,
-        )
-        stream.frames.append(frame)
-        report(frame)
+    stops = () if camera is None else (KeyboardInterrupt,)
+    with suppress(*stops):
+        for found in video.frames():
+            if found.is_rest:
+                continue
+            began, force = time.perf_counter(), None
+            if method is not None and found.trusted:
+                force = method(found, scene, False).size_mn
+            end, visible = time.perf_counter(), found.confidence > 0
+            frame = LiveFrame(
+                index=found.index,
+                latency_s=end - pace.arrivals_s.pop(found.index),
+                stages_s={"mask": found.masking_s, "flow": found.wall_s, "force": end - began},
+                confidence=float(found.confidence[visible].mean()) if visible.any() else 0.0,
+                trusted=found.trusted,
+                largest_px=float(np.hypot(*found.flow[visible].T).max()) if visible.any() else 0.0,
+                force_mn=force,
+            )
+            stream.frames.append(frame)
+            report(frame)
+            if camera is not None and (found.time_s or 0.0) - (video.rest.time_s or 0.0) >= seconds:
+                break
     stream.dropped, stream.findings = pace.dropped, problems(video.findings)
     if not stream.frames:
         raise UserError(f"{footage.name}: fewer than two frames")
     return stream
 
 
-class _VideoClock:
+class _CameraClock(Pace):
+    """A `Pace`, which see, of a camera: its frames have arrived when they are asked for."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera, self._last = camera, 0
+        self.dropped = 0
+        self.arrivals_s: dict[int, float] = {}
+
+    def start(self, time_s: float) -> None:
+        self._last_s = time.perf_counter()
+
+    def is_due(self, index: int, time_s: float) -> bool:
+        self.dropped += max(index - self._last - 1, 0) if self._last else 0
+        self._last, self._last_s = index, time_s
+        self.arrivals_s[index] = time_s
+        return True
+
+    def spare_s(self, time_s: float) -> float:
+        return 0.0
+
+    def free_s(self) -> float:
+        return max(0.0, self._last_s + self._camera.period_s - time.perf_counter())
+
+
+class _VideoClock(Pace):
     """A `Pace`, which see, with the clock of the video."""
 
     def __init__(self, paced: bool) -> None:
@@ -125,3 +159,6 @@ class _VideoClock:
 
     def spare_s(self, time_s: float) -> float:
         return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter()) if self.paced else 0.0
+
+    def free_s(self) -> float:
+        return 0.0

@@ -19,9 +19,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from bench.methods import physics, posterior
 from bench.methods.compliance import TissueKind
 from bench.methods.protocol import Field
-from learn.data import grid
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, total_force
+from learn.network.channels import turned as turned_tensors
 from synth.arrays import Array, Floats
 from synth.flow.confidence import deviation
 
@@ -74,7 +74,7 @@ def turned(clip: Clip) -> list[Clip]:
     """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
 
     def each(fields: Array, turn: int) -> Array:
-        return grid.turned(torch.from_numpy(np.array(fields)), turn).numpy()
+        return turned_tensors(torch.from_numpy(np.array(fields)), turn).numpy()
 
     return [
         replace(

@@ -13,17 +13,22 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
 from evidence.intervals import difference, mean_of
 from evidence.learn.runs import Run, base_settings, by_sequence, carry_out
 from evidence.study import Study
+from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips
-from learn.data.grid import Grid, Scales, channels
-from learn.network.d2fnet import Architecture, D2FNet, freeze, fused
-from learn.settings import PRESETS, replace
+from learn.data.grid import Grid, Scales
+from learn.inference.convert import examples, to_onnx
+from learn.inference.predict import input_names
+from learn.network.channels import channels
+from learn.network.registry import build
+from learn.network.shape import Architecture, Shape
+from learn.settings import PRESETS, TrainingSettings, replace
+from synth.flow.onnx_network import open_network
 
 OTHERS: Mapping[str, tuple[tuple[int, int, int], ...]] = {
     "live": ((16, 4, 3), (8, 4, 4), (12, 4, 4), (16, 4, 4)),
@@ -59,7 +64,7 @@ def measure(
     }
 
 
-def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, int, int, int], dict[str, Any]]:
+def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, ...], dict[str, Any]]:
     """Errors of `OTHERS`, trained with the loss and dropout of their preset, else as `base_settings`, fold 0.
 
     Returns:
@@ -71,18 +76,19 @@ def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, int, int, 
         preset = PRESETS[name]
         clips = load_clips(dataset, Grid(preset.size), ("ideal",), cache=cache)
         usual = replace(base_settings(), size=preset.size, loss=preset.loss)
-        runs: dict[tuple[int, int, int], list[dict[str, Any]]] = {}
+        runs: dict[tuple[int, ...], list[dict[str, Any]]] = {}
         for shape, seed in product(group, range(seeds)):
             width, stem, levels = shape
-            arch = {"width": width, "stem": stem, "levels": levels, "dropout": preset.arch.dropout}
+            dropout = preset.arch.model_dump()["dropout"]
+            arch = {"width": width, "stem": stem, "levels": levels, "dropout": dropout}
             settings = replace(usual, arch=replace(usual.arch, **arch), seed=seed)
             run = Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
             runs.setdefault(shape, []).append(carry_out(run, clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
-        for shape, own in runs.items():
+        for network, own in runs.items():
             rmse = by_sequence(own, "map_rmse")
             against = [value / float(base.mean()) for value in difference(base, rmse)]
-            found[(preset.size, *shape)] = {"map_rmse": mean_of(rmse), "against": against}
+            found[(preset.size, *network)] = {"map_rmse": mean_of(rmse), "against": against}
     return found
 
 
@@ -93,18 +99,19 @@ def key(row: Mapping[str, Any]) -> tuple[int, int, int, int]:
 
 def preset_of(row: Mapping[str, Any]) -> str:
     """Names of the monocular presets with a row's network."""
-    monocular = {name: one for name, one in PRESETS.items() if not one.arch.depth}
+    monocular = {name: one for name, one in PRESETS.items() if _shape(one.arch) and not one.arch.depth}
     return ", ".join(name for name, one in monocular.items() if key(row) == (one.size, *_shape(one.arch)))
 
 
-def _shape(arch: Architecture) -> tuple[int, int, int]:
-    return arch.width, arch.stem, arch.levels
+def _shape(arch: Shape) -> tuple[int, ...]:
+    """Width, stem and levels; empty for another kind of network."""
+    return (arch.width, arch.stem, arch.levels) if isinstance(arch, Architecture) else ()
 
 
 def time_networks(
     shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str
 ) -> list[dict[str, Any]]:
-    """Latency of one frame from displacement on the grid to the force map on it, batch norms folded.
+    """Latency of one frame from displacement on the grid to the force map on it, on a CPU by ONNX Runtime.
 
     CPU time on the CPU (without other processes), wall time on a GPU. Heavy networks are timed at least five
     times, light ones `repeats` times, all of them in turn, so that variations of the machine's speed affect
@@ -123,7 +130,7 @@ def time_networks(
             "width": arch.width,
             "stem": arch.stem,
             "levels": arch.levels,
-            "parameters": sum(p.numel() for p in D2FNet(arch).parameters()),
+            "parameters": sum(p.numel() for p in build("d2fnet", arch).parameters()),
             "ms_p50": float(np.median(own)),
         }
         for (size, arch), own in zip(archs, times, strict=True)
@@ -133,9 +140,14 @@ def time_networks(
 def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
     """A function that processes one frame as in live use, prepared."""
     torch.manual_seed(0)
-    model = D2FNet(arch).eval()
-    net: Callable[[Tensor], Any] = freeze(model, arch, size) if device == "cpu" else fused(model).to(device)
+    model = build("d2fnet", arch).eval()
     grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
+    if device == "cpu":
+        card = ModelCard(TrainingSettings(size=size, arch=arch), scales, 1.0, {}, {})
+        session = open_network(to_onnx(model, card)[0], "network")
+        given = dict(zip(input_names(card), (one.numpy() for one in examples(card, 1)), strict=True))
+        return lambda: session.run(None, given)
+    net = model.to(device)
     displacement = torch.randn(1, 2, size, size, device=device) * 0.1
     mask = torch.ones(1, 1, size, size, device=device)
 
@@ -161,7 +173,7 @@ def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[flo
 def flops(arch: Architecture, size: int) -> float:
     """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
     with torch.device("meta"), FlopCounterMode(display=False) as counter:
-        D2FNet(arch).eval()(torch.zeros(1, len(arch.channels), size, size))
+        build("d2fnet", arch).eval()(torch.zeros(1, len(arch.channels), size, size))
     return float(counter.get_total_flops())
 
 

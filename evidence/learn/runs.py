@@ -18,12 +18,11 @@ from learn.data.clips import Clip, load_clips
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
 from learn.inference.predict import Predictor
-from learn.loss import Loss
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import Split
 from synth.arrays import Floats
 
-LOSSES: tuple[Loss, ...] = ("mse", "antighost", "off-target")
+LOSSES = ("mse", "antighost", "off-target")
 SCORES = (
     "map_r2",
     "map_rmse",

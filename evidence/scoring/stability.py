@@ -134,7 +134,7 @@ def degrade(source: Path, change: Change | None, case: Mapping[str, Any], work: 
 
 @cache
 def _model(stereo: bool) -> Any:
-    return load_model(choose_model(stereo), quick=True)
+    return load_model(choose_model(stereo))
 
 
 def _scored(source: Path, change: Change | None, case: Mapping[str, Any], work: Path, *key: Any) -> Any:

@@ -78,11 +78,18 @@ def predict(
 
 
 def open_source(
-    source: Path | Array, model: Predictor | str | Path | None, options: VideoOptions, input: str | None
+    source: Path | Array,
+    model: Predictor | str | Path | None,
+    options: VideoOptions,
+    input: str | None,
+    threads: int = 1,
 ) -> tuple[Predictor, Iterator[Motion]]:
-    """The model, by default the pretrained one that fits, and the motions of a source for it."""
+    """The model, by default the pretrained one that fits, and the motions of a source for it.
+
+    `threads`: of a model that is given by its name.
+    """
     named = model or choose_model(has_right_camera(source))
-    found = named if isinstance(named, Predictor) else load_model(named, quick=True)
+    found = named if isinstance(named, Predictor) else load_model(named, threads=threads)
     return found, motions(source, found.stored(input), options)
 
 

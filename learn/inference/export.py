@@ -1,95 +1,35 @@
-"""A trained model as one ONNX file for other programs, which computes the input channels itself.
+"""A trained model as one ONNX file for other programs: `convert.py`, with the model's gain of the force.
 
-Inputs: `displacement` (B, 2, N, N) mm, in stereo (B, 3, N, N), and `mask` (B, 1, N, N) 0/1; for some models
-`confidence` (B, 1 or, in stereo, 2, N, N) 0..1 and `membrane` (B,): -1 stripped, 0 unknown, 1 intact. Output:
-force density per unit stiffness (B, C, N, N) [mN/mm² at 1 kPa]. The .json next to it describes their use, and
-`NAME.onnx.example.py` runs it on one frame.
+The .json next to it describes its use, and `NAME.onnx.example.py` runs it on one frame.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import shutil
-import warnings
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import onnxruntime
-import torch
-from torch import Tensor, nn
-
+from learn import checkpoint
 from learn.checkpoint import ModelCard
-from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM, channels
-from learn.inference.predict import Predictor
-from synth.errors import UserError
+from learn.data.grid import HALF_SURE_MM, SMOOTHING_MM
+from learn.inference.convert import to_onnx
+from learn.inference.predict import input_names
+from synth.system.checked_file import write_whole
 
 _EXAMPLE = Path(__file__).with_name("onnx_example.py.txt")
-TOLERANCE = 1e-4  # largest difference from PyTorch allowed, in units of the training data's 99.9th percentile
 
 
-class Portable(nn.Module):
-    """The channels, the network and its scale in one module."""
+def export(model: Path, file: Path) -> float:
+    """Writes the model of a folder as `file`, and a description `file`.json.
 
-    def __init__(self, model: nn.Module, card: ModelCard) -> None:
-        super().__init__()
-        self.model, self.card = model, card
-
-    def forward(self, displacement: Tensor, mask: Tensor, *others: Tensor) -> Tensor:
-        known = dict(zip(input_names(self.card)[2:], others, strict=True))
-        x = channels(displacement, mask, self.card.settings.grid.pitch_mm, self.card.scales, **known)
-        y: Tensor = self.model(x) * (self.card.scales.target * self.card.force_gain)
-        return y
-
-
-def input_names(card: ModelCard) -> list[str]:
-    """Names of the file's inputs, in order."""
-    arch = card.settings.arch
-    return ["displacement", "mask", *["confidence"] * arch.confidence, *["membrane"] * arch.membrane]
-
-
-def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
-    """Random inputs of realistic size: smooth motion over a round mask."""
-    n = card.settings.size
-    rng = np.random.default_rng(seed)
-    y, x = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n), indexing="ij")
-    parts = card.settings.arch.displacements
-    a = rng.normal(size=(batch, parts, 6))
-    basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
-    moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
-    mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
-    found = {
-        "displacement": moved,
-        "mask": mask,
-        "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
-        "membrane": rng.integers(-1, 2, batch),
-    }
-    return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
-
-
-@torch.no_grad()
-def export(predictor: Predictor, file: Path) -> float:
-    """Writes `file` as ONNX, and a description `file`.json. Returns the largest difference from PyTorch.
-
-    It is in units of the 99.9th percentile or of the largest output if that is more. UserError if it is above
-    `TOLERANCE` (the file is removed), or if ONNX's packages are not installed.
+    Returns the largest difference from PyTorch. UserError as `to_onnx` and `checkpoint.read_model`; nothing
+    is written then.
     """
-    card = predictor.card
-    module = Portable(predictor.model.cpu(), card).eval()
+    network, card = checkpoint.read_model(model)
+    data, worst = to_onnx(network, card, card.force_gain)
     file.parent.mkdir(parents=True, exist_ok=True)
-    cases = [examples(card, batch, seed=batch) for batch in (1, 3)]
-    names, worst = input_names(card), 0.0
-    session = _write(module, cases[-1], names, file)
-    for inputs in cases:
-        expected = module(*inputs)
-        largest = max(card.scales.target, float(expected.abs().max()))
-        named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        found = torch.from_numpy(session.run(None, named)[0])
-        worst = max(worst, float((found - expected).abs().max()) / largest)
-    if not worst <= TOLERANCE:
-        file.unlink()
-        raise UserError(f"{file}: differs from PyTorch by {worst:.1e} of full scale, at most {TOLERANCE:g}")
+    write_whole(file, data)
     file.with_suffix(file.suffix + ".json").write_text(json.dumps(describe(card, worst), indent=1))
     shutil.copyfile(_EXAMPLE, file.with_suffix(file.suffix + ".example.py"))
     return worst
@@ -129,24 +69,3 @@ def describe(card: ModelCard, difference: float) -> dict[str, Any]:
         "typical_young_kpa": card.typical_young_kpa,
         "largest_difference_from_pytorch": difference,
     }
-
-
-def _write(module: nn.Module, inputs: list[Tensor], names: list[str], file: Path) -> Any:
-    """Writes `file`, for batches of any size, and returns a session of ONNX Runtime that runs it."""
-    try:
-        importlib.import_module("onnx")
-    except ImportError:
-        raise UserError("ONNX export needs onnx: pip install '.[export]' in the clone") from None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(
-            module,
-            tuple(inputs),
-            str(file),
-            input_names=names,
-            output_names=["density"],
-            dynamic_axes={name: {0: "batch"} for name in [*names, "density"]},
-            dynamo=False,
-            opset_version=17,
-        )
-    return onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])

@@ -2,58 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import warnings
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
-from learn.data.grid import Grid, GridView, certainty, channels, membrane_code
+from learn.data.grid import Grid, GridView, certainty, membrane_code
 from learn.inference.shipped import find_model
-from learn.network.d2fnet import freeze, fused
 from learn.uncertainty.features import motion_features
 from synth.arguments import checked
-from synth.arrays import Floats, Map, Mask
-from synth.errors import UserError, as_positive, as_user_error
+from synth.arrays import Array, Floats, Map, Mask
+from synth.errors import Caution, UserError, as_positive, as_user_error
+from synth.flow import onnx_network
 from synth.flow.stereo.track import Moved
+from synth.job import identity
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
+from synth.system import cache
+
+_KEPT = 32  # networks in the user's cache
 
 
 @checked
-def load_model(name: Path | str, device: torch.device | str = "cpu", *, quick: bool = False) -> Predictor:
+def load_model(name: Path | str, *, threads: int = 1) -> Predictor:
     """A trained model, to be called frame by frame (`Predictor`) or for a whole video (`predict_force`).
 
     Args:
         name: the folder that `learn train` wrote, or `mono` or `stereo` for a pretrained network.
-        device: PyTorch's name of the device.
-        quick: compile the network in a second so that it runs a fifth faster on a CPU.
+        threads: CPU threads of the network.
 
     Raises:
-        UserError: the folder is missing, damaged or edited.
+        UserError: the folder is missing, damaged or edited, or holds no trained network.
     """
-    network, card = checkpoint.read_model(find_model(name))
-    return Predictor(network, card, device, quick)
+    if threads < 1:
+        raise UserError(f"threads {threads}: must be at least 1")
+    folder = find_model(name)
+    card = checkpoint.read_card(folder)
+    data = checkpoint.read_onnx(folder, card)
+    return Predictor(card, _convert(folder, card) if data is None else data, threads)
+
+
+def _convert(folder: Path, card: ModelCard) -> bytes:
+    """The ONNX network of a model that has none, made from its weights and kept in the user's cache."""
+
+    def make() -> bytes:
+        from learn.inference.convert import convert  # PyTorch, which nothing else here needs
+
+        why = "holds its weights for PyTorch only: they are converted to ONNX once, into the user's cache"
+        warnings.warn(f"{folder}: {why}", Caution, stacklevel=2)
+        return convert(folder)
+
+    inputs = {"settings": card.settings.model_dump(mode="json"), "scales": asdict(card.scales)}
+    key = identity.digest({"weights": card.weights_hash, **inputs}).encode()
+    return cache.cached("networks/onnx", key, make, bytes, bytes, (), _KEPT)
+
+
+def input_names(card: ModelCard) -> list[str]:
+    """Names of a network's inputs in ONNX, in order."""
+    arch = card.settings.arch
+    return ["displacement", "mask", *["confidence"] * arch.confidence, *["membrane"] * arch.membrane]
 
 
 class Predictor:
     """A trained model for pictures of any size and scale."""
 
-    def __init__(self, network: nn.Module, card: ModelCard, device: torch.device | str, quick: bool) -> None:
-        """`quick`: as of `load_model`."""
+    def __init__(self, card: ModelCard, network: bytes, threads: int = 1) -> None:
+        """`network`: in ONNX, as of `learn.inference.convert`. UserError: it is none, or of another card."""
         self.card, self.grid = card, card.settings.grid
-        with as_user_error(f"device {device}"):
-            self.device = torch.device(device)
-            self.model = fused(network).to(self.device)
-        self._network: Callable[..., Any] = self.model
-        if quick and self.device.type == "cpu":
-            self._network = freeze(network, card.settings.arch, card.settings.size)
+        self._network = onnx_network.open_network(network, "network.onnx", threads)
+        if [given.name for given in self._network.get_inputs()] != input_names(card):
+            raise UserError("network.onnx: its inputs are not those of config.json")
         self._view: GridView | None = None
 
     def readable(self, source: str) -> str:
@@ -128,7 +150,6 @@ class Predictor:
                 raise UserError(f"{what}: expected ({height}, {width}, 3), got {values.shape}")
         return view.mean(moved.motion.transpose(2, 0, 1)), view.mean(certainty(moved.deviation))
 
-    @torch.inference_mode()
     def density(
         self,
         displacement: Map,
@@ -149,7 +170,7 @@ class Predictor:
         Raises:
             UserError: another grid or number of components, or non-finite values or predictions.
         """
-        n, settings, scales = self.grid.size, self.card.settings, self.card.scales
+        n, settings = self.grid.size, self.card.settings
         parts = settings.arch.displacements
         if displacement.ndim != 4 or displacement.shape[1:] != (parts, n, n):
             raise UserError(
@@ -161,22 +182,31 @@ class Predictor:
         maps = []
         for start in range(0, len(displacement), settings.batch):
             frames = slice(start, start + settings.batch)
-            u = torch.from_numpy(np.array(displacement[frames])).to(self.device)
-            m = torch.from_numpy(np.array(mask)).to(self.device).expand(len(u), 1, n, n)
-            c = codes = None
+            moved = np.asarray(displacement[frames], np.float32)
+            inside = np.broadcast_to(np.asarray(mask, np.float32), (len(moved), 1, n, n))
+            known = {"displacement": moved, "mask": np.ascontiguousarray(inside)}
             if settings.arch.confidence:
-                c = torch.ones_like(m).expand(-1, parts - 1, -1, -1)
-                if confidence is not None:
-                    c = torch.from_numpy(np.array(confidence[frames])).to(self.device)
+                certain = np.ones((len(moved), parts - 1, n, n), np.float32)
+                known["confidence"] = (
+                    certain if confidence is None else np.asarray(confidence[frames], np.float32)
+                )
             if settings.arch.membrane:
-                codes = torch.full_like(u[:, 0, 0, 0], membrane_code(membrane))
-            predicted = self._network(channels(u, m, self.grid.pitch_mm, scales, c, codes))
-            maps.append(predicted.float().cpu().numpy())
+                known["membrane"] = np.full(len(moved), membrane_code(membrane), np.float32)
+            with as_user_error("the network"):
+                (found,) = self._network.run(["density"], known)
+            maps.append(_check_shape(found, (len(moved), settings.arch.components, n, n)))
         with np.errstate(over="ignore", invalid="ignore"):  # checked below
-            density = np.concatenate(maps) * np.float32(scales.target * self.card.force_gain * young_kpa)
+            density = np.concatenate(maps) * np.float32(self.card.force_gain * young_kpa)
         if not np.isfinite(density).all():
             raise UserError("the model predicts NaN or infinity: its weights or scales are invalid")
         return density
+
+
+def _check_shape(found: Array, shape: tuple[int, ...]) -> Map:
+    """A network's output. UserError if it is of another shape."""
+    if found.shape != shape:
+        raise UserError(f"network.onnx: its output is {found.shape}, expected {shape}")
+    return np.asarray(found, np.float32)
 
 
 @dataclass(frozen=True)

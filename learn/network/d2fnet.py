@@ -11,64 +11,19 @@ by soft weights. Width 32 on 256² is the paper's network: 13.1 M parameters, 27
 
 from __future__ import annotations
 
-import copy
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from learn.data.grid import CHANNELS
-from synth.job.types import Section
+from learn.network.shape import Architecture
 
 # In units of the training data's 99.9th percentiles.
 BOUNDS = (0.25, 0.75, 1.5)  # largest output of each head; 1.5 times the published ones, as a reserve
 SMALL_CONTACTS = 4.0  # factor on them if `relative`: a contact half as wide moves the tissue half as far
 LEAST_MOTION = 0.01  # that `relative` divides by, some 0.02 mm: noise is smaller
-
-
-class Architecture(Section):
-    """The network's shape; stored in the model's card."""
-
-    width: Annotated[int, Field(ge=4, le=512, multiple_of=4)] = 32
-    """Channels of the first level; each level doubles them."""
-    levels: Annotated[int, Field(ge=1, le=5)] = 4
-    """Number of halvings after the stem."""
-    stem: Literal[1, 2, 4] = 1
-    """Stride of the first convolution; 4 makes the network fast enough for live use (`d2fnet-s`)."""
-    output: Literal["magnitude", "vector"] = "vector"
-    """`magnitude`: force density ≥ 0; `vector`: its x, y, z in camera axes."""
-    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
-    confidence: bool = False
-    """Whether a sixth channel holds the flow's confidence."""
-    depth: bool = False
-    """Whether channels hold stereo motion along the optical axis, with `confidence` also its confidence."""
-    membrane: bool = False
-    """Whether a last channel holds the state of the membrane (pia): stripped, unknown or intact."""
-    relative: bool = False
-    """Whether displacement is divided by the frame's largest, and the map multiplied by it: twice the motion
-    is then twice the force, as in linear elasticity, by construction."""
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the input channels, in order."""
-        along = ("dz", *["confidence of dz"] * self.confidence)
-        flow = (*CHANNELS, *["confidence"] * self.confidence)
-        return (*flow, *along * self.depth, *["membrane"] * self.membrane)
-
-    @property
-    def displacements(self) -> int:
-        """Components of the displacement."""
-        return 3 if self.depth else 2
-
-    @property
-    def components(self) -> int:
-        return 1 if self.output == "magnitude" else 3
 
 
 class D2FNet(nn.Module):
@@ -113,8 +68,7 @@ class D2FNet(nn.Module):
 
     def largest_motion(self, x: Tensor) -> Tensor:
         """The largest mean displacement of 3 × 3 cells, (B, 1, 1, 1) in the channels' unit."""
-        axes = [k for k, name in enumerate(self.arch.channels) if name in ("dx", "dy", "dz")]
-        size = x[:, axes].square().sum(1, keepdim=True)
+        size = x[:, self.arch.axes].square().sum(1, keepdim=True)
         peak = F.avg_pool2d(size, 3, 1, 1).flatten(1).amax(1)
         return (peak + LEAST_MOTION**2).sqrt()[:, None, None, None]
 
@@ -220,30 +174,3 @@ def _he_initialise(module: nn.Module) -> None:
         nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         assert module.bias is not None
         nn.init.zeros_(module.bias)
-
-
-def fused(model: nn.Module) -> nn.Module:
-    """A copy for evaluation with every batch norm folded into the convolution before it."""
-    quick = copy.deepcopy(model).eval()
-    for block in quick.modules():
-        if isinstance(block, Block):
-            for conv, norm in ((0, 1), (3, 4)):
-                pair: Any = block.body[conv], block.body[norm]
-                block.body[conv] = fuse_conv_bn_eval(*pair)
-                block.body[norm] = nn.Identity()
-    return quick
-
-
-def freeze(model: nn.Module, arch: Architecture, size: int) -> Callable[[Tensor], Tensor]:
-    """The network traced for batches of any length on its own grid; its output is equal up to rounding.
-
-    A frozen graph runs also small convolutions in oneDNN: a fifth of the time of `d2fnet-s` on a CPU.
-    """
-    net: Any = fused(model).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    example = torch.zeros(2, len(arch.channels), size, size).contiguous(memory_format=torch.channels_last)
-    jit: Any = torch.jit
-    with warnings.catch_warnings(), torch.no_grad():
-        # Tracing warns that it makes the grid's size a constant: it is one.
-        warnings.simplefilter("ignore")
-        frozen = jit.freeze(jit.trace(net, (example,), check_trace=False))
-    return lambda x: frozen(x.contiguous(memory_format=torch.channels_last))

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
-from learn.data.grid import Scales, channels, divergence, membrane_code, turned
+from learn.data.grid import Scales, membrane_code
+from learn.network.channels import channels, divergence, turned
 from learn.settings import TrainingSettings
 from learn.training import error_transfer
 from learn.training.error_transfer import Transfer

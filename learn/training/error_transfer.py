@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from learn.data.grid import turned
+from learn.network.channels import turned
 
 IDEAL, TRANSFERRED, RECOVERED = 0.25, 0.25, 0.25
 FACTOR = 2.0  # largest factor of a transferred error, of either sign

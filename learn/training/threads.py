@@ -1,25 +1,32 @@
-"""CPU threads and the device of a training."""
+"""CPU threads, and the device of a training."""
 
 from __future__ import annotations
 
 import os
-
-import torch
+from typing import TYPE_CHECKING
 
 from synth.errors import UserError
 
+if TYPE_CHECKING:
+    import torch
 
-def set_threads(wanted: int | None = None) -> int:
-    """Sets and returns PyTorch's number of threads; default: half the cores, from 1 to 8.
+
+def choose_threads(wanted: int | None = None) -> int:
+    """The number of threads of a network; default: half the cores, from 1 to 8.
 
     Two threads on two busy cores wait for each other (measured: thirty seconds instead of half a second).
     """
     if wanted is not None and wanted < 1:
         raise UserError(f"threads {wanted}: must be at least 1")
     cores = len(os.sched_getaffinity(0))
-    count = wanted or min(max(cores // 2, 1), 8)
-    torch.set_num_threads(count)
-    return count
+    return wanted or min(max(cores // 2, 1), 8)
+
+
+def set_threads(wanted: int | None = None) -> None:
+    """Sets PyTorch's number of threads, as of `choose_threads`."""
+    import torch
+
+    torch.set_num_threads(choose_threads(wanted))
 
 
 def choose_device(accelerator: str) -> torch.device:
@@ -27,6 +34,8 @@ def choose_device(accelerator: str) -> torch.device:
 
     UserError: another name, or no GPU.
     """
+    import torch
+
     gpu = torch.cuda.is_available()
     if accelerator not in ("cpu", "cuda", "auto") or (accelerator == "cuda" and not gpu):
         why = "no GPU was found" if accelerator == "cuda" else "must be cpu, cuda or auto"

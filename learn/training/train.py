@@ -1,4 +1,4 @@
-"""Training with AdamW; every epoch is checkpointed, and a run resumes bit for bit."""
+"""Training with AdamW or in closed form; every epoch is checkpointed, and a run resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from learn.checkpoint import USED, ModelCard
 from learn.data.clips import RECOVERED, Clip, scored_source
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
+from learn.inference.convert import add_onnx
 from learn.loss import full, loss
-from learn.network.d2fnet import D2FNet
+from learn.network.registry import build, load_network
 from learn.settings import TrainingSettings, replace
 from learn.split import Split, find_unit, name_parts
 from learn.training.batches import Batch, FrameDataset, add_surface_motion, inputs, measure_scales
@@ -55,7 +56,8 @@ def train(
     CPU) of an uninterrupted run. `start`: a model whose weights and scales training starts from; what it was
     trained on is the card's part `start`. `report` is called after a batch, `log` with an epoch's numbers.
 
-    Returns the card of the stored epoch: the last with `cosine`, the best with `plateau`. Raises UserError if
+    The stored epoch, the last with `cosine`, the best with `plateau`, is also written as ONNX, by which it is
+    used. Returns its card. Raises UserError if
     `out` holds another run, on divergence, and for a `start` that `_begun` refuses.
     """
     fit, select = [clips[i] for i in split.fit], [clips[i] for i in split.select]
@@ -90,7 +92,9 @@ def train(
         if state is None and not (out / "last.pt").exists():
             shutil.rmtree(out)
         raise
-    return checkpoint.read_card(out)
+    if (card := checkpoint.read_card(out)).weights_hash and not card.onnx_hash:
+        card = add_onnx(out)
+    return card
 
 
 def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
@@ -99,10 +103,11 @@ def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
     UserError if that is of another architecture, grid or unit of the split, or was trained on brains of the
     select, interval or test part.
     """
-    shapes = {
-        (one.settings.arch.model_copy(update={"dropout": 0.0}), one.settings.grid) for one in (card, start)
-    }
-    if len(shapes) > 1:
+    shapes = [
+        (each.settings.network, each.settings.arch.model_dump(exclude={"dropout"}), each.settings.grid)
+        for each in (card, start)
+    ]
+    if shapes[0] != shapes[1]:
         raise UserError("start: a model of another architecture or grid")
     if find_unit(card) != find_unit(start):
         raise UserError("start: its data were split by another unit (anatomy, opening or sequence)")
@@ -157,7 +162,7 @@ def _start(
     """A new run, from the weights of `start` if given, or one continued from a state of `_Run.as_dict`."""
     settings = card.settings
     torch.manual_seed(settings.seed)
-    model = D2FNet(settings.arch)
+    model = build(settings.network, settings.arch)
     if start is not None:
         model.load_state_dict(start.state_dict())
     model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -188,30 +193,42 @@ def _epoch(
     torch.manual_seed(int(seed.generate_state(1)[0]))
     order = frames.order(np.random.default_rng(seed))
     batches = max(len(order) // settings.batch, 1)
-    net.train()
+    if (solve := load_network(settings.network).solve) is not None:
+        parts = (order[i * settings.batch : (i + 1) * settings.batch] for i in range(batches))
+        read = (_moved(frames.batch(part), settings, epoch, i) for i, part in enumerate(parts))
+        solve(net, ((inputs(each, settings, scales), each.target / scales.target) for each in read))
+    net.train(solve is None)
     total = torch.zeros((), device=frames.device)
     for i in range(batches):
-        batch = frames.batch(order[i * settings.batch : (i + 1) * settings.batch])
-        if settings.surface_motion_mm > 0:
-            draws = np.random.SeedSequence([settings.seed, epoch, i])
-            rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
-            batch = add_surface_motion(batch, settings, rng)
-        predicted = forward(net, batch, settings, scales)
+        part = order[i * settings.batch : (i + 1) * settings.batch]
+        batch = _moved(frames.batch(part), settings, epoch, i)
+        with torch.set_grad_enabled(solve is None):
+            predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
         about = settings.loss, scales.target, scales.spread, progress
         error = loss(predicted, batch.target, batch.mask, *about)
         if i % CHECK_EVERY == 0:
             _finite(float(error.detach()), epoch)
-        if settings.schedule == "cosine":
-            for group in optimizer.param_groups:
-                group["lr"] = settings.learning_rate * cosine(progress)
-        optimizer.zero_grad()
-        error.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(net.parameters(), CLIP)
-        optimizer.step()
+        if solve is None:
+            if settings.schedule == "cosine":
+                for group in optimizer.param_groups:
+                    group["lr"] = settings.learning_rate * cosine(progress)
+            optimizer.zero_grad()
+            error.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(net.parameters(), CLIP)
+            optimizer.step()
         total += error.detach()
         report(epoch * batches + i + 1, settings.epochs * batches)
     return {"loss": _finite(float(total) / batches, epoch)}
+
+
+def _moved(batch: Batch, settings: TrainingSettings, epoch: int, number: int) -> Batch:
+    """A batch of an epoch with the settings' motion of the surface."""
+    if settings.surface_motion_mm <= 0:
+        return batch
+    draws = np.random.SeedSequence([settings.seed, epoch, number])
+    rng = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
+    return add_surface_motion(batch, settings, rng)
 
 
 def _finite(value: float, epoch: int) -> float:

@@ -1,4 +1,4 @@
-"""Small networks in ONNX files, run by ONNX Runtime on one thread.
+"""Networks in ONNX files, run by ONNX Runtime, unless told otherwise on one thread.
 
 PyTorch trains them (`weights.networks`). To run them it takes longer, and to import more than the flow
 of a short sequence.
@@ -23,11 +23,15 @@ _ERRORS_ONLY = 3
 @cache
 def load(path: Path) -> onnxruntime.InferenceSession:
     """The network of a file. UserError: it can't be read."""
+    return open_network(checked_file.read_bytes(path, _LARGEST), str(path))
+
+
+def open_network(data: bytes, label: str, threads: int = 1) -> onnxruntime.InferenceSession:
+    """A network from a file's bytes, on so many threads. UserError that begins with `label`: it is none."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = _ERRORS_ONLY
-    data = checked_file.read_bytes(path, _LARGEST)
-    with as_user_error(f"{path}: not a network in ONNX"):
+    with as_user_error(f"{label}: not a network in ONNX"):
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
 
 

@@ -22,6 +22,7 @@ from synth.video.read import Picture, shrink_mask, shrink_picture
 
 DAMAGED = "damaged in the video's file"
 LEAST_COLUMNS = 320  # least width with `shrink` 0: the grids of the networks are no finer
+LIVE_COLUMNS = 160  # the same for streams: a network's grid has 64 to 128 cells
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,15 @@ class RecordingFlowSettings:
     backend: str | Estimator = "tvl1"
     """Flow estimator, or its name."""
     shrink: int = 0
-    """Factor by which pictures are downsampled for flow; 0: the largest that leaves `LEAST_COLUMNS`."""
+    """Factor by which pictures are downsampled for flow; 0: the largest that leaves `least_columns`."""
     rate_hz: float | None = 10.0
     """Largest number of frames tracked per second; None: all."""
     pulse: bool = True
     """Whether pulsation of the tissue by heart and breath is estimated and removed."""
     masks: str = "auto"
     """Which instruments and highlights are masked, one of `MASKS`."""
+    least_columns: int = LEAST_COLUMNS
+    """Least width of the downsampled pictures with `shrink` 0 [px]."""
 
     def __post_init__(self) -> None:
         """Raises UserError for an invalid rate, factor of downsampling or kind of masks."""
@@ -87,7 +90,7 @@ class Decoder:
         self.left_out = Counter[str]()  # number of frames that are not tracked, by reason
         self._pictures = self._decode()
         rest = self._find_rest()
-        self.rest = self._describe_rest(rest, settings.shrink)
+        self.rest = self._describe_rest(rest, settings.shrink, settings.least_columns)
         self.faults = VideoFaults(rest.rgb, self.rest.rgb, self.rest.tissue)
         self.first = self.process(rest)
 
@@ -161,9 +164,9 @@ class Decoder:
         self._due_s, self._last_s = due_s + self._period_s, time_s
         return ""
 
-    def _describe_rest(self, picture: Picture, shrink: int) -> RestFrame:
+    def _describe_rest(self, picture: Picture, shrink: int, least_columns: int) -> RestFrame:
         size = (picture.rgb.shape[0], picture.rgb.shape[1])
-        shrink = shrink or max(1, size[1] // LEAST_COLUMNS)
+        shrink = shrink or max(1, size[1] // least_columns)
         given, bars = self._footage.tissue, find_bars(picture.rgb)
         tissue, findings = np.ones(size, bool) if given is None else given(size), [*self._footage.findings]
         if given is not None and not findings and is_inside_out(tissue):

@@ -13,7 +13,7 @@ import resource
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context, parent_process
@@ -58,10 +58,8 @@ class FlowProcess(LocalFlow):
 
     ahead = 1
 
-    def __init__(self, set_up: Callable[[], object]) -> None:
-        """`set_up`: called in the process before anything else."""
-        spawn = get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin_process, initargs=(set_up,))
+    def __init__(self) -> None:
+        self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_begin_process)
         # The other process inherits the blocked SIGINT: on Ctrl-C this process closes it.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -83,20 +81,19 @@ class FlowProcess(LocalFlow):
 
 
 @contextlib.contextmanager
-def open_flow_process(set_up: Callable[[], object]) -> Iterator[FlowProcess | None]:
-    """A process for flow, which calls `set_up` first, closed at the end; None on a single core."""
+def open_flow_process() -> Iterator[FlowProcess | None]:
+    """A process for flow, closed at the end; None on a single core."""
     if len(os.sched_getaffinity(0)) < 2:
         yield None
         return
-    with contextlib.closing(FlowProcess(set_up)) as process:
+    with contextlib.closing(FlowProcess()) as process:
         yield process
 
 
 _flow = LocalFlow()  # of the other process, for one video at a time
 
 
-def _begin_process(set_up: Callable[[], object]) -> None:
-    set_up()
+def _begin_process() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

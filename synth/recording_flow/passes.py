@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from typing import Protocol
@@ -54,6 +55,10 @@ class Pace(Protocol):
 
     def spare_s(self, time_s: float) -> float:
         """Time until a frame arrives [s]."""
+
+    def free_s(self) -> float:
+        """Time [s] for which results are waited for before the next picture is asked for: 0 of a file, which
+        gives its pictures before they arrive."""
 
 
 class Stage(Protocol):
@@ -192,7 +197,7 @@ class VideoPass:
                 continue
             frame = self._prepare(picture, self._register)
             waiting.append((frame, self._flow.submit(frame.rgb, frame.hidden)))
-            if len(waiting) > self._flow.ahead:
+            if len(waiting) > self._flow.ahead or self._is_done(waiting[0][1]):
                 yield self._finish(self._with_flow(*waiting.popleft()))
         for one in waiting:
             yield self._finish(self._with_flow(*one))
@@ -221,6 +226,15 @@ class VideoPass:
         except TimeoutError:
             return False
         return True
+
+    def _is_done(self, flow: Future[FrameMotion]) -> bool:
+        """Whether a flow is ready before the next picture of a stream is expected, until when it waits."""
+        if self._pace is None or (free_s := self._pace.free_s()) <= 0:
+            return False
+        with suppress(TimeoutError):
+            flow.result(free_s)
+            return True
+        return False
 
     def _with_flow(self, frame: FrameMotion, flow: Future[FrameMotion]) -> FrameMotion:
         found = with_flow(frame, flow.result())

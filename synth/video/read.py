@@ -26,13 +26,9 @@ from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import LARGEST_PIXELS, refuse_large
 from synth.video.file_numbers import find_stills, number_files, still_times
+from synth.video.suffixes import SUFFIXES as SUFFIXES
 
 A = TypeVar("A", bound=np.generic)
-
-SUFFIXES = (
-    *(".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
-    *(".wmv", ".asf", ".flv", ".ogv", ".3gp"),
-)
 
 FPS = 25.0  # assumed if a video's times are unknown
 

@@ -7,7 +7,8 @@ import torch
 from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.grid import Scales
-from learn.network.d2fnet import D2FNet
+from learn.inference.convert import add_onnx
+from learn.network.registry import build
 from learn.settings import preset
 from synth.system.config_file import override
 
@@ -16,10 +17,11 @@ def write_model(folder: Path, *changes: str) -> Path:
     """Writes and returns the folder; `changes` as on the command line, e.g. `arch.output=vector`."""
     settings = override(preset("tiny"), ["size=32", "arch.levels=2", *changes])
     torch.manual_seed(0)
-    net = D2FNet(settings.arch).eval()
+    net = build("d2fnet", settings.arch).eval()
     with torch.no_grad():
         for conv in net.heads.ranges:
             conv.weight.normal_(0, 200.0)
     card = ModelCard(settings, Scales(1.0, 0.2, 1.0, 100.0, 0.3), 1.7, {}, {})
     checkpoint.write_model(folder, card, net.state_dict())
+    add_onnx(folder)
     return folder

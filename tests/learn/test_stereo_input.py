@@ -16,9 +16,10 @@ from learn.checkpoint import read_model
 from learn.cli import app
 from learn.data import clips as reading
 from learn.data.clips import Clip, load_clips
-from learn.data.grid import Grid, Scales, channels
+from learn.data.grid import Grid, Scales
 from learn.inference.export import export
 from learn.inference.predict import load_model
+from learn.network.channels import channels
 from learn.settings import TrainingSettings, preset, replace
 from learn.split import divide
 from learn.training.batches import MEMBRANE_HIDDEN, FrameDataset, FrameItem, inputs
@@ -129,4 +130,4 @@ def test_predict_eval_and_export(model: Path, data: Path, tmp_path: Path) -> Non
         assert found["force_mn"].shape == (6, 3)
     assert json.loads(run(app, "eval", model, data, "--all", "--json").stdout)["input"] == "motion"
     run(app, "eval", model, data, "--all", "--input", "recovered", code=2)
-    assert export(load_model(model), tmp_path / "net.onnx") < 1e-4
+    assert export(model, tmp_path / "net.onnx") < 1e-4

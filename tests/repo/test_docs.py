@@ -180,7 +180,7 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
     scripts = []
     for k, (title, text) in enumerate(blocks(page, "python")):
         packages = re.findall(r"^(?:from|import) (\w+)", text, re.M)
-        if all(map(importlib.util.find_spec, packages)):  # LeRobot's may not be there
+        if all(map(importlib.util.find_spec, packages)):
             scripts.append(Path(title or f"block{k}.py").name)
             (tmp_path / scripts[-1]).write_text(GIVEN.get(page.stem, "") + text)
     (tmp_path / "reader.py").write_text(READER)

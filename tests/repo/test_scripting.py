@@ -1,7 +1,9 @@
 """The packages as scripts use them: imports are light, public names exist, the notebook runs."""
 
+import ast
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_model import write_model
-from sources import ROOT
+from sources import ROOT, imported, parsed, sources
 
 import bench
 import learn
@@ -30,6 +32,9 @@ HEAVY = {"numpy", "pydantic", "torch", "mitsuba", "drjit", "scipy", "cv2", "zarr
         ("import synth, learn, bench", HEAVY),
         ("import synth; synth.Job()", {"mitsuba", "drjit", "torch", "zarr", "numba"}),
         ("import synth.sequence.pipeline, synth.recording_flow.flow", {"torch"}),
+        ("import synth.cli, learn.cli, bench.cli", {"torch", "numpy", "onnxruntime", "numba", "cv2"}),
+        ("import synth, bench.scoring.score, bench.checks.check_recording, bench.tracking.live", {"torch"}),
+        ("import synth, learn; learn.load_model('mono')", {"torch", "onnx"}),
     ],
 )
 def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> None:
@@ -37,6 +42,45 @@ def test_importing_loads_only_what_it_needs(program: str, light: set[str]) -> No
     found = subprocess.check_output([sys.executable, "-c", program], cwd=ROOT, text=True).split()
     assert "synth" in found
     assert not set(found) & light
+
+
+PREDICT = """
+import numpy as np
+from learn.cli import app
+shape = (2, 48, 64)
+np.savez("press.npz", flow=np.ones((*shape, 2)), tissue=np.ones(shape[1:]), scale_mm_per_px=0.5)
+app(["predict", "press.npz", "--out", "out"], standalone_mode=False)
+"""
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        PREDICT,
+        "from bench.cli import app; app(['score', '--help'], standalone_mode=False)",
+        "from bench.cli import app; app(['check', '.'], standalone_mode=False)",
+        pytest.param(
+            "from synth.cli import app; app(['preview', 'tiny', '-o', 'a.png'], standalone_mode=False)",
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["learn predict", "bench score --help", "bench check", "synth preview"],
+)
+def test_only_training_imports_pytorch(program: str, tmp_path: Path) -> None:
+    program = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules))\n" + program
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, env=environment)
+    assert done.stdout.decode().split()[-1] == "False", done.stderr.decode()
+    assert b"Traceback" not in done.stderr
+
+
+def test_pytorch_is_imported_by_training_and_conversion_alone() -> None:
+    """On import: functions that use the weights themselves import it when they are called."""
+    apart = ("learn/training/", "learn/network/", "learn/inference/convert.py")
+    for path in sources("synth", "learn", "bench"):
+        top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
+        if "torch" in {name.split(".")[0] for name in imported(ast.Module(top, []))}:
+            assert str(path.relative_to(ROOT)).startswith(apart)
 
 
 @pytest.mark.parametrize("package", [synth, learn, bench])

@@ -22,7 +22,7 @@ CALLS: dict[Any, tuple[Any, ...]] = {
     synth.write_scene: ({"scene": None, "folder": "out"}, "scene"),
     synth.open_sequence: ({}, "path"),
     synth.TorchDataset: ({"root": ".", "fields": ["rgb"]}, "root", "fields"),
-    learn.load_model: ({"name": "mono"}, "name", "device"),
+    learn.load_model: ({"name": "mono"}, "name", "threads"),
     learn.predict: ({"source": "video.mp4"}, "model", "membrane", "flow"),
     bench.score: ({"recording": "here"}, "recording", "model", "settings", "out"),
 }

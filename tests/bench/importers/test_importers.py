@@ -1,6 +1,6 @@
 """Importers return the frames, times and forces that each format's own library wrote."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bench.cli import app
 from bench.importers import registry
+from bench.importers.formats import IMPORTERS
 from bench.recording.folder import open_recording
 from synth.errors import UserError
 from tests.bench.importers.test_stereo_bag import writing
@@ -114,6 +115,22 @@ def test_unreadable_sources_are_refused(
 ) -> None:
     with pytest.raises(UserError):
         registry.read_source(make(tmp_path / name), use)
+
+
+def test_a_format_of_another_package_is_read_by_its_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(IMPORTERS, "_added", {})
+    pictures = [np.full((16, 20, 3), 10 * k, np.uint8) for k in range(3)]
+
+    def read_xyz(source: Path, use: Mapping[str, str]) -> object:
+        return registry.Intake(np.arange(3) / 25, lambda: iter(pictures)) if not use else None
+
+    IMPORTERS.add("xyz", read_xyz)
+    found = registry.read_source(write_nonsense(tmp_path / "a.XYZ"))
+    np.testing.assert_array_equal(np.stack(list(found.pictures())), pictures)
+    with pytest.raises(UserError, match="xyz"):
+        registry.read_source(tmp_path / "a.XYZ", {"force": "b"})
 
 
 def test_truncated_sequence_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Streams: the same forces as scoring, with flow in this or another process, each as soon as it is ready."""
 
 import json
+import time
+from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
@@ -20,9 +22,8 @@ from bench.recording.folder import open_recording
 from bench.recording.writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
-from learn.training.threads import set_threads
 from synth.arrays import Mask, Pixels
-from synth.recording_flow.decode import Footage, RecordingFlowSettings
+from synth.recording_flow.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess, LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.passes import VideoPass
@@ -43,7 +44,7 @@ def test_flow_in_another_process_gives_the_same_results_in_order() -> None:
         return results
 
     here = watched(None)
-    with closing(FlowProcess(set_threads)) as process:
+    with closing(FlowProcess()) as process:
         there = watched(process)
     assert [one.index for one in there] == [one.index for one in here] == [1, 2, 3, 4]
     assert [one.largest_px for one in there] == [one.largest_px for one in here]
@@ -79,7 +80,7 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
             slow.set_result(super().submit(rgb, masked).result())
             return slow
 
-    clock = Mock(spare_s=lambda time_s: 0.04)
+    clock = Mock(spare_s=lambda time_s: 0.04, free_s=lambda: 0.0)
     clock.is_due = lambda index, time_s: log.append(f"due {index}") is None
     settings = RecordingFlowSettings("dis", 1, rate_hz=None, pulse=False, masks="none")
     footage = Footage(lambda: pictures(4), "test")
@@ -87,6 +88,55 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
         if not frame.is_rest:
             log.append(f"out {frame.index}")
     assert log == expected
+
+
+class FakeCamera:
+    """Gives some of its pictures, as if the others had arrived meanwhile; its period is long past."""
+
+    period_s = 1e-6
+
+    def __init__(self, numbers: tuple[int, ...]) -> None:
+        self.numbers = numbers
+
+    def pictures(self) -> Iterator[Picture]:
+        for k in self.numbers:
+            yield Picture(k, time.perf_counter(), np.roll(texture(64, 80), k, axis=1))
+
+
+def test_a_camera_is_followed_and_what_it_left_out_is_counted() -> None:
+    settings = RecordingFlowSettings("dis", 1, None, False, "none")
+
+    def watch(camera: FakeCamera, seconds: float = np.inf) -> live.Stream:
+        footage = Footage(camera.pictures, "0")
+        return live.stream_video(footage, settings, camera=camera, seconds=seconds)  # type: ignore[arg-type]
+
+    stream = watch(FakeCamera((0, 7, 8, 11)))  # 1 to 6 arrive while the stream is prepared
+    assert ([frame.index for frame in stream.frames], stream.dropped) == ([7, 8, 11], 2)
+    assert min(frame.latency_s for frame in stream.frames) > 0
+    assert len(watch(FakeCamera((0, 1, 2, 3)), seconds=0.0).frames) == 1
+
+
+def test_ctrl_c_ends_a_camera_with_what_was_measured() -> None:
+    class Stopped(FakeCamera):
+        def pictures(self) -> Iterator[Picture]:
+            yield from super().pictures()
+            raise KeyboardInterrupt
+
+    settings, camera = RecordingFlowSettings("dis", 1, None, False, "none"), Stopped((0, 1, 2))
+    stream = live.stream_video(Footage(camera.pictures, "0"), settings, camera=camera)  # type: ignore[arg-type]
+    assert stream.summary()["frames"] == 2
+
+
+@pytest.mark.parametrize("words", [["0", "--every"], ["a.mp4", "--seconds", "5"]])
+def test_options_that_do_not_fit_the_source_are_refused(words: list[str]) -> None:
+    assert words[0] in run(app, "live", *words, code=2).stderr
+
+
+def test_pictures_of_a_stream_are_shrunk_to_what_a_network_needs() -> None:
+    wide = [Picture(k, k / 25, np.roll(texture(240, 330), k, axis=1)) for k in range(2)]
+    settings = RecordingFlowSettings("dis", 0, None, False, "none", LIVE_COLUMNS)
+    stream = live.stream_video(Footage(lambda: wide, "video"), settings, paced=False)
+    assert stream.size == (120, 165)
 
 
 @pytest.mark.slow

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from learn.data.grid import CHANNELS, Grid, GridView, Scales, channels, divergence, settled, turned
+from learn.data.grid import CHANNELS, Grid, GridView, Scales, settled
+from learn.network.channels import channels, divergence, turned
 
 GRID = Grid(64, 36.0)
 

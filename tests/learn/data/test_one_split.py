@@ -25,7 +25,7 @@ from synth.dataset.folder import claim
 from synth.dataset.split import DatasetSplit
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish.export.registry import FORMATS, export_dataset
+from synth.publish.export.registry import EXPORTERS, export_dataset
 
 BASE, SCALES = preset("tiny", size=32), Scales(1.0, 0.2, 1.0, 100.0, 0.3)
 
@@ -48,14 +48,14 @@ def divided(*datasets: Path) -> tuple[ModelCard, partition.Split]:
     return ModelCard(BASE, SCALES, 1.7, *named, [*parts.hashes]), parts
 
 
-WITH_SIDES = ("hf", "lerobot", "webdataset")
+WITH_SIDES = ("hf", "webdataset")
 """Formats that state the side of a sequence beside split.csv."""
 
 
 def exported(dataset: Path, target: Path, every: bool) -> dict[str, dict[int, str]]:
     """The side of every sequence by its index, in each export, or in those `WITH_SIDES`."""
     # Phantoms have no camera, no mechanics.
-    formats = sorted(FORMATS.keys() - {"endonerf", "vtu"}) if every else WITH_SIDES
+    formats = sorted({*EXPORTERS.names()} - {"endonerf", "vtu"}) if every else WITH_SIDES
     for to in formats:
         export_dataset(dataset, target / to, to)
     tables = [csv.reader((target / to / "split.csv").read_text().splitlines()[1:]) for to in formats]
@@ -65,9 +65,6 @@ def exported(dataset: Path, target: Path, every: bool) -> dict[str, dict[int, st
     for one in (target / "webdataset").glob("*.tar"):
         with tarfile.open(one) as archive:
             shards |= {int(name[:6]): one.name.split("-")[0] for name in archive.getnames()}
-    ranges = json.loads((target / "lerobot/meta/info.json").read_text())["splits"]
-    for side, (first, last) in ((side, text.split(":")) for side, text in ranges.items()):
-        assert int(last) - int(first) == list(hf.values()).count(side)
     listed = {to: {int(k): side for k, side in rows} for to, rows in zip(formats, tables, strict=True)}
     return {f"split.csv of {to}": sides for to, sides in listed.items()} | {"hf": hf, "webdataset": shards}
 

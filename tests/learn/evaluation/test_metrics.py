@@ -14,7 +14,7 @@ from learn.data.clips import Clip
 from learn.evaluation.evaluate import EvaluationReport, score
 from learn.evaluation.metrics import agreement, contact_mm, moments
 from learn.evaluation.statistics import over_groups, pooled_r2
-from learn.network.d2fnet import Architecture
+from learn.network.shape import Architecture
 from learn.settings import TrainingSettings
 from learn.training.batches import measure_scales
 

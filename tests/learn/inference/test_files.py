@@ -24,7 +24,8 @@ from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView, to_image
 from learn.inference import prediction_file
 from learn.inference.apply import apply, stiffness
-from learn.inference.export import examples, export
+from learn.inference.convert import examples
+from learn.inference.export import export
 from learn.inference.motion import motions
 from learn.inference.predict import load_model
 from learn.settings import preset
@@ -60,7 +61,7 @@ def test_an_exported_model_predicts_the_same_force_with_its_gain(
     before, after = (one.density(inputs[0].numpy(), inputs[1][0, 0].numpy(), 1.0) for one in (plain, gained))
     np.testing.assert_allclose(after, 1.25 * before, rtol=1e-5)
     assert np.abs(before).max() > 0.05 * plain.card.scales.target, "else the comparison proves nothing"
-    assert export(gained, tmp_path / "net") <= 1e-4
+    assert export(folder, tmp_path / "net") <= 1e-4
     note = json.loads((tmp_path / "net.json").read_text())
     assert note["inputs"][:2] == ["displacement", "mask"]
     assert note["grid"]["pitch_mm"] == 36 / 32
@@ -73,9 +74,9 @@ def test_an_exported_model_predicts_the_same_force_with_its_gain(
     density = gained.density(moved, np.ones((32, 32), np.float32), plain.card.typical_young_kpa, sure)
     force = (36 / 32) ** 2 * density[0].sum(axis=(1, 2))
     np.testing.assert_allclose(ran["force_mn"], force, rtol=1e-3, atol=1e-4)
-    monkeypatch.setattr("learn.inference.export.TOLERANCE", -1.0)
+    monkeypatch.setattr("learn.inference.convert.TOLERANCE", -1.0)
     with pytest.raises(UserError):
-        export(gained, tmp_path / "refused")
+        export(folder, tmp_path / "refused")
     assert not list(tmp_path.glob("refused*"))
 
 

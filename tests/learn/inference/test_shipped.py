@@ -18,6 +18,8 @@ from synth.flow.estimator import name_motion
 from synth.system.checked_file import folder_bytes
 from weights.pack import LARGEST_BYTES, pack_model
 
+FILES = ("README.md", "config.json", "network.onnx", "weights.safetensors")
+
 
 @pytest.fixture
 def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -37,7 +39,7 @@ def pack(models: Path, name: str, *changes: str) -> Path:
 def test_a_packed_model_is_equal(models: Path) -> None:
     folder = pack(models, "mono", "arch.output=vector")
     pack(models, "stereo")
-    assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "weights.safetensors"}
+    assert {path.name for path in folder.iterdir()} == set(FILES)
     both = (models.parent / "trained-mono", folder)
     before, after = (checkpoint.read_model(one)[0].state_dict() for one in both)
     assert before.keys() == after.keys()
@@ -60,7 +62,8 @@ def test_the_pretrained_networks_predict_the_same_as_before(name: str, force: li
 @pytest.mark.parametrize("name", shipped.NAMES)
 def test_pretrained_networks_are_small_complete_and_documented(name: str) -> None:
     folder, card = shipped.MODELS / name, learn.load_model(name).card
-    assert folder_bytes(folder) <= LARGEST_BYTES == 4_000_000
+    assert {file.name for file in folder.iterdir()} == set(FILES)
+    assert max(file.stat().st_size for file in folder.iterdir()) <= LARGEST_BYTES == 4_000_000
     assert card.settings.arch.depth == (name == "stereo")
     for motion, doubts in ((["tvl1 0"], 1), ([], 1), ([name_motion("tvl1")], 0)):
         assert len(replace(card, motion=motion).doubt(name_motion("tvl1"))) == doubts

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from learn.data.clips import Clip
-from learn.data.grid import certainty, turned
+from learn.data.grid import certainty
+from learn.network.channels import turned
 from learn.settings import preset
 from learn.training.batches import FrameDataset
 from learn.training.error_transfer import Transfer, restated, transfer

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torchmetrics
 
-from learn.loss import Loss, loss, unexplained
+from learn.loss import loss, unexplained
 
 
 def maps(*values: float) -> torch.Tensor:
@@ -30,7 +30,7 @@ SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
         ("off-target", 0.5 * SQUARED, 0.5 * R2, 8 * 0.4 / 3 / 2.0),
     ],
 )
-def test_terms_by_hand(kind: Loss, error: float, r2: float, off_target: float) -> None:
+def test_terms_by_hand(kind: str, error: float, r2: float, off_target: float) -> None:
     found = float(loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0))
     assert found == pytest.approx(error + r2 + off_target, rel=1e-5)
     assert torch.isfinite(loss(PREDICTED, 0 * TRUE, MASK, kind, 4.0, 2.0)), "a batch at rest"

@@ -7,10 +7,8 @@ import tarfile
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from command import run
@@ -27,7 +25,7 @@ from synth.job.schema import Job
 from synth.publish import sequence_video
 from synth.publish.export import endonerf, hugging_face
 from synth.publish.export.encoding import write_exr
-from synth.publish.export.registry import export_dataset
+from synth.publish.export.registry import EXPORTERS, export_dataset
 from synth.render.camera.camera import Camera, project, rays
 
 
@@ -264,30 +262,28 @@ def test_webdataset_gives_arrays_as_arrays(root: Path, tmp_path: Path) -> None:
     gc.collect()
 
 
+def test_a_format_of_another_package_writes_and_its_faults_name_it(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(EXPORTERS, "_added", {})
+
+    def write_curves(dataset: Dataset, target: Path) -> None:
+        for sequence in dataset:
+            np.savetxt(target / f"{sequence.index}.csv", sequence["force"][:])
+
+    EXPORTERS.add("curves", write_curves)
+    assert export_dataset(root, tmp_path / "to", "curves") == len(Dataset(root))
+    assert np.loadtxt(tmp_path / "to/1.csv") == pytest.approx(by_index(root)[1]["force"][:])
+    assert (tmp_path / "to/split.csv").exists()
+
+    EXPORTERS.add("broken", lambda dataset, target: 1 / 0)
+    with pytest.raises(UserError, match="broken"):
+        export_dataset(root, tmp_path / "other", "broken")
+    assert not (tmp_path / "other").exists()
+
+
 def drawn(*words: Any) -> np.ndarray:
     return np.stack(list(sequence_video.draw_video(*words)))
-
-
-def test_lerobot_files_follow_its_format(root: Path, tmp_path: Path) -> None:
-    export_dataset(root, tmp_path / "to", "lerobot")
-    info = json.loads((tmp_path / "to/meta/info.json").read_text())
-    assert info["codebase_version"] == "v3.0"
-    rows = pq.read_table(tmp_path / "to/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    values = pq.read_table(tmp_path / "to/data/chunk-000/file-000.parquet").to_pylist()
-    stores, on = by_index(root), sides(root)
-    order = [k for side in split.SIDES for k in sorted(on[side])]
-    assert info["splits"] == {"train": "0:3", "validation": "3:5", "test": "5:6"}
-    for row in values:
-        sequence = stores[order[row["episode_index"]]]
-        assert row["force"] == pytest.approx(sequence["force"][row["frame_index"]], rel=1e-6)
-    assert [row["dataset_to_index"] for row in rows] == [3, 6, 9, 12, 15, 18]
-    for row in rows:
-        for key in ("observation.images.left", "observation.images.right"):
-            place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            with av.open(tmp_path / "to" / info["video_path"].format(video_key=key, **place)) as video:
-                frames = list(video.decode(video=0))
-                assert [frame.time for frame in frames] == pytest.approx(np.arange(3) / info["fps"])
-                assert [*frames[0].to_ndarray(format="rgb24").shape] == info["features"][key]["shape"]
 
 
 def moving(out: Path, job: Job) -> list[Camera]:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from fake_recording import texture
 
-from learn.training.threads import set_threads
 from synth.errors import UserError
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess
@@ -23,7 +22,7 @@ from synth.video.read import Picture
 def test_errors_and_the_end_of_the_process_are_reported() -> None:
     rest = texture(64, 80)
     moved, free = np.roll(rest, 2, axis=1), np.zeros((64, 80), bool)
-    with closing(FlowProcess(set_threads)) as elsewhere:
+    with closing(FlowProcess()) as elsewhere:
         with pytest.raises(UserError, match="no estimator"):
             elsewhere.begin("nonesuch", rest, free, ~free)
         elsewhere.begin("dis", rest, free, ~free)
@@ -44,7 +43,7 @@ def test_errors_and_the_end_of_the_process_are_reported() -> None:
 @pytest.mark.slow
 def test_the_process_ends_when_its_parent_is_killed() -> None:
     script = (
-        "import os, time; from synth.recording_flow.flow import FlowProcess; flow = FlowProcess(int);"
+        "import os, time; from synth.recording_flow.flow import FlowProcess; flow = FlowProcess();"
         "print(flow._pool.submit(os.getpid).result(), flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:

@@ -126,7 +126,7 @@ def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path
     assert not {"force", "traction"} & set(sequence.fields)
     assert sequence.attrs["young_kpa"] is None
     assert "peak_force_mn" not in sequence.attrs["summary"]
-    for form, works in (("folder", 0), ("video", 0), ("endonerf", 0), ("lerobot", 2), ("d2fnet-npz", 2)):
+    for form, works in (("folder", 0), ("video", 0), ("endonerf", 0), ("d2fnet-npz", 2)):
         run(app, "export", tmp_path / "a", tmp_path / form, "--to", form, code=works)
     assert np.isnan(synth.simulate(job_of(source), 0).force).all()
 
