@@ -16,8 +16,8 @@ from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
 from synth.recording_flow import stereo
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.passes import VideoPass
 from synth.recording_flow.stereo import RightCamera
+from synth.recording_flow.video_pass import VideoPass
 
 _SAME = 0.2  # share of the left picture's change below which the right picture is frozen
 _COPY = 0.03  # share of the picture's detail: the noise of two cameras differs by more

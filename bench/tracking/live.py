@@ -17,7 +17,7 @@ from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, problems
 from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.passes import Pace, VideoPass
+from synth.recording_flow.video_pass import Pace, VideoPass
 from synth.video.pixel_scale import StatedScale, pixel_mm
 
 

@@ -25,8 +25,9 @@ from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
-from synth.recording_flow.passes import VideoPass, passes
 from synth.recording_flow.pulse import SurfaceMotion
+from synth.recording_flow.video_pass import VideoPass
+from synth.recording_flow.video_track import FrameWatcher, VideoTrack, track_video
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
@@ -101,16 +102,24 @@ def track_recording(
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
     footage, free_s = replace(as_footage(recording, scale_mm_per_px), only=only), about.pulse.free_s
-    for video in passes(footage, settings, free_s, flow=flow, watch=watch, progress=progress):
+    pictures: list[RightPictures] = []  # of both cameras, of the last pass
+
+    def watch_frames(video: VideoPass) -> FrameWatcher:
+        pictures[:] = [RightPictures(video)]
+        return pictures[0].add
+
+    with track_video(
+        footage, settings, free_s, flow=flow, watch=watch, progress=progress, watch_frames=watch_frames
+    ) as track:
+        video = track.video
         mm_per_px = scale_mm_per_px * video.rest.shrink
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
         scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
         forces = _Forces(methods, pictured, watch, video.rest, scene)
-        pictures, turning = RightPictures(video), SurfaceMotion(video.rest.tissue)
+        turning = SurfaceMotion(video.rest.tissue)
         free = ContactFreeSearch(video.rest.tissue, mm_per_px)
-        for frame in video.frames():
+        for frame in track.frames():
             each(frame)
-            pictures.add(frame)
             if frame.time_s is not None:
                 forces.add(frame, frame.time_s)
                 free.add(frame, frame.time_s)
@@ -118,29 +127,30 @@ def track_recording(
                     turning.add(frame.time_s, frame.flow, frame.confidence)
     if not forces.out.time_s:
         raise UserError(f"{recording.folder}: no frame has a time; give frames.csv, or fps in meta.yaml")
-    found_s = free.find()  # of the last pass
+    found_s = free.find()
     forces.finish(recording, found_s)
     out = forces.out
-    out.stereo, out.turning = pictures.quality, turning if turning.time_s else None
+    out.stereo, out.turning = pictures[0].quality, turning if turning.time_s else None
     out.scale_mm_per_px = scale_mm_per_px
-    _describe(out, video, recording, methods, pictured)
+    _describe(out, track, recording, methods, pictured)
     if found_s:
         spans = ", ".join(f"{a:.2f}–{b:.2f}" for a, b in found_s)
         out.notes.append(f"no contact is assumed in {spans} s, where no instrument is over the tissue")
-    out.timings |= watch.report()  # of all passes
+    out.timings |= watch.report()
     return out
 
 
 def _describe(
     out: TrackedRecording,
-    video: VideoPass,
+    track: VideoTrack,
     recording: Recording,
     methods: Mapping[str, Method],
     pictured: str,
 ) -> None:
     """Adds summary, findings and notes after the last frame."""
+    video = track.video
     decoder = video.decoder
-    out.summary, out.size, out.notes = video.summary, video.rest.size, video.notes
+    out.summary, out.size, out.notes = video.summary, video.rest.size, track.notes
     out.findings, out.decoded, out.rest_s = [*video.findings], decoder.decoded, video.rest.time_s
     out.repeats, mm_per_px = decoder.faults.repeats(), out.scale_mm_per_px * video.rest.shrink
     if recording.masks:
@@ -160,7 +170,7 @@ def _describe(
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
         out.notes.append(out.stereo.describe())
-    if (removed := video.removed) is not None:
+    if (removed := track.removed) is not None:
         out.notes.append(removed.describe(mm_per_px))
         out.pulse = [
             {"rate_hz": rhythm.rate_hz, "amplitude_mm": mm_per_px * size}

@@ -11,7 +11,7 @@ from evidence.flow.scenes import Frame, Recipe, recipes, video
 from evidence.study import Study
 from synth.arrays import Array, Mask
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.video_pass import VideoPass
 from synth.video.read import Picture
 
 _MASKS = ("auto", "none")

@@ -103,13 +103,12 @@ def apply(
     """
     young = young_kpa if young_kpa is not None else motion.young_kpa
     young = young if motion.scale_known else None
-    for one in motion.passes:  # the last one counts
-        estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
-        rows, found = [], list[FrameForce]()
-        for frame in one.frames:
-            rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
-            found.append(estimator.estimate(frame))
-    findings = problems([*judge_young(young), *one.findings()])
+    estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
+    rows, found = [], list[FrameForce]()
+    for frame in motion.frames():
+        rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
+        found.append(estimator.estimate(frame))
+    findings = problems([*judge_young(young), *motion.findings])
     fault = first_fault(findings)
     numbers, times, followed = map(np.array, zip(*rows, strict=True))
     trusted = followed & (not fault)
@@ -136,7 +135,7 @@ def apply(
         out["force_mn"] = force
     doubt = predictor.card.doubt(motion.recovered_by)
     warned = [finding.message for finding in findings if finding.severity == "warning"]
-    notes = [*doubt, *warned, *one.notes(), *estimator.notes]
+    notes = [*doubt, *warned, *motion.notes, *estimator.notes]
     if motion.scale_known:
         notes += estimator.interval_notes
         out |= _ends(found, trusted)
@@ -167,8 +166,8 @@ def calibrate(predictor: Predictor, press: Motion) -> float:
     if press.force_mn is None:
         raise UserError(f"{press.name}: needs a known force (force_mn in an .npz)")
     view = GridView(press.tissue, press.scale_mm_per_px, predictor.grid)
-    frames = next(press.passes).frames
-    inputs = [predictor.on_grid(view, one.flow, one.confidence, one.motion) for one in frames]
+    frames = press.frames()
+    inputs = [predictor.on_grid(view, frame.flow, frame.confidence, frame.motion) for frame in frames]
     displacement, confidence = (np.stack([*part]) for part in zip(*inputs, strict=True))  # a frame has both
     return stiffness(predictor, displacement, view.mask, press.force_mn, confidence)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from synth.flow.stereo.track import Moved
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.finding import Finding, judge_scale
 from synth.recording_flow.frame_motion import FrameMotion, Size
-from synth.recording_flow.passes import VideoPass, passes
+from synth.recording_flow.video_track import track_video
 from synth.system import checked_file
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
@@ -28,27 +28,19 @@ from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
 
 
 @dataclass(frozen=True)
-class MotionPass:
-    """The frames of one pass over a video, in order and to the end, and what was found in them."""
-
-    frames: Iterator[FrameMotion]
-    notes: Callable[[], list[str]] = list  # after the last frame, as the next
-    findings: Callable[[], list[Finding]] = list
-
-
-@dataclass(frozen=True)
 class Motion:
     """Motion of one video."""
 
     name: str
-    # One pass, or for a video with heartbeat and breathing a second one without them: the last one counts.
-    passes: Iterator[MotionPass]
+    frames: Callable[[], Iterator[FrameMotion]]  # in order; may be called again
     tissue: Mask  # (H, W) in the rest frame
     scale_mm_per_px: float
     young_kpa: float | None
     force_mn: Floats | None = None  # (T,) size of the true force, if known
     shrink: int = 1  # factor by which pictures were shrunk before flow
     recovered_by: str = ""  # estimator and version of recovered motion; empty if unknown
+    notes: tuple[str, ...] = ()  # on the processing
+    findings: tuple[Finding, ...] = ()
     scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
 
 
@@ -114,7 +106,7 @@ def _stored(sequence: Sequence, source: str) -> Motion:
 
     return Motion(
         name=sequence.path.stem,
-        passes=iter([MotionPass(frames())]),
+        frames=frames,
         tissue=tissue.astype(bool),
         scale_mm_per_px=scale,
         young_kpa=sequence.attrs["young_kpa"],
@@ -146,28 +138,21 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     elif options.tool is not None:
         tool = partial(_mask, "masks", options.tool)
     footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool)
-    every = passes(footage, options.settings)
-    first = next(every)
-    rest = first.rest
+    track = track_video(footage, options.settings)
+    rest, findings = track.video.rest, track.video.findings
     scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
-
-    def described(one: VideoPass) -> MotionPass:
-        def notes() -> list[str]:
-            removed = [] if one.removed is None else [one.removed.describe(scale * rest.shrink)]
-            missing = [found.message for found in one.findings if found.severity == "missing"]
-            return [*taken, *one.notes, *removed, *missing]
-
-        frames = (replace(frame, time_s=frame.time_s or 0.0) for frame in one.frames())
-        return MotionPass(frames, notes, lambda: [*judge_scale(scale, rest.size[1]), *one.findings])
-
+    removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
+    missing = [found.message for found in findings if found.severity == "missing"]
     return Motion(
         name=path.stem,
-        passes=map(described, chain([first], every)),
+        frames=lambda: (replace(frame, time_s=frame.time_s or 0.0) for frame in track.frames()),
         tissue=rest.tissue,
         scale_mm_per_px=scale * rest.shrink,
         young_kpa=None,
         recovered_by=name_motion(options.settings.backend),
         shrink=rest.shrink,
+        notes=(*taken, *track.notes, *removed, *missing),
+        findings=(*judge_scale(scale, rest.size[1]), *findings),
         scale_known=scale_known,
     )
 
@@ -212,7 +197,7 @@ def _arrays(path: Path) -> Motion:
 
     return Motion(
         name=path.stem,
-        passes=iter([MotionPass(frames())]),
+        frames=frames,
         tissue=tissue,
         scale_mm_per_px=scale,
         young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,

@@ -58,7 +58,7 @@ class Footage:
 
     pictures: Callable[[], Iterable[Picture]]  # all frames in order, the same in every pass
     name: str  # for messages
-    # (H, W) tissue mask of the rest frame; None: `passes` finds it, a single pass takes the whole picture.
+    # (H, W) tissue mask of the rest frame; None: `track_video` finds it, one pass takes the whole picture.
     tissue: Callable[[Size], Mask] | None = None
     # (H, W) instrument mask of a frame, None: empty; if the function is None, instruments are detected.
     tool: Callable[[int, Size], Mask | None] | None = None
@@ -78,7 +78,7 @@ class Decoder:
         watch: Stopwatch,
         progress: Callable[[int], None],
     ) -> None:
-        """Decodes the video up to its rest frame; arguments as for `passes`.
+        """Decodes the video up to its rest frame; arguments as for `VideoPass`.
 
         Raises UserError: unreadable video, no rest frame in it, or a tissue mask without tissue.
         """

@@ -26,7 +26,7 @@ from synth.arrays import Mask, Pixels
 from synth.recording_flow.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess, LocalFlow
 from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.video_pass import VideoPass
 from synth.video.read import Picture, read_video
 
 

@@ -34,7 +34,7 @@ from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.video_pass import VideoPass
 from synth.system.checked_file import write_picture
 from synth.system.config_file import override
 from synth.video.pixel_scale import UNKNOWN_NOTE

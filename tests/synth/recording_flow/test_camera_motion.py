@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from synth.flow.confidence import add_deviation, deviation, of_deviation
 from synth.recording_flow.camera_motion import CameraTracker
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.video_pass import VideoPass
 from synth.video.read import Picture
 
 HEIGHT, WIDTH = 120, 160

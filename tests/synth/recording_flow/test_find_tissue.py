@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.find_tissue import touches_border
-from synth.recording_flow.passes import passes
+from synth.recording_flow.video_track import track_video
 from synth.video.read import Picture
 from tests.synth.recording_flow.test_camera_motion import EVERYWHERE, OPENING, X, Y, texture
 
@@ -42,7 +42,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_tissue_is_found(case: str) -> None:
-    *_, last = passes(video(*CASES[case]), SETTINGS)
+    last = track_video(video(*CASES[case]), SETTINGS).video
     truth, severity = CASES[case][0], "warning" if case == "gentle contact" else "missing"
     tissue = last.rest.tissue
     assert (tissue & truth).sum() / (tissue | truth).sum() > 0.9

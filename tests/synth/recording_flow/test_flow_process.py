@@ -14,7 +14,7 @@ from fake_recording import texture
 from synth.errors import UserError
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
 from synth.recording_flow.flow import FlowProcess
-from synth.recording_flow.passes import VideoPass
+from synth.recording_flow.video_pass import VideoPass
 from synth.video.read import Picture
 
 

@@ -1,16 +1,23 @@
 """Camera motion where tissue fills the picture, separated from contacts and pulsation of analytic motion."""
 
 from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from synth.arrays import Mask, Pixels
+from synth.flow.stereo.track import Moved
 from synth.recording_flow.camera_motion import CameraPath, Similarity, SimilarityBasis
 from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.passes import VideoPass, passes
+from synth.recording_flow.flow import LocalFlow
+from synth.recording_flow.frame_motion import FrameMotion
 from synth.recording_flow.pulse import SurfaceMotion
 from synth.recording_flow.shared_motion import SharedMotion, find_path
+from synth.recording_flow.video_pass import VideoPass
+from synth.recording_flow.video_track import FrameFile, track_video
 from synth.video.read import Picture
 from tests.synth.recording_flow.test_camera_motion import EVERYWHERE, HEIGHT, WIDTH, X, Y, moved, texture
 
@@ -118,13 +125,62 @@ def test_pulsation_is_not_taken_for_camera_motion() -> None:
     assert found.pulse.rhythms[0].rate_hz == pytest.approx(0.9, abs=0.03)
 
 
-def test_the_bump_of_a_recording_is_removed_in_the_second_pass() -> None:
+def test_the_bump_of_a_recording_is_removed_in_a_second_pass() -> None:
     shift = np.where(np.arange(12) > 4, 5.0, 0.0)
-    found = []
-    for video in passes(footage(shift), SETTINGS):
-        last = [np.median(one.flow, axis=(0, 1))[1] for one in video.frames()]
-        found.append((last, [one.cause for one in video.findings].count("camera")))
-    (first, unreported), (second, reported) = found
-    assert first[-1] == pytest.approx(5, abs=0.1)
-    assert np.abs(second).max() < 0.05
-    assert (unreported, reported) == (0, 1)
+    passes: list[tuple[VideoPass, list[float]]] = []
+
+    def watch(video: VideoPass) -> Callable[[FrameMotion], None]:
+        passes.append((video, []))
+        return lambda frame: passes[-1][1].append(float(np.median(frame.flow, axis=(0, 1))[1]))
+
+    with track_video(footage(shift), SETTINGS, watch_frames=watch) as track:
+        kept = [np.median(frame.flow, axis=(0, 1))[1] for frame in track.frames()]
+    (first, before), (second, after) = passes
+    assert before[-1] == pytest.approx(5, abs=0.1)
+    assert np.abs(after).max() < 0.05
+    np.testing.assert_allclose(kept, after, atol=1e-3)
+    assert [[one.cause for one in video.findings].count("camera") for video in (first, second)] == [0, 1]
+    assert track.video is second
+
+
+def test_a_pulsating_video_is_decoded_and_its_flow_computed_once() -> None:
+    time_s = np.arange(70) / 10
+    pulse = 1.5 * np.sin(2 * np.pi * 0.9 * time_s)
+    decoded, solved = [], []
+
+    class Counting(LocalFlow):
+        def submit(self, rgb: Pixels, masked: Mask) -> Future[FrameMotion]:
+            solved.append(len(solved))
+            return super().submit(rgb, masked)
+
+    tissue = replace(footage(pulse), tissue=lambda size: np.ones(size, bool))
+    with track_video(tissue, SETTINGS, flow=Counting(), progress=decoded.append) as track:
+        left = [np.median(frame.flow, axis=(0, 1))[1] for frame in track.frames()]
+        again = [np.median(frame.flow, axis=(0, 1))[1] for frame in track.frames()]
+    assert track.removed is not None
+    assert decoded == list(range(1, 71))
+    assert len(solved) == 69
+    assert np.abs(left).max() < 0.15
+    assert left == again
+
+
+def test_frames_are_kept_within_the_rounding_that_is_stated() -> None:
+    rng = np.random.default_rng(0)
+    flow = rng.normal(scale=30, size=(40, 60, 2)).astype(np.float32)
+    motion, deviation = rng.normal(size=(2, 40, 60, 3)).astype(np.float32)
+    mask, rgb = rng.random((40, 60)) > 0.5, rng.integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    frame = FrameMotion(
+        flow, np.abs(motion[..., 0]), masked=mask, motion=Moved(motion, deviation), index=7, rgb=rgb
+    )
+    kept = FrameFile()
+    kept.add(frame)
+    kept.add(replace(frame, motion=None, masked=None, trusted=False))
+    for _ in range(2):
+        first, second = kept.read()
+        np.testing.assert_allclose(first.flow, flow, rtol=2.0**-13)
+        np.testing.assert_allclose(first.motion.motion, motion, rtol=2.0**-13)
+        np.testing.assert_array_equal(first.masked, mask)
+        np.testing.assert_array_equal(first.rgb, rgb)
+        assert (first.index, first.trusted, first.tool) == (7, True, None)
+        assert (second.motion, second.masked, second.trusted) == (None, None, False)
+    kept.close()

@@ -1,13 +1,7 @@
-"""Motion in a video, in stages: decode, register camera, mask, flow, stereo, detrend.
+"""One pass over a video, in stages: decode, register camera, mask, flow, stereo.
 
-A stage takes a frame and returns it with its own part filled in. Heart and breath, and the motion of a camera
-that sees tissue only, are known when the whole video has been tracked: a second pass subtracts them.
-
-    for one in passes(footage, settings):  # one pass, or two: the last one counts
-        for frame in one.frames():
-            ...
-
-`learn predict`, `bench score`, `bench check` and `bench live` all do this.
+A stage takes a frame and returns it with its own part filled in. A stream is one pass, a recording one or, if
+tissue fills the picture and the camera moves, two (`synth.recording_flow.video_track`).
 """
 
 from __future__ import annotations
@@ -21,21 +15,19 @@ from dataclasses import replace
 from itertools import chain
 from typing import Protocol
 
-import cv2
 import numpy as np
 
-from synth.arrays import Mask
 from synth.errors import UserError
+from synth.recording_flow.camera_motion import CameraPath
 from synth.recording_flow.decode import Decoder, Footage, RecordingFlowSettings
-from synth.recording_flow.detrend import Detrend, GatherMotion
-from synth.recording_flow.find_tissue import TissueSearch, choose_frames
-from synth.recording_flow.finding import Finding, first_fault
+from synth.recording_flow.detrend import GatherMotion
+from synth.recording_flow.finding import Finding
 from synth.recording_flow.flow import LocalFlow, with_flow
 from synth.recording_flow.foreground import ForegroundSearch
-from synth.recording_flow.frame_motion import FrameMotion, Size, TrackingSummary
+from synth.recording_flow.frame_motion import FrameMotion, TrackingSummary
 from synth.recording_flow.harmonic_fit import Span
 from synth.recording_flow.mask import MaskFrame
-from synth.recording_flow.pulse import PulseEstimate, PulseSearch
+from synth.recording_flow.pulse import PulseSearch
 from synth.recording_flow.register_camera import RegisterCamera, RegisterOnTissue
 from synth.recording_flow.stereo import DepthCamera, RightCamera, RightVideo
 from synth.system.stopwatch import Stopwatch
@@ -68,54 +60,6 @@ class Stage(Protocol):
         """The frame with this stage's part filled in."""
 
 
-def passes(
-    footage: Footage,
-    settings: RecordingFlowSettings,
-    free_s: Sequence[Span] = (),
-    *,
-    flow: LocalFlow | None = None,
-    watch: Stopwatch | None = None,
-    progress: Callable[[int], None] = lambda done: None,
-) -> Iterator[VideoPass]:
-    """The passes over a video; a second one follows if the first found pulsation or camera motion in it.
-
-    Tissue that is not given is found before them, in a few frames. The caller takes all `frames` of a pass
-    before the next one.
-
-    `free_s`: spans known to be without contact [s]; `flow`: computes the flow and is closed by the caller,
-    None: in this process; `watch` collects the time spent; `progress` is called after every decoded picture
-    of a pass with their number. UserError: unreadable video, no tissue, sizes that differ, no such estimator.
-    """
-    flow, watch = flow or LocalFlow(), watch or Stopwatch()
-    if footage.tissue is None:
-        footage = _with_tissue(footage, settings, watch)
-    first = VideoPass(footage, settings, None, flow=flow, watch=watch, progress=progress)
-    yield first
-    found = first.search(free_s)
-    if found is not None and (found.pulse or found.camera):
-        yield VideoPass(footage, settings, found, flow=flow, watch=watch, progress=progress)
-
-
-def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
-    """The footage with the tissue that is found in a few of its frames, by flow in this process."""
-    with watch.stage("decode"):
-        few = replace(footage, only=choose_frames(footage), depth=None)
-    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
-    if video.rest.fault:
-        return footage
-    search = TissueSearch(video.rest)
-    for frame in video.frames():
-        search.add(frame)
-    with watch.stage("mask"):
-        found, finding = search.find()
-
-    def tissue(size: Size) -> Mask:
-        whole = cv2.resize(found.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
-        return np.asarray(whole > 0)
-
-    return replace(footage, tissue=tissue, findings=(finding,))
-
-
 class VideoPass:
     """One pass over a video. What it found over the whole video is valid after the last frame."""
 
@@ -123,28 +67,28 @@ class VideoPass:
         self,
         footage: Footage,
         settings: RecordingFlowSettings,
-        known: PulseSearch | None = None,
+        path: CameraPath | None = None,
         *,
         flow: LocalFlow | None = None,
         pace: Pace | None = None,
         watch: Stopwatch | None = None,
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
-        """Decodes the rest frame, with which all stages start; other arguments and errors as for `passes`.
+        """Decodes the rest frame, with which all stages start.
 
-        `known`: pulsation and camera motion from a first pass, removed from every frame; `pace`: of a stream;
-        None: every frame is processed.
+        `path`: of the camera, found on the tissue in a first pass and removed from the pictures; `flow`:
+        computes the flow and is closed by the caller, None: in this process; `pace`: of a stream, None: every
+        frame is processed; `watch` collects the time spent; `progress` is called after every decoded picture
+        with their number. UserError: unreadable video, no tissue, sizes that differ, no such estimator.
         """
-        self.watch, self.known, self.summary = watch or Stopwatch(), known, TrackingSummary()
+        self.watch, self.summary = watch or Stopwatch(), TrackingSummary()
         self.decoder = Decoder(footage, settings, self.watch, progress)
         self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
-        self.found: PulseSearch | None = None  # by `search`
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
         self._mask = MaskFrame(rest, settings.masks, footage.tool)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
         self.summary.rest_masked = self._first.hidden if self._first.hidden.any() else None
-        path, pulse = (None, None) if known is None else (known.camera, known.pulse)
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)
         self.stereo: RightCamera | DepthCamera | None = None
         if isinstance(footage.depth, RightVideo):
@@ -155,16 +99,11 @@ class VideoPass:
         if pace is None and not rest.fault:
             stated, masks = bool(footage.tissue and not footage.findings), footage.tool is not None
             self._foreground = ForegroundSearch(rest.tissue, rest.shrink, is_stated=stated, has_masks=masks)
-        mm_per_px = 1.0 if footage.depth is None else footage.depth.mm_per_px * rest.shrink
-        self._gather = GatherMotion(rest, mm_per_px) if settings.pulse and known is None else None
-        self._detrend = None if pulse is None else Detrend(pulse, mm_per_px)
-        no_second_pass = self._gather is None and known is None
-        self._on_tissue = RegisterOnTissue(rest) if self._fills_picture and no_second_pass else None
-
-    @property
-    def removed(self) -> PulseEstimate | None:
-        """Pulsation that this pass subtracts from every frame; None: none."""
-        return self._detrend.pulse if self._detrend else None
+        self.mm_per_px = 1.0 if footage.depth is None else footage.depth.mm_per_px * rest.shrink
+        is_searched = settings.pulse and path is None
+        self._gather = GatherMotion(rest, self.mm_per_px) if is_searched else None
+        is_stream = not settings.pulse and path is None
+        self._on_tissue = RegisterOnTissue(rest) if self._fills_picture and is_stream else None
 
     @property
     def _fills_picture(self) -> bool:
@@ -249,7 +188,7 @@ class VideoPass:
         if not frame.is_rest:
             self.summary.add(frame, self.rest.tissue)
         self._search_foreground(frame)
-        return self._process("pulse", self._detrend or self._gather, frame)
+        return self._process("pulse", self._gather, frame)
 
     def _process(self, name: str, stage: Stage | None, frame: FrameMotion) -> FrameMotion:
         if stage is None:
@@ -266,11 +205,15 @@ class VideoPass:
                 self._foreground.add(frame, depth)
 
     def search(self, free_s: Sequence[Span] = ()) -> PulseSearch | None:
-        """What a second pass is to remove, after the last frame; None: this pass did not gather it."""
-        if self._gather is not None:
-            with self.watch.stage("pulse"):
-                self.found = self._gather.search(free_s, self._fills_picture)
-        return self.found
+        """Pulsation of the tissue, and the camera's motion if tissue fills the picture, after the last frame.
+
+        `free_s`: spans known to be without contact [s]. None: the settings request no search, or this pass
+        follows one.
+        """
+        if self._gather is None:
+            return None
+        with self.watch.stage("pulse"):
+            return self._gather.search(free_s, self._fills_picture)
 
     @property
     def findings(self) -> list[Finding]:
@@ -289,11 +232,9 @@ class VideoPass:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on the processing for reports, after the search for pulsation."""
+        """Sentences on the processing for reports, after the last frame."""
         shrink, decoder = self.rest.shrink, self.decoder
         shrunk = [f"pictures are downsampled {shrink} times for flow"] if shrink > 1 else []
         count = len(decoder.decoded)
         left = [f"left out: {n} of {count} frames {why}" for why, n in decoder.left_out.items()]
-        searched = self.known or self.found
-        missed = "" if searched is None or first_fault(self.findings) else searched.describe()
-        return shrunk + left + ([missed] if missed else [])
+        return shrunk + left
