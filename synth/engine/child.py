@@ -20,7 +20,7 @@ import synth
 from synth.dataset.folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.system import gpu, llvm
+from synth.system import gpu, llvm, resources
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
@@ -181,7 +181,7 @@ def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
 
 def environment(job: Job, workers: int) -> dict[str, str]:
     """What all workers of a machine have in their environment: threads, the program, the renderer's LLVM."""
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    threads = max(1, resources.cores() // workers)
     library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
     home = str(Path(synth.__file__).resolve().parents[1])
     path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
@@ -193,5 +193,4 @@ def environment(job: Job, workers: int) -> dict[str, str]:
 
 def share_of_memory(workers: int) -> int:
     """Bytes of the available memory for each of `workers` processes."""
-    fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    return int(0.9 * int(fields["MemAvailable"].split()[0]) * 1024 / workers)
+    return int(0.9 * resources.free_memory() / workers)
