@@ -8,9 +8,9 @@
 
 FROM python:3.11-slim-trixie
 
-# The renderer compiles its kernels with LLVM and is linked against libatomic, which slim images lack.
+# The renderer is linked against libatomic, which slim images lack; its LLVM is a Python package.
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends libatomic1 libllvm19 \
+    && apt-get install -y --no-install-recommends libatomic1 \
     && rm -rf /var/lib/apt/lists/*
 
 ARG PIP_EXTRA_INDEX_URL
@@ -21,6 +21,7 @@ COPY learn learn
 COPY bench bench
 RUN pip install --no-cache-dir -c constraints.txt '.[bench]' \
     && rm -rf /opt/sulcus \
+    && python -c '' \
     && useradd --create-home sulcus \
     && install -d -o sulcus /data
 

@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo test trials quick guard docs weights evidence setup lint types slurm clean
 .DELETE_ON_ERROR:
 
-setup: .venv/developed .venv/llvm
+setup: .venv/developed .venv/checked
 
 # `demo` installs what a user needs; the other targets add the developers' tools (3.6 instead of 2.3 GB).
 .venv/installed: pyproject.toml constraints.txt
@@ -44,16 +44,13 @@ setup: .venv/developed .venv/llvm
 	@$(INSTALL) -e '.[dev]' || $(UNREACHABLE)
 	@touch $@
 
-# The fast renderer needs LLVM; without it the slow variant renders the same. Debian's is installed where permitted.
-LLVM := $(BIN)/python -c 'from synth.system.llvm import find; exit(0 if find() else 1)'
-APT := $$(test $$(id -u) = 0 || echo sudo -n) env DEBIAN_FRONTEND=noninteractive apt-get
-.venv/llvm: .venv/installed
-	@$(LLVM) || { echo "installing libllvm19 ..."; { $(APT) update -q; \
-	  $(APT) install -y -q --no-install-recommends libllvm19; } >/dev/null 2>&1 </dev/null; $(LLVM); } || \
-	  echo "no usable LLVM (17 or newer; Debian: apt-get install libllvm19): rendering takes up to twice as long"
+# What packages can't bring: slim images lack libatomic1. One line says how to install it.
+.venv/checked: .venv/installed
+	@$(BIN)/python -c 'from synth.system import doctor; print("".join(f"{d.what}: {d.found}: {d.advice}\n" \
+	  for d in doctor.renderer() if not d.good), end="")'
 	@touch $@
 
-demo: .venv/installed .venv/llvm
+demo: .venv/installed .venv/checked
 	@mkdir -p $(DEMO)
 	@echo && echo "1 of 4: renders videos of brain surfaces that are pushed and pulled, with force and motion of every pixel"
 	$(BIN)/synth render demo -o $(DEMO)/data

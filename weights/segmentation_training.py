@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 from evidence.flow.scenes import jpeg, noise_field, photographs_of
 from synth.arrays import Map, Pixels
 from synth.flow.segmentation import CLASSES
+from synth.system import resources
 from weights import paste
 from weights.correction_training import draw_motion, draw_texture
 from weights.networks import SegmentationNet, follow
@@ -198,7 +198,7 @@ def train(
     cv2.setNumThreads(0)  # its threads would not survive the fork of the processes that draw
     torch.manual_seed(seed)
     new, count, latest = _PACE[device]
-    workers = 1 if device == "cpu" else max(1, len(os.sched_getaffinity(0)) - 1)
+    workers = 1 if device == "cpu" else max(1, resources.cores() - 1)
     net = SegmentationNet().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(net)
     optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-3)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 from synth.errors import UserError
+from synth.system import resources
 
 if TYPE_CHECKING:
     import torch
@@ -18,8 +18,7 @@ def choose_threads(wanted: int | None = None) -> int:
     """
     if wanted is not None and wanted < 1:
         raise UserError(f"threads {wanted}: must be at least 1")
-    cores = len(os.sched_getaffinity(0))
-    return wanted or min(max(cores // 2, 1), 8)
+    return wanted or min(max(resources.cores() // 2, 1), 8)
 
 
 def set_threads(wanted: int | None = None) -> None:

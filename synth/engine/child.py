@@ -20,8 +20,7 @@ import synth
 from synth.dataset.folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.system import gpu, llvm
-from synth.system.memory import free_bytes
+from synth.system import gpu, llvm, resources
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
@@ -182,7 +181,7 @@ def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
 
 def environment(job: Job, workers: int) -> dict[str, str]:
     """What all workers of a machine have in their environment: threads, the program, the renderer's LLVM."""
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    threads = max(1, resources.cores() // workers)
     library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
     home = str(Path(synth.__file__).resolve().parents[1])
     path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))
@@ -193,8 +192,8 @@ def environment(job: Job, workers: int) -> dict[str, str]:
 
 
 def share_of_memory(workers: int) -> int:
-    """Bytes of the memory that is free, as its control groups limit it, for each of `workers` processes."""
-    free = free_bytes()
+    """Bytes of the free memory, as control groups limit it, for each of `workers` processes."""
+    free = resources.free_memory()
     if free is None:
         raise UserError("the free memory is unknown on this system: give --memory in GB")
     return int(0.9 * free / workers)

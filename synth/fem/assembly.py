@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from synth.arrays import Floats, Indices
-from synth.fem.mesh.element import Quadrature, degrees_of_freedom, scatter
+from synth.fem.mesh.element import Quadrature, scatter_blocks
 from synth.system.jit import argument_types, compiled
 
 
@@ -66,4 +66,4 @@ def stiffness(mesh: Quadrature, moduli: Floats, along: Floats | None = None) -> 
     local = (half @ slopes).reshape(elements, n, 3, 3, n).swapaxes(3, 4)
     if along is not None:
         local += along[:, :, :, None, None] * along[:, None, None]
-    return scatter(local, degrees_of_freedom(mesh.cells), 3 * mesh.nodes)
+    return scatter_blocks(local, mesh.cells, mesh.nodes)

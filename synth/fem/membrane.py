@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from synth.arrays import Floats, Indices
-from synth.fem.mesh.element import degrees_of_freedom, scatter, shape_slope
+from synth.fem.mesh.element import scatter_blocks, shape_slope
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.system.jit import compiled, inlined
 
@@ -68,7 +68,7 @@ class Membrane:
         local = np.einsum("fqniab,fqabcd,fqmjcd,fq->fnimj", bent, moduli, bent, self.weight, optimize=True)
         held = np.einsum("fqna,fqab,fqmb,fq->fnm", self.slope, stress, self.slope, self.weight, optimize=True)
         local += np.einsum("fnm,ij->fnimj", held, np.eye(3))
-        return scatter(local, degrees_of_freedom(self.faces), self.balance.size)
+        return scatter_blocks(local, self.faces, len(self.balance))
 
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:

@@ -54,7 +54,8 @@ def deform(
     embedding = surface_embedding.embed(tets, surface.vertices)
     traction, load_parameter = _load(tools, tissue.law, surface.vertices, area, frames)
     # Loads for E = 1 kPa: displacement depends on force over stiffness alone.
-    loads = np.stack([embedding.gather(area[:, None] * t) for t in traction / tissue.young_kpa])
+    pressed = np.moveaxis(area[:, None] * traction / tissue.young_kpa, 0, -1)
+    loads = np.ascontiguousarray(np.moveaxis(embedding.gather(pressed), -1, 0))
     system = tissue.equations(tets)
     height, raising = np.zeros(frames), np.zeros_like(tets.points)
     if pulse is not None:
@@ -65,7 +66,8 @@ def deform(
             path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
         else:
             path = solve_path(system, loads, load_parameter)
-    displacement = np.stack([embedding.move(u) for u in path.displacement])
+    moved = embedding.move(np.ascontiguousarray(np.moveaxis(path.displacement, 0, -1)))
+    displacement = np.ascontiguousarray(np.moveaxis(moved, -1, 0))
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))
     pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)

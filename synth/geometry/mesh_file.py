@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import Floats, Ints
 from synth.geometry.skin import CELLS, IGNORED, TRIANGLE
-from synth.system.memory import refuse_excess
+from synth.system.resources import refuse_excess
 
 SUFFIXES = ("vtu", "vtk", "vtp")
 SURFACES = ("obj", "ply", "glb")  # without data at points

@@ -23,6 +23,7 @@ from synth.flow.confidence import add_deviation
 from synth.flow.estimator import Estimator
 from synth.flow.track import Tracker
 from synth.recording_flow.frame_motion import FrameMotion
+from synth.system import resources
 
 
 class LocalFlow:
@@ -83,7 +84,7 @@ class FlowProcess(LocalFlow):
 @contextlib.contextmanager
 def open_flow_process() -> Iterator[FlowProcess | None]:
     """A process for flow, closed at the end; None on a single core."""
-    if len(os.sched_getaffinity(0)) < 2:
+    if resources.cores() < 2:
         yield None
         return
     with contextlib.closing(FlowProcess()) as process:

@@ -92,9 +92,11 @@ def write_scene(
     if job.sensor.bitrate_mbps is not None:  # a codec needs all frames at once
         videos = _encode(task, videos)
     if job.flow.backend != "ideal":
-        recovered = _recover_flow(task, videos[0])
+        with watch.stage("flow"):
+            blocked = with_highlights(*videos[0])
+        recovered = _recover_flow(task, videos[0].rgb, blocked)
         if writer.wants("motion_recovered"):
-            _recover_motion(task, videos[0], videos[1], recovered)
+            _recover_motion(task, videos[0].rgb, blocked, videos[1], recovered)
     return _seal(task)
 
 
@@ -158,28 +160,29 @@ def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
     return coded
 
 
-def _recover_flow(task: _Task, video: _Video) -> Track:
+def _recover_flow(task: _Task, rgb: Pixels, blocked: Mask) -> Track:
     """Recovers flow with the job's estimator and writes it.
 
-    As in a real pipeline, its inputs are pictures and instrument masks; glare is detected in the pictures.
+    As in a real pipeline, its inputs are pictures (T, H, W, 3) and masks (T, H, W) of instruments; glare is
+    detected in the pictures.
     """
     job, writer = task.scene.job, task.writer
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
-        recovered = track.recover_flow(*video, task.scene.tissue, create(job.flow.backend))
+        recovered = track.track(create(job.flow.backend), rgb, blocked, task.scene.tissue)
     with task.watch.stage("store"):
         writer.put("flow_recovered", recovered.flow)
         writer.put("flow_confidence", recovered.confidence)
     return recovered
 
 
-def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> None:
+def _recover_motion(task: _Task, left: Pixels, left_blocked: Mask, right: _Video, flow: Track) -> None:
     """Recovers motion in three dimensions from the left camera's flow and both videos, and writes it."""
     scene, writer, job = task.scene, task.writer, task.scene.job
     lens = scene.renderer.right
     assert lens is not None
-    blocked = with_highlights(*left), with_highlights(*right)
     with task.watch.stage("stereo"):
+        blocked = left_blocked, with_highlights(*right)
         pair = rig.StereoRig(
             rig.Intrinsics(scene.view.K, scene.view.distortion),
             rig.Intrinsics(lens.K, lens.distortion),
@@ -187,7 +190,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
             size=job.render.size,
         )
         still = stereo.still_frames(flow.flow, scene.tissue)
-        rest = left.rgb[:still], right.rgb[:still]
+        rest = left[:still], right.rgb[:still]
         tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], scene.tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
@@ -195,7 +198,7 @@ def _recover_motion(task: _Task, left: _Video, right: _Video, flow: Track) -> No
             if t == 0:
                 moved = stereo.Moved.nothing(scene.tissue.shape)
             else:
-                now = left.rgb[t], right.rgb[t], blocked[0][t], blocked[1][t]
+                now = left[t], right.rgb[t], blocked[0][t], blocked[1][t]
                 moved = tracker.step(*now, flow.flow[t], flow.confidence[t])
         with task.watch.stage("store"):
             writer.put_frame("motion_recovered", t, moved.motion)

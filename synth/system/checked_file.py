@@ -25,7 +25,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError
 
 from synth.errors import UserError, as_user_error, first_line
-from synth.system.memory import refuse_excess
+from synth.system.resources import refuse_excess
 
 LARGEST_PICTURE, LARGEST_YAML = 512 << 20, 200_000  # bytes
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video

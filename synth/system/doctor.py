@@ -29,19 +29,16 @@ class Diagnosis:
 
 def diagnose(folder: Path) -> list[Diagnosis]:
     """All lines of the report; `folder` is where datasets are to be written."""
-    machine, library = packages.machine(), llvm.find()
+    machine = packages.machine()
     enough = float(machine["memory_gb"]) >= _LEAST_MEMORY_GB
-    renders = library or "none works: scalar_rgb renders, at half the speed"
     smaller = "use --workers 1 and a smaller render.size"
-    newer = "install LLVM 17 or newer (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH"
     return [
         Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
         Diagnosis("cores", str(machine["cores"])),
         Diagnosis("memory", f"{machine['memory_gb']} GB", enough, smaller),
         _disk(folder),
-        Diagnosis("LLVM", renders, library is not None, newer),
+        *renderer(),
         _cuda(),
-        *_lacking(),
         _kernels(),
         *(Diagnosis(name, version) for name, version in packages.versions().items()),
     ]
@@ -57,6 +54,17 @@ def lines(found: Sequence[Diagnosis]) -> list[str]:
     return text
 
 
+def renderer() -> list[Diagnosis]:
+    """What the renderer needs: system libraries that the loader doesn't find, else LLVM."""
+    if lacking := list(_lacking()):
+        return lacking
+    library = llvm.find()
+    if library is not None:
+        return [Diagnosis("LLVM", library)]
+    newer = "install the Python package karellen-llvm-core (x86-64), or LLVM 17 or newer (Debian: libllvm19)"
+    return [Diagnosis("LLVM", "none works: scalar_rgb renders, at half the speed", False, newer)]
+
+
 def _lacking() -> Iterator[Diagnosis]:
     """A system library that the renderer is linked to but the loader doesn't find."""
     spec = importlib.util.find_spec("drjit")
@@ -64,7 +72,7 @@ def _lacking() -> Iterator[Diagnosis]:
         try:
             ctypes.CDLL(str(threads))
         except OSError as error:
-            advice = "install it (Debian: apt-get install libatomic1): the renderer needs it"
+            advice = "install it (Debian: apt-get install libatomic1): without it nothing is rendered"
             yield Diagnosis("renderer's libraries", str(error), False, advice)
 
 

@@ -7,8 +7,10 @@ import os
 import re
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
+_PACKAGE = "karellen-llvm-core"  # a dependency on x86-64 Linux: no other package is one library
 _OLDEST = 17  # drjit 1.5 aborts with 15 and 16 and refuses 14
 _FOLDERS = "x86_64-linux-gnu", "aarch64-linux-gnu", ".", "../lib64", "../local/lib"  # from /usr/lib
 _PROBE = (
@@ -21,18 +23,29 @@ _PROBE = (
 def find() -> str | None:
     """Path of a libLLVM that works with the fast renderer on this machine, tested in a subprocess, or None.
 
-    Of `SULCUS_LLVM` (a parent process's result, empty for none), else `DRJIT_LIBLLVM_PATH`, else the newest.
+    Of `SULCUS_LLVM` (a parent process's result, empty for none), else `DRJIT_LIBLLVM_PATH`, else of the
+    installed Python package, else the system's newest.
     """
     given = os.environ.get("SULCUS_LLVM")
     if given is not None:
         return given or None
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    tried = [named] if named else candidates()
+    tried = [named] if named else [*packaged(), *candidates()]
     return next((path for path in tried if probe(path)), None)
 
 
+def packaged() -> list[str]:
+    """The LLVM library that was installed with this program as a Python package, if it was."""
+    try:
+        files = metadata.files(_PACKAGE) or ()
+    except metadata.PackageNotFoundError:
+        return []
+    paths = (Path(str(file.locate())) for file in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", file.name))
+    return [str(path.resolve()) for path in paths if path.exists()]
+
+
 def candidates() -> list[str]:
-    """LLVM libraries of a usable version on this machine, newest first."""
+    """LLVM libraries of a usable version of this system, newest first."""
     folders = [*(Path("/usr/lib", one) for one in _FOLDERS), *Path("/usr/lib").glob("llvm-*/lib")]
     found: dict[Path, int] = {}
     for path in [*_linker(), *(path for folder in folders for path in folder.glob("libLLVM*"))]:

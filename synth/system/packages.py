@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+
+from synth.system import resources
 
 _OPENCV = "opencv-contrib-python-headless"
 COMPUTING = ("mitsuba", "drjit", "numpy", "scipy", _OPENCV, "onnxruntime", "numba", "llvmlite", "xatlas")
@@ -30,12 +31,12 @@ def _versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, str | int | float]:
-    """Processor, cores, memory [GB], system and Python; nothing that identifies the machine."""
+    """Processor, cores and memory [GB] of this process, system, Python; nothing that identifies it."""
     model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
     return {
         "processor": model.group(1) if model else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "memory_gb": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1),
+        "cores": resources.cores(),
+        "memory_gb": round((resources.memory() or 0) / 1e9, 1),
         "system": platform.system(),
         "python": platform.python_version(),
     }

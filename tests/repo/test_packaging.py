@@ -14,6 +14,8 @@ import pytest
 from ruamel.yaml import YAML
 from sources import ROOT
 
+from synth.system import llvm
+
 DOCKER = (ROOT / "Dockerfile").read_text("utf-8")
 APPTAINER = (ROOT / "apptainer.def").read_text("utf-8")
 TOML = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -61,6 +63,12 @@ def test_containers_install_what_the_renderer_is_linked_against() -> None:
     linked = subprocess.run(["ldd", *map(str, files)], capture_output=True, text=True).stdout
     needed = {line.split()[0] for line in linked.splitlines() if "=>" in line} - {path.name for path in files}
     assert needed - IN_IMAGE == {"libatomic.so.1"}
+    for library in llvm.packaged():  # it brings what is next to it
+        linked = subprocess.run(["ldd", library], capture_output=True, text=True).stdout
+        pairs = (line.split()[::2] for line in linked.splitlines() if "=>" in line)
+        own = Path(library).parent
+        foreign = {name for name, path in pairs if own not in Path(os.path.normpath(path)).parents}
+        assert foreign <= IN_IMAGE | {"libatomic.so.1"}
     assert all(re.search(r"apt-get install .*\blibatomic1\b", recipe) for recipe in (DOCKER, APPTAINER))
 
 

@@ -17,7 +17,7 @@ from synth.fem.external import plausibility
 from synth.fem.surface_embedding import vertex_area
 from synth.geometry.skin import skin
 from synth.system.csv_table import read_csv, read_header
-from synth.system.memory import refuse_excess
+from synth.system.resources import refuse_excess
 
 _LENGTHS = {1.0: "mm", 1000.0: "m", 10.0: "cm"}
 _LIKELY_MM, _POSSIBLE_MM = (20.0, 400.0), (1.0, 2000.0)  # largest extent of a specimen
