@@ -33,8 +33,13 @@ GRID = Grid(48)
 class TissueConstants:
     """Candidate tissues and constants of their weights; by hand where no source is given."""
 
-    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
-    stretches: tuple[float, ...] = (1.0, 1.02)  # of a membrane at rest; in vivo 1 to 3% (design.md)
+    membranes_mm: tuple[float, ...] = (
+        0.0,
+        5.0,
+        40.0,
+        250.0,
+    )  # stiffness over E; evidence tells no more apart
+    stretch: float = 1.02  # of a membrane at rest; in vivo 1 to 3% (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
     cut: float = 0.25  # share of its outline on the picture's border, from which tissue's edge is unknown
@@ -189,10 +194,9 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
-        TissueKind(edge, one, middle, stretch)
+        TissueKind(edge, membrane, middle, TISSUES.stretch if membrane else 1.0)
         for edge in edges
-        for one in stiff
-        for stretch in (TISSUES.stretches if one else TISSUES.stretches[:1])
+        for membrane in stiff
     )
 
 

@@ -18,6 +18,7 @@ import io
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations_with_replacement
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -27,7 +28,7 @@ from scipy.special import logsumexp
 from bench.methods import compliance
 from bench.methods.compliance import COMPLIANCE, OPENING_MM, Lattice, TissueKind
 from bench.methods.force_mixture import ForceMixture
-from synth.arrays import Array, Floats, Map
+from synth.arrays import Floats, Map
 from synth.system import cache
 from synth.system.terminal import say_if_long
 
@@ -138,7 +139,7 @@ _WAIT = "physics: computing how tissue yields under loads, once on this machine 
 _STORED = 128  # bases in the cache, of some 1.5 MB: those of five recordings about which nothing is stated
 
 
-def _reduce(components: int, tissue: TissueKind) -> dict[str, Array]:
+def _reduce(components: int, tissue: TissueKind) -> dict[str, Any]:
     """What of a `LoadBasis` depends on the tissue, by attribute; large arrays in single precision."""
     lattice = compliance.lattice()
     matrix, count, rank = compliance.solve(tissue, components), len(lattice.nodes), MODEL.rank
@@ -173,12 +174,12 @@ def _contact_shares(lattice: Lattice) -> Floats:
     return np.concatenate([(part / part.sum(axis=0))[:, within] for part in spread], axis=1)
 
 
-def _dump(stored: dict[str, Array]) -> bytes:
+def _dump(stored: dict[str, Any]) -> bytes:
     np.savez(held := io.BytesIO(), **stored)
     return held.getvalue()
 
 
-def _load(data: bytes) -> dict[str, Array]:
+def _load(data: bytes) -> dict[str, Any]:
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
         return {name: stored[name] for name in ("motion", "size", "force", "omitted", "contacts", "loads")}
 

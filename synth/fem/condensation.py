@@ -99,11 +99,11 @@ class _Mesh:
         along = self.centre[elements, axis]
         low = along <= np.median(along)
         parts = elements[low], elements[~low]
-        sides = tuple(np.intersect1d(inner, self.cells[part]) for part in parts)
-        return parts, sides, np.intersect1d(*sides)
+        below, above = (np.intersect1d(inner, self.cells[part]) for part in parts)
+        return parts, (below, above), np.intersect1d(below, above)
 
 
-_Cut = tuple[tuple[Ints, Ints], tuple[Ints, ...], Ints]
+_Cut = tuple[tuple[Ints, Ints], tuple[Ints, Ints], Ints]
 """Elements of both halves; those nodes to eliminate that each touches; the nodes that both touch."""
 
 
