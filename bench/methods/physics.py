@@ -33,12 +33,7 @@ GRID = Grid(48)
 class TissueConstants:
     """Candidate tissues and constants of their weights; by hand where no source is given."""
 
-    membranes_mm: tuple[float, ...] = (
-        0.0,
-        5.0,
-        40.0,
-        250.0,
-    )  # stiffness over E; evidence tells no more apart
+    membranes_mm: tuple[float, ...] = (0.0, 5.0, 15.0, 40.0, 100.0, 250.0)  # stiffness over E
     stretch: float = 1.02  # of a membrane at rest; in vivo 1 to 3% (design.md)
     intact: float = 0.33  # prior probability of a membrane
     poisson: tuple[float, ...] = (0.45, 0.4, 0.49)  # most likely first
