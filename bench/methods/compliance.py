@@ -1,29 +1,30 @@
 """The compliance: observed surface displacement under unit loads, the linear map that physics inverts.
 
 Computed by `synth.fem` on a procedural block viewed from straight above, as a recording determines neither
-the camera's pose nor the brain's shape; for each `TissueKind` once, in a cache on disk.
+the camera's pose nor the brain's shape. Of a block and Poisson's ratio the stiffness is computed once, with
+all below the surface eliminated: the skull's hold and a membrane only add to the surface's stiffness.
 """
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import cho_solve, cholesky
 from scipy.spatial import Delaunay
 
-from synth.arrays import Floats, Map
+from synth.arrays import Floats, Ints
 from synth.fem import surface_embedding
-from synth.fem.membrane import MembraneSheet
+from synth.fem.condensation import condense
+from synth.fem.membrane import MembraneSheet, lay
 from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
-from synth.fem.system import System, assemble
-from synth.formats import COMPLIANCE, MESH
+from synth.fem.system import System, assemble, springs, tissue_stiffness
 from synth.job import schema
-from synth.system import cache
 
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
@@ -35,8 +36,9 @@ _OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0
 _POINT_MM = 1.0  # spacing of the points, which reach to the opening's edge
 _NODE_MM = 1.2  # spacing of the nodes, which stay as far inside it
 _TETS = 3000  # of the map's own mesh, second order
-_AT_ONCE = 32  # loads solved at a time: memory
-_STORED = 64  # matrices in the cache: three recordings' tissues
+
+SETTINGS = _POINT_MM, _NODE_MM, _TETS
+"""Settings of every compliance, for the key of what is kept on disk."""
 
 Edge = Literal["bonded", "slipping", "free"]
 
@@ -52,12 +54,9 @@ class TissueKind:
 
 
 @dataclass(frozen=True, eq=False)
-class Compliance:
-    """Displacement at points of the opening under loads at nodes of it, E = 1 kPa."""
+class Lattice:
+    """Where displacement is observed and loads act, in the opening."""
 
-    matrix: Floats
-    """(C P, 3 K): displacement [mm], x of every point, then y, then in stereo z (C = 3), under x, y, z loads
-    of 1 mN per node."""
     points: Floats  # (P, 2) camera x, y from the opening's centre [mm]
     nodes: Floats  # (K, 2) positions of the loads, same axes [mm]
     node_area: Floats  # (K,) mm^2
@@ -74,22 +73,14 @@ class ElasticBlock:
     def build(cls, tets: int, tissue: TissueKind | None = None) -> ElasticBlock:
         """A linear block of about `tets` second-order tetrahedra."""
         tissue = tissue or TissueKind()
-        free = tissue.edge == "free"
-        volume = tetrahedra.block(
-            _OPEN if free else _ANATOMY,
-            tets,
-            [(0.0, 0.0, OPENING_MM)] if free else (),
-            slips=tissue.edge == "slipping",
-        )
+        volume = _mesh(tets, tissue.edge)
         sheet = MembraneSheet(tissue.membrane, tissue.stretch) if tissue.membrane else None
         law = "neo-hookean" if tissue.stretch > 1 else "linear"  # a linear sheet has no tension
         return cls(volume, assemble(volume, law, tissue.poisson, sheet))
 
     def embed(self, xy: Floats) -> Embedding:
         """The embedding of surface points (P, 2), camera x, y [mm], in the volume."""
-        world = xy * np.array([1.0, -1.0])
-        on_dome = np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)])
-        return surface_embedding.embed(self.volume, on_dome)
+        return _embed(self.volume, xy)
 
 
 def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
@@ -97,48 +88,101 @@ def picture(embedding: Embedding, moved: Floats, components: int = 2) -> Floats:
     return np.asarray(np.einsum("ab,pb...->pa...", TO_CAMERA[:components], embedding.move(moved)), np.float64)
 
 
-def build(components: int, tissue: TissueKind) -> Compliance:
-    """The compliance (4 CPU-s, or the cache) of 2 or, in stereo, 3 components of displacement."""
-    points, nodes = _lattices()
-    matrix = _stored(tissue)[: components * len(points)]
+@lru_cache(maxsize=1)
+def lattice() -> Lattice:
+    """Points and nodes of every compliance."""
+    points, nodes = _disc(_POINT_MM, OPENING_MM), _disc(_NODE_MM, OPENING_MM - _NODE_MM)
     flat = np.column_stack([nodes, np.zeros(len(nodes))])
-    area = surface_embedding.vertex_area(flat, Delaunay(nodes).simplices)
-    return Compliance(matrix.astype(np.float64), points, nodes, area)
+    return Lattice(points, nodes, surface_embedding.vertex_area(flat, Delaunay(nodes).simplices))
 
 
-@lru_cache(maxsize=4)
-def _stored(tissue: TissueKind) -> Map:
-    """The matrix (3 P, 3 K) from this user's cache, or solved and stored there."""
-    key = f"{MESH} {COMPLIANCE} {_TETS} {_POINT_MM} {_NODE_MM} {OPENING_MM} {tissue}".encode()
-    faults = ValueError, EOFError  # of files that were cut off by a full disk: they are computed again
-    return cache.cached("compliance/npy", key, lambda: _solved(tissue), _dump, _load, faults, _STORED)
+def solve(tissue: TissueKind, components: int) -> Floats:
+    """Displacement (C P, 3 K) mm of a tissue of E = 1 kPa under unit loads [mN].
+
+    Rows: x of every point, then y, then in stereo z (C = 3); columns: loads along x at every node, then y, z.
+    """
+    surface = _condensed("free" if tissue.edge == "free" else "held", tissue.poisson)
+    whole = surface.stiffness + surface.added(tissue)
+    # The window is last, so that only its own part of the factor meets the loads.
+    root = cholesky(whole.T, lower=True, overwrite_a=True, check_finite=False)  # .T: without a copy
+    first, rows = len(root) - len(surface.loads), components * len(lattice().points)
+    moved = cho_solve((root[first:, first:], True), surface.loads, check_finite=False)
+    return np.asarray(surface.observed[:rows] @ moved, np.float64)
 
 
-def _dump(matrix: Map) -> bytes:
-    np.save(held := io.BytesIO(), matrix)
-    return held.getvalue()
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A block of one Poisson's ratio, without skull or membrane, with all below its surface eliminated.
+
+    Its nodes are those of the surface and, last, the window: those that bear the loads or move the points.
+    """
+
+    volumes: dict[Edge, Tets]  # by edge: one mesh, with the skull's springs
+    nodes: Ints  # (S,) of the volume
+    stiffness: Floats  # (3 S, 3 S) mN/mm
+    observed: Floats  # (3 P, 3 W) motion of the points, x, y, z in turn, by that of the window's nodes
+    loads: Floats  # (3 W, 3 K) forces on the window's nodes by unit loads
+
+    def added(self, tissue: TissueKind) -> Floats:
+        """What skull and membrane add to the stiffness, (3 S, 3 S) mN/mm."""
+        volume = self.volumes[tissue.edge]
+        stiffness = springs(volume)
+        if tissue.membrane:
+            sheet = MembraneSheet(tissue.membrane, tissue.stretch)
+            stiffness = stiffness + lay(volume, sheet, linear=tissue.stretch <= 1).rest_stiffness()
+        at = (3 * self.nodes[:, None] + np.arange(3)).ravel()
+        return np.asarray(stiffness.tocsr()[at][:, at].toarray(), np.float64)
 
 
-def _load(data: bytes) -> Map:
-    return np.asarray(np.load(io.BytesIO(data), allow_pickle=False))
+Block = Literal["held", "free"]
 
 
-def _lattices() -> tuple[Floats, Floats]:
-    """Points (P, 2) and nodes (K, 2) [mm]."""
-    return _disc(_POINT_MM, OPENING_MM), _disc(_NODE_MM, OPENING_MM - _NODE_MM)
+@lru_cache(maxsize=1)
+def _condensed(block: Block, poisson: float) -> _Surface:
+    volumes, nodes, observed, loads = _geometry(block)
+    volume = next(iter(volumes.values()))
+    tissue, _ = tissue_stiffness(quadrature(volume.points, volume.cells), poisson)
+    stiffness = condense(tissue, volume.points, volume.cells, nodes, volume.fixed)
+    return _Surface(volumes, nodes, stiffness, observed, loads)
 
 
-def _solved(tissue: TissueKind) -> Map:
-    """The matrix: one linear problem per node and axis, with one factorisation."""
-    block, (points, nodes) = ElasticBlock.build(_TETS, tissue), _lattices()
-    observed, loaded = block.embed(points), block.embed(nodes)
-    columns = np.empty((len(nodes), 3, 3, len(points)), np.float32)
-    for some in np.array_split(np.arange(len(nodes)), max(1, len(nodes) // _AT_ONCE)):
-        for axis in range(3):
-            unit = np.einsum("kl,a->kal", np.eye(len(nodes))[:, some], TO_CAMERA[axis])
-            u = block.system.solve(loaded.gather(unit))
-            columns[some, axis] = picture(observed, u, 3).transpose(2, 1, 0)
-    return columns.transpose(2, 3, 0, 1).reshape(3 * len(points), 3 * len(nodes))
+@lru_cache(maxsize=1)
+def _geometry(block: Block) -> tuple[dict[Edge, Tets], Ints, Floats, Floats]:
+    """What of a `_Surface` depends on no Poisson's ratio: volumes, nodes, observed, loads."""
+    edges: tuple[Edge, ...] = ("free",) if block == "free" else ("bonded", "slipping")
+    volumes, where = {edge: _mesh(_TETS, edge) for edge in edges}, lattice()
+    volume = volumes[edges[0]]
+    embedded = [_embed(volume, xy) for xy in (where.points, where.nodes)]
+    moving = [np.union1d(each.value.indices, each.spin.indices // 3) for each in embedded]
+    window = np.union1d(*moving)
+    surface = np.setdiff1d(tetrahedra.boundary(volume.cells), window)
+    nodes = np.concatenate([surface[~volume.fixed[surface]], window])
+    observed, loads = (_motion(each, window) for each in embedded)
+    return volumes, nodes, observed, np.ascontiguousarray(loads.T)
+
+
+def _motion(embedding: Embedding, window: Ints) -> Floats:
+    """Motion (3 V, 3 W) of V points along the camera's x, then y, then z, by that of a window's nodes.
+
+    It is `Embedding.move` of unit motions of the window's nodes.
+    """
+    count = embedding.value.shape[0]
+    moved = np.kron(embedding.value[:, window].toarray(), np.eye(3)).reshape(count, 3, -1)
+    spin = embedding.spin[:, (3 * window[:, None] + np.arange(3)).ravel()].toarray()
+    turned = embedding.corner @ embedding.mean @ spin.reshape(len(embedding.mean), -1)
+    moved += np.cross(turned.reshape(moved.shape), embedding.arm[:, :, None], axis=1)
+    return np.asarray(np.einsum("ab,vbw->avw", TO_CAMERA, moved).reshape(3 * count, -1), np.float64)
+
+
+def _mesh(tets: int, edge: Edge) -> Tets:
+    if edge == "free":
+        return tetrahedra.block(_OPEN, tets, [(0.0, 0.0, OPENING_MM)])
+    return tetrahedra.block(_ANATOMY, tets, slips=edge == "slipping")
+
+
+def _embed(volume: Tets, xy: Floats) -> Embedding:
+    world = xy * np.array([1.0, -1.0])
+    return surface_embedding.embed(volume, np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)]))
 
 
 def _disc(spacing_mm: float, radius_mm: float) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
-from bench.methods import posterior
+from bench.methods import compliance, posterior
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
 from bench.methods.posterior import Observation, Posterior
@@ -126,7 +126,7 @@ class Physics:
         if self._scene is None:
             return []
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
-        moved = posterior.polynomials(basis.known.points) @ self._weights.own_mm  # (C, P, M)
+        moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
         sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
         own = f"the tissue's own motion is {sizes} mm along x, y, z"
         if self._weights.assumed or not self._contact_free:
@@ -148,7 +148,7 @@ class Physics:
     def _picture(self, found: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
-        known, view = basis.known, self._view
+        known, view = basis.lattice, self._view
         step = np.diff(np.unique(known.nodes[:, 0].round(6))).min()
         column, row = np.rint(known.nodes / step).astype(int).T
         most = max(column.max(), row.max())
@@ -189,10 +189,10 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
     if "free" not in edges and touches_border(scene.tissue) > TISSUES.cut:
         edges = *edges, "free"  # the tissue's edge may be anywhere beyond the picture
     return tuple(
-        TissueKind(edge, one, middle, stretch)
+        TissueKind(edge, membrane, middle, stretch)
         for edge in edges
-        for one in stiff
-        for stretch in (TISSUES.stretches if one else TISSUES.stretches[:1])
+        for membrane in stiff
+        for stretch in (TISSUES.stretches if membrane else TISSUES.stretches[:1])
     )
 
 
@@ -212,7 +212,7 @@ def weigh_tissues(
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
-        return TISSUES.temper * sum(posterior.infer(basis, one, own_mm).evidence for one in strongest)
+        return TISSUES.temper * sum(posterior.evidence(basis, one, own_mm) for one in strongest)
 
     tissues = list(candidate_tissues(scene))
     prior = _prior(tissues, scene.membrane)
@@ -252,7 +252,7 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
 
 @lru_cache(maxsize=1)
 def _places() -> Floats:
-    points = posterior.load_basis(2, TissueKind()).known.points
+    points = compliance.lattice().points
     return np.asarray(points.T[::-1] / GRID.pitch_mm + (GRID.size - 1) / 2, np.float64)
 
 

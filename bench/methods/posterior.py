@@ -14,17 +14,24 @@ ch. 3; rank-3 updates of evidence by the matrix determinant lemma).
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations_with_replacement
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve, eigh
 from scipy.special import logsumexp
 
 from bench.methods import compliance
-from bench.methods.compliance import OPENING_MM, TissueKind
+from bench.methods.compliance import OPENING_MM, Lattice, TissueKind
 from bench.methods.force_mixture import ForceMixture
 from synth.arrays import Floats, Map
+from synth.formats import COMPLIANCE, MESH
+from synth.system import cache
+from synth.system.terminal import say_if_long
 
 Axes = tuple[float, float, float]
 
@@ -67,7 +74,7 @@ class LoadBasis:
     loads: Floats  # (3 K, R) mN at the nodes per coefficient
     shares: Floats  # (K, H) share of each contact carried by each node
     around: Floats  # (P, P) weights of means over neighbouring points
-    known: compliance.Compliance
+    lattice: Lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,40 +109,80 @@ class Posterior:
 
 @lru_cache(maxsize=32)
 def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
-    """The reduced compliance of a tissue, observed in 2 or 3 components."""
-    known = compliance.build(components=components, tissue=tissue)
-    count = len(known.nodes)
-    apart = np.square(known.nodes[:, None] - known.nodes[None]).sum(axis=-1)
-    kernel = np.exp(-apart / (2 * MODEL.smooth_mm**2)) * known.node_area[:, None] * known.node_area
-    root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
-    root /= np.linalg.norm(root.sum(axis=0))
-    by_node = known.matrix.reshape(-1, count, 3)
-    smooth = np.tensordot(by_node, root, (1, 0)).transpose(0, 2, 1).reshape(len(by_node), -1)
-    values, vectors = eigh(smooth.T @ smooth)
-    rank, vectors = MODEL.rank, vectors[:, ::-1]
-    size = np.sqrt(values[: -rank - 1 : -1])
-    motion = smooth @ (vectors[:, :rank] / size)
-    loads = np.tensordot(root, vectors.reshape(count, 3, -1), (1, 0)).reshape(3 * count, -1)
-    total = loads.reshape(count, 3, -1).sum(axis=0)
-    within = np.hypot(*known.nodes.T) <= MODEL.reach_mm
-    spread = [np.clip(1 - apart / r**2, 0, None) ** 2 * known.node_area[:, None] for r in MODEL.radii_mm]
-    shares = np.concatenate([(one / one.sum(axis=0))[:, within] for one in spread], axis=1)
-    by_load = (motion.T @ known.matrix).reshape(rank, count, 3)
-    contacts = np.einsum("rka,kh->rha", by_load, shares, optimize=True)
-    near = np.square(known.points[:, None] - known.points[None]).sum(axis=-1)
+    """The reduced compliance of a tissue, observed in 2 or 3 components: from this user's cache, or computed
+    (half a CPU-second, and two for each block and Poisson's ratio) and stored there."""
+    kept = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
+    key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {kept}".encode()
+    faults = ValueError, EOFError, KeyError, BadZipFile  # of files that were cut off: they are computed again
+    with say_if_long(_WAIT):
+        stored = cache.cached(
+            "basis/npz", key, lambda: _reduce(components, tissue), _dump, _load, faults, _STORED
+        )
+    lattice = compliance.lattice()
+    shares = _contact_shares(lattice)
+    near = np.square(lattice.points[:, None] - lattice.points[None]).sum(axis=-1)
     near = np.exp(-near / (2 * MODEL.around_mm**2))
-    own = np.kron(np.eye(components), polynomials(known.points))
+    own = np.kron(np.eye(components), polynomials(lattice.points))
     return LoadBasis(
-        np.hstack([motion, own]),
-        size,
-        total[:, :rank] / size,
-        np.square(total[:, rank:]).sum(axis=1),
-        contacts.astype(np.float32),
-        loads[:, :rank] / size,
+        np.hstack([stored["motion"], own]),
+        stored["size"],
+        stored["force"],
+        stored["omitted"],
+        stored["contacts"].transpose(0, 2, 1),
+        stored["loads"].astype(np.float64),
         shares,
         near / near.sum(axis=1, keepdims=True),
-        known,
+        lattice,
     )
+
+
+_WAIT = "physics: computing how tissue yields under loads, once on this machine (some 20 s of a processor)"
+_STORED = 128  # bases in the cache, of some 1.5 MB: those of five recordings about which nothing is stated
+
+
+def _reduce(components: int, tissue: TissueKind) -> dict[str, Any]:
+    """What of a `LoadBasis` depends on the tissue, by attribute; large arrays in single precision."""
+    lattice = compliance.lattice()
+    matrix, count, rank = compliance.solve(tissue, components), len(lattice.nodes), MODEL.rank
+    apart = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
+    kernel = np.exp(-apart / (2 * MODEL.smooth_mm**2)) * lattice.node_area[:, None] * lattice.node_area
+    root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
+    root /= np.linalg.norm(root.sum(axis=0))
+    smooth = (matrix.reshape(-1, count) @ root).reshape(len(matrix), 3 * count)
+    values, vectors = eigh(smooth.T @ smooth)
+    vectors = vectors[:, ::-1]
+    size = np.sqrt(values[: -rank - 1 : -1])
+    motion = smooth @ (vectors[:, :rank] / size)
+    loads = root @ vectors.reshape(3, count, -1)  # (3, K, 3 K)
+    total = loads.sum(axis=1)
+    by_load = (motion.T @ matrix).reshape(rank, 3, count)
+    contacts = by_load @ _contact_shares(lattice)  # (R, 3, H): each axis is contiguous
+    return {
+        "motion": motion.astype(np.float32),
+        "size": size,
+        "force": total[:, :rank] / size,
+        "omitted": np.square(total[:, rank:]).sum(axis=1),
+        "contacts": contacts.astype(np.float32),
+        "loads": (loads[..., :rank] / size).transpose(1, 0, 2).reshape(3 * count, rank).astype(np.float32),
+    }
+
+
+def _contact_shares(lattice: Lattice) -> Floats:
+    """Share (K, H) of each contact carried by each node: radius by radius, at every node within reach."""
+    apart = np.square(lattice.nodes[:, None] - lattice.nodes[None]).sum(axis=-1)
+    within = np.hypot(*lattice.nodes.T) <= MODEL.reach_mm
+    spread = [np.clip(1 - apart / r**2, 0, None) ** 2 * lattice.node_area[:, None] for r in MODEL.radii_mm]
+    return np.concatenate([(part / part.sum(axis=0))[:, within] for part in spread], axis=1)
+
+
+def _dump(stored: dict[str, Any]) -> bytes:
+    np.savez(held := io.BytesIO(), **stored)
+    return held.getvalue()
+
+
+def _load(data: bytes) -> dict[str, Any]:
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        return {name: stored[name] for name in ("motion", "size", "force", "omitted", "contacts", "loads")}
 
 
 def polynomials(points: Floats) -> Floats:
@@ -152,8 +199,8 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated:
     within the noise are included: without them intervals are too narrow. Not `correlated`: one size per
     component, for frames that may have contacts.
     """
-    components = len(basis.motion) // len(basis.known.points)
-    terms = polynomials(basis.known.points)
+    components = len(basis.motion) // len(basis.lattice.points)
+    terms = polynomials(basis.lattice.points)
     excess = []
     for frame in contact_free:
         fitted, error = list[Floats](), list[Floats]()
@@ -179,10 +226,20 @@ def own_motion(basis: LoadBasis, contact_free: list[Observation], *, correlated:
     return np.asarray(modes.reshape(components, terms.shape[1], -1), np.float64)
 
 
+def evidence(basis: LoadBasis, frame: Observation, own_mm: Floats) -> float:
+    """`infer(...).evidence` alone, at three quarters of the cost."""
+    return float(logsumexp(_weigh(basis, frame, own_mm, _contact_sizes(frame))[1]))
+
+
+def _contact_sizes(frame: Observation) -> Floats:
+    """Standard deviations (S, 3) of a contact's force [mN/kPa]."""
+    return np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))
+
+
 def infer(basis: LoadBasis, frame: Observation, own_mm: Floats) -> Posterior:
     """The posterior of a frame's loads; `own_mm`: the tissue's own motion, see `own_motion`."""
     rank, count = len(basis.size), basis.contacts.shape[1]
-    sizes = np.array(MODEL.contacts + (MODEL.presses if len(frame.moved) == 2 else ()))
+    sizes = _contact_sizes(frame)
     levels, score = _weigh(basis, frame, own_mm, sizes)
     # Systematic draws: each hypothesis is drawn in proportion to its probability, however many there are.
     likely = np.cumsum(np.exp(score - logsumexp(score)))
@@ -230,8 +287,9 @@ def _weigh(
     known = weight > 0
     rest = float(moved @ (weight * moved) - np.log(weight[known]).sum() + known.sum() * np.log(2 * np.pi))
     count = basis.contacts.shape[1]
-    flat = basis.contacts.reshape(rank, -1)
-    levels, evidence = list[_Level](), list[Floats]()
+    flat = basis.contacts.transpose(0, 2, 1).reshape(rank, -1)
+    exact = flat.astype(np.float64)
+    levels, evidences = list[_Level](), list[Floats]()
     for spread in MODEL.smooth:
         prior = np.concatenate([np.square(spread * basis.size), np.ones(modes.shape[1])])
         factor = cho_factor(gram + np.diag(1 / prior), lower=True)
@@ -240,25 +298,44 @@ def _weigh(
         alone = -0.5 * (rest - right @ mean + log_det)
         taken = cho_solve(factor, gram[:, :rank])
         left = (gram[:rank, :rank] - gram[:, :rank].T @ taken).astype(np.float32)
-        explained = (left @ flat).reshape(rank, -1, 3)
-        # Entries (a, b) of each contact's 3 x 3 matrix, summed over directions.
+        explained = (left @ flat).reshape(rank, 3, count)
+        # Entries (a, b) of each contact's symmetric 3 x 3 matrix, summed over directions.
         square = np.empty((count, 3, 3))
-        for a in range(3):
-            square[:, a] = np.einsum("rh,rhb->hb", basis.contacts[..., a], explained)
-        pull = (right[:rank] - gram[:, :rank].T @ mean) @ flat.astype(np.float64)
+        for a, b in combinations_with_replacement(range(3), 2):
+            square[:, a, b] = np.einsum("rh,rh->h", basis.contacts[..., a], explained[:, b])
+            square[:, b, a] = square[:, a, b]
+        pull = ((right[:rank] - gram[:, :rank].T @ mean) @ exact).reshape(3, count).T
         padded = np.zeros((len(prior), 3))
         padded[:rank] = basis.force.T
         covariance = basis.force @ cho_solve(factor, padded)[:rank] + np.diag(basis.omitted) * spread**2
         total = basis.force @ mean[:rank], covariance
-        level = _Level(mean[:rank], square, pull.reshape(-1, 3), taken[:rank], *total)
+        level = _Level(mean[:rank], square, pull, taken[:rank], *total)
         levels.append(level)
-        for size in sizes:
-            scaled = square + np.diag(1 / size**2)
-            force = np.linalg.solve(scaled, level.pull[..., None])[..., 0]
-            gain = 0.5 * (level.pull * force).sum(axis=1) - 0.5 * np.log(np.linalg.det(scaled))
-            evidence.append(alone + gain - np.log(size).sum() - np.log(count))
-        evidence.append(np.array([alone]))
-    return levels, np.concatenate(evidence)
+        scaled = square + np.eye(3) / np.square(sizes)[:, None, :, None]  # (S, H, 3, 3)
+        fit, log = _quadratic(scaled, pull)
+        gain = alone + 0.5 * (fit - log) - np.log(sizes).sum(axis=1, keepdims=True) - np.log(count)
+        evidences += [gain.ravel(), np.array([alone])]
+    return levels, np.concatenate(evidences)
+
+
+def _quadratic(matrix: Floats, vector: Floats) -> tuple[Floats, Floats]:
+    """v' M^-1 v and log det M of symmetric positive definite 3 x 3 matrices (..., 3, 3) and vectors (..., 3).
+
+    By cofactors: LAPACK takes a call for each matrix, ten times as long.
+    """
+    (a, b, c), (_, d, e), (*_, f) = np.moveaxis(matrix, (-2, -1), (0, 1))
+    x, y, z = np.moveaxis(vector, -1, 0)
+    aa, bb, cc, ab, ac, bc = (
+        d * f - e * e,
+        a * f - c * c,
+        a * d - b * b,
+        c * e - b * f,
+        b * e - c * d,
+        b * c - a * e,
+    )
+    det = a * aa + b * ab + c * ac
+    fit = aa * x * x + bb * y * y + cc * z * z + 2 * (ab * x * y + ac * x * z + bc * y * z)
+    return fit / det, np.log(det)
 
 
 @dataclass(frozen=True, eq=False)

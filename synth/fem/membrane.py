@@ -73,6 +73,14 @@ class Membrane:
 
 def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     """A membrane over a volume's surface but its cut walls; `linear`: small strain, without pre-stretch."""
+    found = lay(tets, sheet, linear=linear)
+    balance = np.zeros_like(tets.points)
+    stored = found.pull(balance.copy(), balance)
+    return replace(found, balance=balance, stored=stored)
+
+
+def lay(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
+    """`cover` without the pressure that balances it, for its stiffness at rest."""
     faces = boundary(tets.cells)
     faces = faces[~tets.fixed[faces].all(axis=1)]
     local = shape_slope(_POINTS)
@@ -82,7 +90,7 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
     area = np.linalg.norm(normal, axis=-1)
     tangent = np.stack([first, np.cross(normal / area[..., None], first)], axis=-1)
     mapping = np.linalg.inv(np.einsum("fqia,fqik->fqak", tangent, side))
-    found = Membrane(
+    return Membrane(
         faces.astype(np.int32),
         np.ascontiguousarray(np.einsum("qnk,fqka->fqna", local, mapping)),
         np.ascontiguousarray(tangent),
@@ -93,9 +101,6 @@ def cover(tets: Tets, sheet: MembraneSheet, *, linear: bool) -> Membrane:
         np.zeros_like(tets.points),
         0.0,
     )
-    balance = np.zeros_like(tets.points)
-    stored = found.pull(balance.copy(), balance)
-    return replace(found, balance=balance, stored=stored)
 
 
 @compiled

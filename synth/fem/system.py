@@ -123,19 +123,8 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
         flat = f"is flat or inside out (mean ratio {shape.min():.1e})"
         raise UserError(f"the mesh's element {shape.argmin()} {flat}")
     mesh = quadrature(tets.points, tets.cells)
-    mu, lam = lame(1.0, poisson)
-    mean = max(lam - POINTWISE * mu, 0.0)
-    along = None
-    if mean:
-        even = np.broadcast_to(np.eye(3), (*mesh.weight.shape, 3, 3))  # the swelling's derivative at rest
-        along = np.einsum("eq,eqij,eqnj->eni", mesh.weight, even, mesh.slope, optimize=True)
-        along *= np.sqrt(mean / mesh.weight.sum(axis=1))[:, None, None]
-    moduli = hooke(1.0, poisson)
-    moduli -= mean * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
-    springs = sp.kron(tets.hold, np.eye(3), format="csr")
-    if tets.slip is not None:
-        springs = springs + tets.slip
-    whole = (stiffness(mesh, moduli, along) + springs).tocsr()
+    whole, mean = tissue_stiffness(mesh, poisson)
+    whole = (whole + springs(tets)).tocsr()
     membrane = None if sheet is None else cover(tets, sheet, linear=law == "linear")
     if membrane is not None:
         whole = (whole + membrane.rest_stiffness()).tocsr()
@@ -145,6 +134,27 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
     factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
     corners = quadrature(tets.points, tets.cells, np.eye(4))
     return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip)
+
+
+def tissue_stiffness(mesh: Quadrature, poisson: float) -> tuple[sp.csr_array, float]:
+    """Stiffness (3N, 3N) mN/mm of the tissue alone at rest, and the part of lambda [kPa] that acts on
+    elements' means."""
+    mu, lam = lame(1.0, poisson)
+    mean = max(lam - POINTWISE * mu, 0.0)
+    along = None
+    if mean:
+        even = np.broadcast_to(np.eye(3), (*mesh.weight.shape, 3, 3))  # the swelling's derivative at rest
+        along = np.einsum("eq,eqij,eqnj->eni", mesh.weight, even, mesh.slope, optimize=True)
+        along *= np.sqrt(mean / mesh.weight.sum(axis=1))[:, None, None]
+    moduli = hooke(1.0, poisson)
+    moduli -= mean * np.einsum("ij,km->ijkm", np.eye(3), np.eye(3))
+    return stiffness(mesh, moduli, along), mean
+
+
+def springs(tets: Tets) -> sp.csr_array:
+    """Stiffness (3N, 3N) mN/mm of the skull and of attachments."""
+    whole = sp.kron(tets.hold, np.eye(3), format="csr")
+    return sp.csr_array(whole if tets.slip is None else whole + tets.slip)
 
 
 def hooke(young: float, poisson: float) -> Floats:

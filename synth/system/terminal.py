@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import textwrap
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.util import find_spec
 
 from rich import progress
@@ -33,6 +36,23 @@ def counting(what: str, total: int | None = None) -> Iterator[Callable[..., None
     with ProgressBars(progress.TimeRemainingColumn(), transient=True) as bars:
         task = bars.add_task(what, total=total)
         yield lambda done, of=None: bars.update(task, completed=done, total=of)
+
+
+@contextmanager
+def say_if_long(what: str, seconds: float = 2.0) -> Iterator[None]:
+    """Prints a line on stderr if the work inside takes longer; each text once a process."""
+    timer = threading.Timer(seconds, _say, (what,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@lru_cache
+def _say(what: str) -> None:
+    print(what, file=sys.stderr, flush=True)
 
 
 def hang(head: str, text: str) -> list[str]:

@@ -35,7 +35,7 @@ def pressed(basis: LoadBasis, tissue: TissueKind, force: list[float]) -> Floats:
     share = (1 - np.square(disc).sum(axis=1)) ** 2
     load = np.outer(share / share.sum(), np.array(force) * [1, -1, -1])
     u = block.system.solve(block.embed(np.array([2.0, 3.0]) + 3 * disc).gather(load))
-    return np.asarray(block.embed(basis.known.points).move(u) * [1, -1, -1], np.float64)
+    return np.asarray(block.embed(basis.lattice.points).move(u) * [1, -1, -1], np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_monocular_intervals_cover_presses_along_the_optical_axis(basis: LoadBas
 @pytest.mark.slow
 def test_no_motion_is_no_force(basis: LoadBasis) -> None:
     for noise in (0.0, 0.03):
-        found = posterior.infer(basis, observed(np.zeros((len(basis.known.points), 3)), noise), STILL)
+        found = posterior.infer(basis, observed(np.zeros((len(basis.lattice.points), 3)), noise), STILL)
         low, high = physics.size_interval(found.force, 0.08)
         assert np.linalg.norm(found.force.mean) < 0.2
         assert low == 0.0
@@ -83,7 +83,7 @@ def test_no_motion_is_no_force(basis: LoadBasis) -> None:
 @pytest.mark.slow
 def test_the_tissues_own_motion_is_estimated_from_contact_free_frames(basis: LoadBasis) -> None:
     rng = np.random.default_rng(1)
-    terms = posterior.polynomials(basis.known.points)
+    terms = posterior.polynomials(basis.lattice.points)
     shape = rng.normal(size=(6, 3)) * [0.0, 0.05, 0.25]  # lifts and bends as one; twice that is stated
     own = [terms @ (np.sin(k) * shape) for k in range(1, 10)]
     modes = posterior.own_motion(basis, [observed(one, 0.005) for one in own[:8]])
@@ -129,7 +129,7 @@ def test_force_on_an_elastic_half_space_is_estimated(basis: LoadBasis) -> None:
     disc = disc[np.hypot(*disc.T) < radius]
     share = 1 - np.square(disc).sum(axis=1) / radius**2
     share /= share.sum()
-    x, y = np.moveaxis(basis.known.points[:, None] - disc, -1, 0)
+    x, y = np.moveaxis(basis.lattice.points[:, None] - disc, -1, 0)
     r = np.hypot(x, y).clip(0.05)
     shear = 1 / (2 * (1 + nu))
     p, q = force[2] / (4 * np.pi * shear), force[0] / (4 * np.pi * shear)
