@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
-from synth.geometry.mesh_file import SUFFIXES, read_mesh
+from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
 from synth.geometry.skin import skin
 from synth.geometry.triangles import Shape, side_areas
 from synth.job import identity
@@ -204,7 +204,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
                 raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
             # From bytes, trimesh can't open further files that are named in this one.
-            held = io.BytesIO(_whole(data) if kind == "stl" else data)
+            held = io.BytesIO(_whole(data) if kind == "stl" else check_surface(data, kind))
             mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
