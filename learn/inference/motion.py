@@ -76,7 +76,7 @@ def has_right_camera(path: Path | Array) -> bool:
     if isinstance(path, np.ndarray) or video.is_video(path):
         return False
     if path.suffix == ".npz":
-        return "motion" in checked_file.read_arrays(path)
+        return "motion" in checked_file.ArrayFile(path)
     first = next(_sequences(path), None)
     return first is not None and FIELDS["motion"] in first
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 import struct
 import warnings
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
-from synth.geometry.mesh_file import SUFFIXES, read_mesh
+from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
 from synth.geometry.skin import skin
 from synth.geometry.triangles import Shape, side_areas
 from synth.job import identity
@@ -204,7 +206,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
                 raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
             # From bytes, trimesh can't open further files that are named in this one.
-            held = io.BytesIO(_whole(data) if kind == "stl" else data)
+            held = io.BytesIO(_whole(data) if kind == "stl" else check_surface(data, kind))
             mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
@@ -240,6 +242,7 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
         if stated := re.search(_CENTRE, data):
             offset = np.array(stated[1].split(), np.float64)
     else:
+        _refuse_expansion(data)
         image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
         held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{one}") for one in ("POINTSET", "TRIANGLE")]
         if [[one.data.shape[1:] for one in arrays] for arrays in held] != [[(3,)], [(3,)]]:
@@ -248,6 +251,18 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
         if points.coordsys is None or points.coordsys.dataspace != 1:  # 1: NIFTI_XFORM_SCANNER_ANAT
             offset = np.array([float(points.meta.get(f"VolGeomC_{axis}", 0)) for axis in "RAS"])
     return np.asarray(vertices, np.float64), np.asarray(faces, np.int64), offset
+
+
+def _refuse_expansion(data: bytes) -> None:
+    """ValueError if the compressed arrays of a GIfTI file expand to more than a file may have."""
+    left = identity.FILES["anatomy", "mesh"]
+    for text in re.findall(rb"<Data>([^<]*)</Data>", data) if b"GZipBase64Binary" in data else ():
+        unpacker, packed = zlib.decompressobj(), base64.b64decode(text)
+        while packed and not unpacker.eof:
+            left -= len(unpacker.decompress(packed, 1 << 20))
+            packed = unpacker.unconsumed_tail
+            if left < 0:
+                raise ValueError("its arrays expand to more than 1 GB")
 
 
 def _whole(data: bytes) -> bytes:

@@ -51,6 +51,8 @@ _LEGACY_TYPES = {
 }  # fmt: skip
 _ATTRIBUTES = {"SCALARS": 1, "VECTORS": 3, "NORMALS": 3, "TENSORS": 9}
 _WORD_LINE = re.compile(rb"\n[ \t]*(?!nan\b|inf\b)[A-Za-z_]", re.IGNORECASE)
+_LONGEST_LINE = 20_000  # of a surface in text: a polygon's triangles take the square of its corners
+_MOST_NODES = 1000  # of a .glb, whose search takes their square
 _BLANK = re.compile(rb"\n[ \t\r]*\n")
 _TIMES = ("time", "timevalue")
 
@@ -127,13 +129,35 @@ def read_surface(data: bytes, suffix: str) -> tuple[Floats, Ints]:
     """
     import trimesh  # here, as it is slow to import
 
+    data = check_surface(data, suffix)
+    given = {"force": "mesh", "process": False, "maintain_order": True, "skip_materials": True}
+    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, **given)
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def check_surface(data: bytes, suffix: str) -> bytes:
+    """The bytes of a surface for trimesh, text in UTF-8; ValueError for what would take it without bound."""
     if suffix == "glb":
         _refuse_hollow(data)
     if suffix == "ply":
         _refuse_overcount(data)
-    given = {"force": "mesh", "process": False, "maintain_order": True, "skip_materials": True}
-    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, **given)
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if suffix in ("obj", "off") or (suffix == "ply" and b"format ascii" in data[:1000]):
+        if suffix == "obj":
+            data = _shape_of_obj(data)
+        if max(map(len, data.splitlines()), default=0) > _LONGEST_LINE:
+            raise ValueError(f"a line has over {_LONGEST_LINE} characters; has a face thousands of corners?")
+        try:
+            data.decode("utf-8")
+        except UnicodeDecodeError:  # of names and comments
+            return data.decode("latin-1").encode("utf-8")
+    return data
+
+
+def _shape_of_obj(data: bytes) -> bytes:
+    """Vertices and faces of an .obj alone, in order: groups, materials and textures split its vertices."""
+    lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
+    kept = (line for line in lines if line.split(None, 1)[:1] in ([b"v"], [b"f"]))
+    return re.sub(rb"/\S*", b"", b"\n".join(kept)) + b"\n"
 
 
 def _refuse_hollow(data: bytes) -> None:
@@ -141,8 +165,11 @@ def _refuse_hollow(data: bytes) -> None:
     size = int.from_bytes(data[12:16], "little")
     tree = json.loads(data[20 : 20 + size])
     hollow = [one for one in tree.get("accessors", []) if "bufferView" not in one or "sparse" in one]
-    if data[:4] != b"glTF" or hollow or tree.get("extensionsRequired"):
-        raise ValueError("it is no plain GLB: sparse, empty or compressed arrays, or another format")
+    if len(tree.get("nodes", [])) > _MOST_NODES:
+        raise ValueError(f"it has over {_MOST_NODES} nodes; join its meshes")
+    outside = any("uri" in one for one in tree.get("buffers", []))
+    if data[:4] != b"glTF" or hollow or outside or tree.get("extensionsRequired"):
+        raise ValueError("it is no plain GLB: sparse, empty, compressed or outer arrays, or another format")
 
 
 def _refuse_overcount(data: bytes) -> None:
@@ -300,7 +327,7 @@ def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit:
     refuse_excess(total)
     stops, parts = np.cumsum([width * (count + 3), *packed]), list[bytes]()
     for (start, end), wanted in zip(pairwise(stops.tolist()), sizes, strict=True):
-        part = _PACKERS[packer]().decompress(data[start:end], wanted)
+        part = _PACKERS[packer]().decompress(data[start:end], wanted + 1)
         if len(part) != wanted:
             raise ValueError("a block has another size than it states; is it truncated?")
         parts.append(part)
@@ -353,7 +380,9 @@ def _read_legacy(data: bytes) -> MeshFile:
             target[words[1]] = PointArray(parts, file.numbers(rows * parts, words[2], (rows, parts)))
         elif key == "FIELD":
             for _ in range(int(words[2])):
-                name, width, tuples, kind = file.words()[:4]  # ValueError at the end of the file
+                if len(words := file.words()) < 4:
+                    raise ValueError("an array of its field is missing; is it truncated?")
+                name, width, tuples, kind = words[:4]
                 parts, count = int(width), int(tuples)
                 if kind == "string":
                     file.skip_lines(count)

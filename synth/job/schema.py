@@ -111,10 +111,10 @@ class MechanicsSection(Section):
     """Motion and load of another program's files, instead of our finite elements'."""
 
     source: Path | None = None
-    """Files of a deforming surface or volume: numbered .vtu, .vtk or .vtp as a pattern with *, a collection
-    of them (.pvd, .series), a run of the published recorder, an .npz, or a folder with one of these; relative
-    to the job file. A pattern that ends in */ names folders, used by sequences in turn. Its surface
-    at rest takes the place of `anatomy.mesh`. Empty: our own finite elements."""
+    """Files of a deforming surface or volume: numbered .vtu, .vtk, .vtp, .obj, .ply or .glb as a pattern with
+    *, a collection of them (.pvd, .series), a run of the published recorder, an .npz, or a folder with one of
+    these; relative to the job file. A pattern that ends in */ names folders, used by sequences in turn. Its
+    surface at rest takes the place of `anatomy.mesh`. Empty: our own finite elements."""
     unit_mm: Positive | None = None
     """Millimetres in the files' unit of length: 1000 for m."""
     unit_mn: Positive | None = None

@@ -26,6 +26,7 @@ def as_job(source: Path) -> str:
     named = [f"nodal:{name}, traction:{name}" for name in series.fields if name.lower() not in MOVED]
     lines = [
         f"# {series.summary}.",
+        *(f"# DOUBTFUL: {caution}" for caution in series.cautions),
         "# Look at it:  synth preview THIS_FILE      Render it:  synth render THIS_FILE -o OUT",
         "# Every key:   synth new",
         "sequences: 1  # more: the same motion, other vessels, lamps and instruments",

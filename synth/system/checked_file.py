@@ -9,7 +9,6 @@ import os
 import shutil
 import stat
 import tempfile
-import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -24,14 +23,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import MarkedYAMLError
 
-from synth.errors import UserError, as_user_error, first_line
+from synth.errors import Caution, UserError, as_user_error, first_line
 from synth.system.resources import refuse_excess
 
 LARGEST_PICTURE, LARGEST_YAML = 512 << 20, 200_000  # bytes
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
 _LARGEST_HEAD = 10_000  # bytes of an array's header, NumPy's own limit
-_OLD_S = 86_400.0  # after which an unfinished folder has been left, where locks can't tell
 PART = ".part"  # suffix of files that are being written, `.NAME.RANDOM.part`
 
 
@@ -271,12 +269,11 @@ def _sweep_parts(path: Path) -> None:
             descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
                 free = _lock(descriptor)
-                if free is None:  # no locks here: another machine may write to it
-                    free = (
-                        time.time() - max(one.lstat().st_mtime for one in (part, *part.rglob("*"))) > _OLD_S
-                    )
                 if free:
                     shutil.rmtree(part)
+                elif free is None:  # no locks on this file system
+                    left = f"{part}: was left by a process that was killed, or another one writes to it"
+                    warnings.warn(f"{left}; delete it in the first case", Caution, stacklevel=1)
             finally:
                 os.close(descriptor)
 

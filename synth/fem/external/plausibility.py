@@ -28,6 +28,10 @@ _ALONG = (
 )
 _HALF_SPACE = 0.43  # E a u / F of a uniform load on a half-space, 16 (1 - nu^2) / (3 pi^2), nu = 0.45
 _LEAST_WORK = 0.02  # share of the largest work below which a negative one is rounding
+_LOADED, _GIVES_LESS = (
+    0.3,
+    0.05,
+)  # share of the largest load; of the compliance under it, tissue stiffens by less
 _PULLS = 0.5  # cosine between a load and the outward direction above which it pulls
 _OUT_OF_LINE, _NEAR = 0.5, 0.35  # of the length of edges: a node off its neighbours; on another's place
 _MOST_NAMED = 4
@@ -120,16 +124,28 @@ def find_load_doubts(
             f"force: does negative work, {done[at] / 2:.2g} mN mm in state {at}: it has to be what acts on "
             "the tissue, not the reaction; is its sign right?"
         )
-    elif work < _ALONG * most:
+    elif 0 < work < _ALONG * most:
         angle = np.degrees(np.arccos(np.clip(work / max(most, 1e-300), -1, 1)))
         found.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
-    elif total_mn > 0:
+    elif work <= 0:
+        found.append(
+            f"force: {total_mn:.3g} mN act on nodes that don't move; are nodes, faces and force in one order?"
+        )
+    else:
         stiff = _HALF_SPACE * total_mn / (radius * work / total_mn)
         least, largest = _YOUNG_KPA if young_kpa is None else (one * young_kpa for one in _STIFFNESS)
         if not least <= stiff <= largest:
             stated = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
             what = f"load and motion are those of a tissue of {stiff:.2g} kPa, fem.young_kpa is {stated}"
             found.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
+        borne = size.sum(axis=1, dtype=np.float64)
+        given = done / np.maximum(borne, 1e-30) ** 2  # compliance: mean motion along the load, per load
+        late = np.flatnonzero((borne > _LOADED * total_mn) & (given < _GIVES_LESS * given[k]))
+        if late.size:
+            state, why = int(late[0]), "have force and motion the same times?"
+            found.append(
+                f"force: {borne[state]:.3g} mN in state {state} move the tissue hardly at all; {why}"
+            )
     return found
 
 

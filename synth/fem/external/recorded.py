@@ -21,7 +21,7 @@ from synth.arrays import Floats, Ints
 from synth.errors import UserError, as_user_error
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.fem.external.vtk_series import force_field
-from synth.geometry.mesh_file import read_surface, whole
+from synth.geometry.mesh_file import Numbers, read_surface, whole
 from synth.geometry.skin import TRIANGLE
 from synth.job import identity
 from synth.system import checked_file
@@ -49,7 +49,8 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
     if len(shapes.get("points", ())) == 3 and shapes["points"][0]:
         moved = held["points"]
         rest = moved[0].astype(np.float64)
-        moved = moved - moved[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # refused later
+            moved = moved - moved[0]
     elif "rest" in held and (name := next((one for one in _MOTION if one in held), None)):
         rest, moved = held["rest"].astype(np.float64), held[name]
     else:
@@ -74,10 +75,16 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
         cells = named or {kind: whole(held[one]) for one, kind in _CELLS.items() if one in held}
     surface = find_surface(rest, cells, file)
     states = (
-        State(file, at, moved[k].astype(np.float64), None if load is None else load[k].astype(np.float64))
+        State(file, at, _double(moved[k]), None if load is None else _double(load[k]))
         for k, at in enumerate(time.tolist())
     )
     return assemble(file, surface, units, len(time), states, fields, per_area)
+
+
+def _double(values: Numbers) -> Floats:
+    """Values (N, 3) in double precision; what is too large for it is infinite, which is refused later."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float64)
 
 
 def _faces_of(arrays: Path, rest: Floats) -> Ints:

@@ -22,6 +22,7 @@ from synth.system.resources import refuse_excess
 _LENGTHS = {1.0: "mm", 1000.0: "m", 10.0: "cm"}
 _LIKELY_MM, _POSSIBLE_MM = (20.0, 400.0), (1.0, 2000.0)  # largest extent of a specimen
 _ROUNDING = 1e-5  # relative to an extent or a largest force: files are in single precision
+_LATEST_S = 1e9
 _LARGEST = 1e30  # of a displacement or force: its square is summed in double precision
 _MOST_STRETCH = 3.0  # of the width of a specimen
 _DISPLACED = 0.3  # share of the largest displacement
@@ -95,8 +96,10 @@ class OuterSurface(NamedTuple):
 def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> OuterSurface:
     """The outer surface of cells (see `skin`) of points (M, 3) at rest. UserError: there is none, or points
     are not finite or belong to several bodies."""
-    if not np.isfinite(points).all():
-        raise UserError(f"{where}: has coordinates that are not finite")
+    if not len(points):
+        raise UserError(f"{where}: has no points")
+    if not np.abs(points).max() < _LARGEST:
+        raise UserError(f"{where}: has coordinates that are not finite, or above {_LARGEST:g}")
     step = _ROUNDING * max(float(np.ptp(points, axis=0).max(initial=0)), 1e-12)
     _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     place = first[place.ravel()]
@@ -107,6 +110,8 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
         outer = skin(points, cells)
         sides = np.cross(points[outer[:, 1]] - points[outer[:, 0]], points[outer[:, 2]] - points[outer[:, 0]])
         area = np.linalg.norm(sides, axis=1)  # cells may be collapsed
+        if not area.max(initial=0) > 0:
+            raise ValueError("its surface has no area")
         nodes, faces = np.unique(outer[area > _ROUNDING**2 * area.max()], return_inverse=True)
     links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
     graph = sp.coo_array((np.ones(sum(one.shape[1] for one in links)), np.hstack(links)), [len(points)] * 2)
@@ -170,7 +175,8 @@ def assemble(
     if force is None:
         return found
     each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
-    force *= np.asarray(_force_mn(units, source) * each, np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # `bear` refuses what is infinite
+        force *= np.asarray(_force_mn(units, source) * each, np.float32)
     return bear(found, force, source)
 
 
@@ -205,8 +211,8 @@ def _refuse_blank(displacement: Map, files: list[Path]) -> None:
 
 def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
     """Times (S,) s from 0, as stated by the files or `dt_s`. UserError: none, or they don't rise."""
-    if np.isinf(times).any():
-        raise UserError(f"{files[int(np.isinf(times).argmax())]}: its time is infinite")
+    if (wild := np.abs(times) > _LATEST_S).any():
+        raise UserError(f"{files[at := int(wild.argmax())]}: its time is {times[at]:g} s")
     if np.isnan(times).all():
         if units.dt_s is None:
             raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
@@ -261,7 +267,8 @@ def press(series: MeshSeries, table: Path, units: Units, patch_mm: float) -> Mes
         if not share.any() and row[:3].any():
             at = f"no node within {patch_mm:g} mm of the contact at {series.time[k]:g} s"
             raise UserError(f"{table}: {at}; is its unit that of the files?")
-        force[k] = unit_mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
+        with np.errstate(over="ignore", invalid="ignore"):
+            force[k] = unit_mn * row[:3] * (share / max(share.sum(), 1e-12))[:, None]
     return bear(series, force, table)
 
 

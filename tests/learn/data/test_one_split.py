@@ -192,6 +192,19 @@ def test_half_of_the_validation_brains_are_moved_to_the_interval_part(clips: lis
     assert partition.find_obstacle([some[i] for i in found.select], [some[i] for i in found.intervals]) == ""
 
 
+def test_labels_that_are_the_training_data_are_refused(tmp_path: Path) -> None:
+    own = make(tmp_path / "own", [*range(9)])
+    clips = load_clips(own, BASE.grid, ["ideal"])
+    clips, parts = partition.divide(clips, [own], seed=0)
+    with pytest.raises(UserError, match="--labels"):
+        partition.add_labels(clips, parts, clips)
+    held_back = [clips[k] for k in parts.test]
+    others = [replace(one, content_hash=f"other {one.content_hash}") for one in held_back]
+    with pytest.raises(UserError, match="--labels"):
+        partition.add_labels(clips, parts, others)
+    assert partition.add_labels(clips, parts, []) == (clips, parts)
+
+
 @pytest.mark.slow
 def test_labels_join_training_unless_their_brain_is_on_another_side(tmp_path: Path) -> None:
     own, truth = make(tmp_path / "own", [*range(9)]), make(tmp_path / "truth", [*range(12)], first=20)

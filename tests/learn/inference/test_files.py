@@ -28,6 +28,7 @@ from learn.inference.convert import examples
 from learn.inference.export import export
 from learn.inference.motion import motions
 from learn.inference.predict import load_model
+from learn.inference.shipped import MODELS
 from learn.settings import preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
@@ -48,6 +49,24 @@ from synth.video.read import read_video
 )
 def model(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     return write_model(tmp_path_factory.mktemp("model"), *request.param)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"force_gain": 1e308},
+        {"force_gain": 1e-300},
+        {"typical_young_kpa": 1e308},
+        {"scales": {"target": 1e200}},
+    ],
+)
+def test_a_card_with_an_absurd_number_is_refused(changed: dict[str, Any], tmp_path: Path) -> None:
+    """Its seal matches: whoever made it meant it."""
+    card = read_card(MODELS / "mono")
+    scales = replace(card.scales, **changed.pop("scales", {}))
+    write_card(tmp_path / "model", replace(card, **changed, scales=scales))
+    with pytest.raises(UserError, match="must be from"):
+        read_card(tmp_path / "model")
 
 
 def test_an_exported_model_predicts_the_same_force_with_its_gain(

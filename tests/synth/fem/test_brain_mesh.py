@@ -203,6 +203,17 @@ def test_neuroimaging_is_read_as_stored_or_refused(tmp_path: Path, monkeypatch: 
             brain_surface.read_brain(path)
 
 
+def test_arrays_that_expand_without_bound_are_refused(tmp_path: Path) -> None:
+    """A GIfTI file of a megabyte whose points expand to 1.1 GB."""
+    gii = stored(tmp_path / "B64GZ.gii", "B64GZ")
+    packer = zlib.compressobj()
+    bomb = b"".join(packer.compress(bytes(1 << 24)) for _ in range(66)) + packer.flush()
+    start, end = gii.index(b"<Data>") + 6, gii.index(b"</Data>")
+    (tmp_path / "a.gii").write_bytes(gii[:start] + base64.b64encode(bomb) + gii[end:])
+    with pytest.raises(UserError, match="1 GB"):
+        brain_surface.read_brain(tmp_path / "a.gii")
+
+
 @pytest.mark.trial
 def test_openings_of_fsaverage5_are_found_and_rendered(tmp_path: Path) -> None:
     nibabel, place = pytest.importorskip("nibabel"), "nilearn/datasets/data/fsaverage5/pial_[lr]*.gii.gz"

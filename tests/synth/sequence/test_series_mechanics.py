@@ -14,6 +14,7 @@ from synth.arrays import Floats
 from synth.checks.verify import verify_dataset
 from synth.cli import app
 from synth.errors import Caution, UserError
+from synth.fem.external.read import read_job_series
 from synth.job import identity
 from synth.job.schema import Job
 from synth.render.camera import camera
@@ -131,9 +132,53 @@ def test_without_a_force_there_is_no_label_anywhere(source: Path, tmp_path: Path
     assert np.isnan(synth.simulate(job_of(source), 0).force).all()
 
 
+@pytest.mark.slow
+def test_doubts_are_stored_and_counted_and_a_replaced_series_is_refused(tmp_path: Path) -> None:
+    """Two nodes that change places are named by render and verify; then another motion takes their place."""
+    source = write(tmp_path / "block", "npz")
+    with np.load(source) as held:
+        arrays = dict(held)
+    top = np.flatnonzero(np.isclose(arrays["rest"][:, 2], 0))
+    order = top[np.linalg.norm(arrays["rest"][top], axis=1).argsort()][:2]
+    places = (arrays["rest"] + arrays["displacement"][3])[order[::-1]]
+    arrays["displacement"][3][order] = places - arrays["rest"][order]
+    np.savez(source, **arrays)
+    job, root = job_of(source, *FORCE, "sequences=2"), tmp_path / "out"
+    made = synth.render_job(job.model_copy(update={"sequences": 1}), root, workers=1)
+    (doubt,) = (one for one in made.cautions if one.startswith("nodes"))
+    assert all(str(one) in doubt for one in [*order.tolist(), "state 3"])
+    assert made.cautions[doubt] == [0]
+    stored = synth.open_sequence(root / "000000.zarr").attrs["mechanics"]["cautions"]
+    assert doubt in stored
+    report = verify_dataset(root, fast=True)
+    assert report.cautions[doubt] == [0]
+    assert not report.verdict.startswith("good")
+    np.savez(source, **{**arrays, "displacement": 0.9 * arrays["displacement"]})
+    with pytest.raises(UserError, match="another job"):
+        synth.render_job(job, root, workers=1)
+    with pytest.warns(Caution, match="nodes"):
+        scene = synth.simulate(job, 1)
+    with pytest.raises(UserError, match="replaced"):
+        synth.write_scene(scene, root)
+
+
+def test_a_pull_is_doubtful_unless_the_instrument_can(source: Path) -> None:
+    """A press upside down is a pull; the direction of the opening tells."""
+    with np.load(write(source.parent / "pull", "npz")) as held:
+        arrays = dict(held)
+    arrays |= {name: -arrays[name] for name in ("displacement", "contact")}
+    np.savez(source.parent / "pull/s.npz", **arrays)
+    job = job_of(source.parent / "pull/s.npz", *FORCE)
+    assert any("upside down" in one for one in read_job_series(job, 0).cautions)
+    table(source.parent / "pull/s.npz", "tips.csv", np.zeros((STATES, 3)))
+    given = ["mechanics.instruments=tips.csv", "fem.instrument=forceps"]
+    job = job_of(source.parent / "pull/s.npz", *FORCE, *given)
+    assert not read_job_series(job, 0).cautions
+
+
 def test_load_outside_the_opening_is_reported(source: Path) -> None:
     place = PLACE.replace("point: [0", "point: [10")
-    with pytest.warns(Caution, match=r"mechanics\.force: .* mN, [3-7]\d%.* 0.00 mN"):
+    with pytest.warns(Caution, match=r"force: .* mN, [3-7]\d%.* 0.00 mN"):
         scene = synth.simulate(job_of(source, *FORCE, place), 0)
     np.testing.assert_allclose(scene.motion.force[2], -solve().reaction, rtol=1e-5, atol=1e-5)
 

@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image
 
 from synth.errors import UserError
-from synth.system import checked_file
+from synth.system import checked_file, memory
 
 HOME = str(Path(checked_file.__file__).parents[2])
 
@@ -66,6 +67,59 @@ def test_a_corrupted_file_is_one_line_and_runs_no_code(
         read(tmp_path / "a")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "ran").exists()
+
+
+def npz(path: Path, shape: tuple[int, ...], size: int, method: int = zipfile.ZIP_DEFLATED) -> None:
+    """An .npz of a small array `a` and of `b`, whose header states float64 of a shape for `size` bytes."""
+    np.savez_compressed(path, a=np.arange(3))
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(path, "a", method) as archive, archive.open("b.npy", "w") as entry:
+        entry.write(head.getvalue())
+        for start in range(0, size, 1 << 20):
+            entry.write(bytes(min(1 << 20, size - start)))
+
+
+def test_an_array_is_expanded_when_it_is_needed_and_fits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """800 MB in a file of 0.8 MB, where 1 GB is free: its neighbour is read all the same."""
+    npz(tmp_path / "a.npz", (10**8,), 8 * 10**8)
+    assert (tmp_path / "a.npz").stat().st_size < 10**6
+    monkeypatch.setattr(memory, "free_bytes", lambda: 10**9)
+    held = checked_file.ArrayFile(tmp_path / "a.npz")
+    assert held.shapes["b"] == (10**8,)
+    assert held["a"].tolist() == [0, 1, 2]
+    with pytest.raises(UserError, match="GB of memory"):
+        held["b"]
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "method"),
+    [
+        ((10**12,), 80, zipfile.ZIP_DEFLATED),
+        ((10,), 80_000, zipfile.ZIP_DEFLATED),
+        ((-10,), 80, zipfile.ZIP_DEFLATED),
+        ((10,), 80, zipfile.ZIP_BZIP2),
+        ((10,), 80, zipfile.ZIP_LZMA),
+    ],
+)
+def test_an_array_has_the_size_that_its_header_states(
+    tmp_path: Path, shape: tuple[int, ...], size: int, method: int
+) -> None:
+    npz(tmp_path / "a.npz", shape, size, method)
+    with pytest.raises(UserError):
+        checked_file.ArrayFile(tmp_path / "a.npz")
+
+
+def test_free_memory_is_at_most_the_machines() -> None:
+    whole = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    free = memory.free_bytes()
+    assert free is not None
+    assert 0 < free <= int(whole["MemTotal"].split()[0]) * 1024
+    with pytest.raises(ValueError, match="GB"):
+        memory.refuse_excess(free)
+    memory.refuse_excess(free // 10)
 
 
 def test_values_of_valid_files_are_read(tmp_path: Path) -> None:

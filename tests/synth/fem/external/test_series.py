@@ -1,22 +1,54 @@
 """Series of other programs: every format gives the same states, whatever can't be used is refused by name."""
 
+import base64
+import json
+import os
 import re
-from collections.abc import Callable
+import resource
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pressed_block
 import pytest
+import trimesh
 from pressed_block import STATES, STEP_S, solve, write
+from scipy.spatial.transform import Rotation
 
 from synth.arrays import Floats, Ints
 from synth.errors import UserError
-from synth.fem.external.read import read_series
+from synth.fem.external.plausibility import contact_radius, is_rigid
+from synth.fem.external.read import doubt_load, read_series
 from synth.fem.external.series import MeshSeries, Units
+from synth.geometry.mesh_file import SURFACES, read_mesh, read_surface
+from synth.geometry.skin import skin
 
 FORMS = ("ascii", "binary", "vtk", "moving", "npz", "points")
 FORCE = "nodal:contact"
 TABLE = "time,fx,fy,fz,x,y,z\n0,0,0,0,1,0,0\n0.2,1.5,0,-4,1,0,0\n0.5,0,0,0,1,0,0\n"
+
+
+@contextmanager
+def limited(more: int) -> Iterator[None]:
+    """Memory that the process may take beyond what it has [bytes]."""
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (size + more, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def glb(tree: dict[str, Any]) -> bytes:
+    """A .glb of this JSON, without binary data."""
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = np.array([2, 20 + len(text), len(text)], "<u4").tobytes()
+    return b"glTF" + head + b"JSON" + text
 
 
 def read(source: Path, mm: float = 1.0, mn: float = 1.0, force: str | None = FORCE) -> MeshSeries:
@@ -157,6 +189,19 @@ def first(one: Floats) -> Floats:
     return one[:1]
 
 
+def first_none(one: Floats) -> Floats:
+    return one[:0]
+
+
+def none(one: Floats) -> Floats:
+    return one[:, :0]
+
+
+def as_rigid(one: Floats) -> Floats:
+    """A press of 1 mm without a deformation."""
+    return 0 * one + np.outer(solve().scale, [0, 0, -1])[:, None]
+
+
 def at(k: int, value: float) -> Callable[[Floats], Floats]:
     def put(one: Floats) -> Floats:
         one = one.astype(float)
@@ -200,6 +245,15 @@ BAD: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "separate bodies": (r"2 separate", arrays(tetrahedra=apart)),
     "a collection of nothing": (r"block\.pvd", change("block.pvd", "<DataSet.*/>", "", "binary")),
     "a file outside": (r"\.\./b", change("block.pvd", 'file="b', 'file="../b', "binary")),
+    "motion of a wrong unit": ("times the width", arrays(displacement=lambda u: 1000 * u)),
+    "motion of 1e30 mm": (r"s\.npz", arrays(displacement=at(2, 1e30))),
+    "forces of 1e300 mN": (r"s\.npz", arrays(contact=lambda f: 1e300 * f)),
+    "a rigid motion with a force": ("rigid", arrays(displacement=as_rigid)),
+    "a zero state midway": ("state 2", arrays(displacement=lambda u: u * (np.arange(5) != 2)[:, None, None])),
+    "faces that are not whole": ("whole", arrays(tetrahedra=lambda t: t + 0.5)),
+    "an infinite last time": ("inf", arrays(times=lambda t: np.append(t[:-1], np.inf))),
+    "times of 1e308 s": ("308", arrays(times=lambda t: np.array([-1.7e308, 0, 1, 2, 1.7e308]))),
+    "no points": (r"s\.npz", arrays(rest=first_none, displacement=none, contact=none)),
     "another engine's format": (r"\.frd.*VTU", lambda folder: folder / "block.frd"),
 }  # fmt: skip
 
@@ -211,6 +265,226 @@ def test_a_bad_series_is_refused_in_one_line_that_names_it(what: str, tmp_path: 
     with pytest.raises(UserError, match=named) as refused:
         read(source)
     assert "\n" not in str(refused.value)
+
+
+def no_doubts(source: Path, young_kpa: float | None = 1.0) -> list[str]:
+    """All that is doubtful in a series."""
+    series = read(source)
+    return [*series.cautions, *doubt_load(series, young_kpa)]
+
+
+def exchange(state: int, *nodes: int) -> Callable[[Floats], Floats]:
+    """Displacement in which nodes take each other's places in a state."""
+
+    def put(u: Floats) -> Floats:
+        points = solve().points[list(nodes)]
+        u[state, nodes] = np.roll(points + u[state, nodes], 1, axis=0) - points
+        return u
+
+    return put
+
+
+def nearest(*place: float) -> int:
+    return int(np.linalg.norm(solve().points - place, axis=1).argmin())
+
+
+MIDDLE = nearest(0, 0, 0)
+
+DOUBTFUL: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "newtons taken for millinewtons": (r"P = 4\.1e\+02.*", arrays(contact=lambda f: 1000 * f)),
+    "millinewtons taken for newtons": (r"P = 0\.00041", arrays(contact=lambda f: f / 1000)),
+    "reaction instead of load": ("negative work", arrays(contact=lambda f: -f)),
+    "y and z of the load swapped": ("80 degrees", arrays(contact=lambda f: f[..., [0, 2, 1]])),
+    "y and z of the motion swapped": ("80 degrees", arrays(displacement=lambda u: u[..., [0, 2, 1]])),
+    "load on other nodes": ("don't move", arrays(contact=lambda f: f[:, ::-1])),
+    "load a state late": ("state 4", arrays(contact=lambda f: np.stack([0 * f[0], *f[:3], f[1]]))),
+    "ms taken for s": (r"over 400 s", arrays(times=lambda t: 1000 * t)),
+    "s taken for ms": (r"over 0\.0004 s", arrays(times=lambda t: t / 1000)),
+    "two nodes": (
+        f"nodes {min(nearest(0, 0, 0), nearest(3, 0, 0))}, .* state 3:",
+        arrays(displacement=exchange(3, nearest(0, 0, 0), nearest(3, 0, 0))),
+    ),
+    "two nodes far apart": ("state 3:", arrays(displacement=exchange(3, MIDDLE, nearest(-18, 9, 0)))),
+    "three nodes in turn": (
+        "state 1:",
+        arrays(displacement=exchange(1, nearest(0, 0, 0), nearest(3, 0, 0), nearest(0, 3, 0))),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", DOUBTFUL)
+def test_what_is_unlikely_of_tissue_is_said(what: str, tmp_path: Path) -> None:
+    named, made = DOUBTFUL[what]
+    doubts = no_doubts(made(tmp_path))
+    assert len([one for one in doubts if re.search(named, one)]) == 1
+    assert not any("\n" in one for one in doubts)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_plausible_series_raises_no_doubt(form: str, tmp_path: Path) -> None:
+    assert no_doubts(write(tmp_path, form)) == []
+
+
+@pytest.mark.parametrize("factor", [1000.0, 1e-3])
+def test_a_wrong_unit_of_force_is_seen_without_a_stiffness(factor: float, tmp_path: Path) -> None:
+    (doubt,) = no_doubts(arrays(contact=lambda f: factor * f)(tmp_path), None)
+    assert f"{1.2 * factor:.1e} kPa".replace(".0e", "e") in doubt or f"{1.2 * factor:.2g} kPa" in doubt
+
+
+def test_the_contact_of_a_uniform_pressure_has_its_own_radius() -> None:
+    """Of a disk of 12 mm on a fine grid, loaded evenly; of a paraboloid (3/4)^(1/2) of it."""
+    across = np.linspace(-20, 20, 161)
+    points = np.stack([*np.meshgrid(across, across), np.zeros((161, 161))], axis=-1).reshape(-1, 3)
+    corner = np.arange(161 * 160)[np.arange(161 * 160) % 161 < 160]
+    faces = np.concatenate([corner[:, None] + [0, 1, 162], corner[:, None] + [0, 162, 161]])
+    share = np.maximum(1 - (points**2).sum(axis=1) / 144, 0)[:, None] * [0, 0, -1.0]
+    assert contact_radius(points, faces, np.sign(share)) == pytest.approx(12, rel=0.01)
+    assert contact_radius(points, faces, share) == pytest.approx(12 * np.sqrt(0.75), rel=0.01)
+
+
+def test_a_rigid_body_is_told_from_a_bent_one() -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (500, 3))
+    turn = Rotation.from_rotvec([0.1, -0.3, 0.2]).as_matrix()
+    moved = points @ turn.T + [1, 2, 3] - points
+    assert is_rigid(points, moved)
+    assert not is_rigid(points, moved + 0.05 * np.sin(points[:, :1] / 5) * [0, 0, 1.0])
+
+
+def packed(*blocks: bytes, size: int, last: int = 0) -> str:
+    """The base64 text of compressed blocks whose header states `size` bytes each."""
+    head = np.array([len(blocks), size, last, *map(len, blocks)], "<u4").tobytes()
+    return base64.b64encode(head).decode() + base64.b64encode(b"".join(blocks)).decode()
+
+
+def compressed(points: str, count: int, other: str = "") -> bytes:
+    """A .vtu of one tetrahedron and `count` points, with another array at them."""
+    text = (
+        '<VTKFile type="UnstructuredGrid" byte_order="LittleEndian" compressor="vtkZLibDataCompressor">'
+        f'<UnstructuredGrid><Piece NumberOfPoints="{count}" NumberOfCells="1"><Points><DataArray '
+        f'type="Float32" NumberOfComponents="3" format="binary">{points}</DataArray></Points><Cells>'
+        '<DataArray type="Int32" Name="connectivity" format="ascii">0 1 2 3</DataArray>'
+        '<DataArray type="Int32" Name="offsets" format="ascii">4</DataArray>'
+        '<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells>'
+        f"<PointData>{other}</PointData></Piece></UnstructuredGrid></VTKFile>"
+    )
+    return text.encode()
+
+
+TETRAHEDRON = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+POINTS = packed(zlib.compress(TETRAHEDRON.astype("<f4").tobytes()), size=48)
+HUGE = zlib.compress(bytes(1 << 24))
+LEGACY = b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET UNSTRUCTURED_GRID\n"
+ENTITIES = '<!DOCTYPE x [<!ENTITY a "b">]><VTKFile type="UnstructuredGrid">&a;</VTKFile>'
+
+BOMBS = {
+    "a block larger than it states": compressed(packed(HUGE, size=48), 4),
+    "more blocks than it has": compressed("AAAAgAEAAAABAAAA", 4),
+    "all that it states, of 12 GB": compressed(packed(*[HUGE] * 768, size=1 << 24), (768 << 24) // 12),
+    "blocks of no size": compressed(packed(HUGE, size=0), 4),
+    "entities in UTF-16": ENTITIES.encode("utf-16"),
+    "entities": ENTITIES.encode(),
+    "cells": LEGACY + b"POINTS 1 float\n0 0 0\nCELLS 1000000000 1\n0\n",
+    "cells of a negative size": LEGACY + b"POINTS 1 float\n0 0 0\nCELLS 3 6\n-1 4 0 0 0 0\n",
+    "arrays of a field": LEGACY + b"FIELD f 1000000000000\n",
+    "texts of a field": LEGACY + b"FIELD f 1\na 1 1000000000000 string\nx\n",
+    "points": LEGACY + b"POINTS 1000000000000000 float\n0 0 0\n",
+    "a negative number of points": LEGACY.replace(b"ASCII", b"BINARY") + b"POINTS -1 float\n" + bytes(12),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BOMBS)
+def test_what_a_mesh_declares_is_held_against_its_bytes(what: str) -> None:
+    """In 200 MB beyond what the process has, without a loop over what isn't there."""
+    with limited(200 << 20), pytest.raises(ValueError, match=r"."):
+        read_mesh(BOMBS[what])
+
+
+def test_arrays_that_are_not_needed_are_not_expanded() -> None:
+    named = '<DataArray type="Float64" Name="{}" NumberOfComponents="3" format="binary">{}</DataArray>'
+    u = packed(zlib.compress(np.arange(12.0).astype("<f8").tobytes()), size=96)
+    with limited(200 << 20):
+        mesh = read_mesh(
+            compressed(POINTS, 4, named.format("u", u) + named.format("x", packed(HUGE, size=96)))
+        )
+        np.testing.assert_array_equal(mesh.point_data["u"].read(), np.arange(12.0).reshape(4, 3))
+        with pytest.raises(ValueError, match=r"another size|expands"):
+            mesh.point_data["x"].read()
+
+
+@pytest.mark.parametrize("strips", [False, True])
+def test_polygons_and_strips_become_triangles_that_face_alike(strips: bool) -> None:
+    """A fan of a hexagon and of a square; a strip of a band: areas add up, normals agree."""
+    ring = np.stack([np.cos(np.arange(6) * np.pi / 3), np.sin(np.arange(6) * np.pi / 3), np.zeros(6)], axis=1)
+    if strips:
+        ring = np.array([[k // 2, k % 2, 0] for k in range(6)], float)
+    rows = "6 0 1 2 3 4 5\n4 0 1 2 3\n" if not strips else "6 0 2 1 3 4 5\n".replace("2 1", "1 2")
+    kind = "TRIANGLE_STRIPS" if strips else "POLYGONS"
+    text = "\n".join(" ".join(map(str, row)) for row in ring.tolist())
+    size = 12 if not strips else 7
+    data = f"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\nPOINTS 6 float\n{text}\n"
+    mesh = read_mesh(f"{data}{kind} {2 - strips} {size}\n{rows}".encode())
+    a, b, c = (mesh.points[mesh.cells[5][:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)[:, 2] / 2
+    assert len({bool(one > 0) for one in normals}) == 1
+    whole = 2.0 if strips else 1.5 * np.sqrt(3) + 0.75 * np.sqrt(3)
+    assert np.abs(normals).sum() == pytest.approx(whole)
+
+
+@pytest.mark.parametrize("kind", SURFACES)
+def test_surfaces_that_move_are_read_in_their_order(kind: str, tmp_path: Path) -> None:
+    """As OBJ with groups, materials (which are not opened) and textures, PLY and GLB, written by trimesh."""
+    block = solve()
+    used, faces = np.unique(skin(block.points, {10: block.tets}), return_inverse=True)
+    for k in range(STATES):
+        mesh = trimesh.Trimesh(
+            block.points[used] + block.scale[k] * block.u[used], faces.reshape(-1, 3), process=False
+        )
+        data = mesh.export(file_type=kind)
+        data = data.encode() if isinstance(data, str) else data
+        if kind == "obj":
+            lines = (
+                f"f {' '.join(f'{word}/{1 + k % 2}' for word in line[2:].split())}"
+                if line[:2] == "f "
+                else line
+                for line in data.decode().splitlines()
+            )
+            data = ("mtllib m.mtl\no größe\nvt 0 0\nvt 1 1\nusemtl a\n" + "\n".join(lines) + "\n").encode(
+                "latin-1"
+            )
+        (tmp_path / f"s_{k}.{kind}").write_bytes(data)
+    os.mkfifo(tmp_path / "m.mtl")
+    series = read_series(tmp_path / f"s_*.{kind}", Units(1.0, dt_s=STEP_S))
+    order, true = (np.lexsort(one.round(3).T) for one in (series.points, block.points[used]))
+    np.testing.assert_allclose(series.points[order], block.points[used][true], atol=1e-5)
+    np.testing.assert_allclose(series.displacement[2][order], block.u[used][true], atol=1e-5)
+
+
+HOSTILE_SURFACES = {
+    "a face of a million corners": ("obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 " * 10**6),
+    "a face that is continued": ("obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 \\\n" * 10**5 + b"1\n"),
+    "a count beyond the bytes": ("ply", b"ply\nformat ascii 1.0\nelement vertex 1000000000000\nend_header\n"),
+    "arrays without bytes": ("glb", glb({"accessors": [{"count": 10**9, "type": "VEC3"}]})),
+    "a file outside": ("glb", glb({"buffers": [{"uri": "../../etc/passwd", "byteLength": 10}]})),
+    "a chain of nodes": ("glb", glb({"nodes": [{"children": [k + 1]} for k in range(20_000)]})),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", HOSTILE_SURFACES)
+def test_a_surface_that_would_take_long_is_refused(what: str) -> None:
+    kind, data = HOSTILE_SURFACES[what]
+    with limited(200 << 20), pytest.raises(ValueError, match=r"."):
+        read_surface(data, kind)
+
+
+@pytest.mark.parametrize("name", ["../f.csv", "{}/f.csv", "link.csv", "pipe.csv", "sub/../../f.csv"])
+def test_a_table_lies_in_the_folder_of_the_files(name: str, tmp_path: Path) -> None:
+    source = write(tmp_path / "in", "ascii")
+    (tmp_path / "f.csv").write_text(TABLE)
+    (tmp_path / "in/link.csv").symlink_to(tmp_path / "f.csv")
+    os.mkfifo(tmp_path / "in/pipe.csv")
+    for given in ({"force": name.format(tmp_path)}, {"force": FORCE, "instruments": name.format(tmp_path)}):
+        with pytest.raises(UserError, match=r"folder|regular"):
+            read_series(source, Units(1.0, 1.0, STEP_S), **given)
 
 
 @pytest.mark.parametrize(
