@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from bench.importers import formats
 from bench.recording import clocks, writer
 from bench.recording.sensor_table import find_bias
 from synth.arrays import Array, Floats, Ints, Pixels
@@ -39,6 +40,7 @@ _BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
     **dict.fromkeys((".h5", ".hdf5"), "bench.importers.hdf5"),
+    **dict.fromkeys((".dcm", ".dicom"), "bench.importers.dicom"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), _BAG),
     **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
 }
@@ -97,10 +99,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if source.is_dir():
         maker = _folder_maker(source)
     if maker is None:
-        known = ", ".join(sorted(_MAKERS))
-        raise UserError(
-            f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
-        )
+        raise formats.unknown(source, sorted(_MAKERS))
     is_bag = maker == _BAG
     roles = {_BAG: BAG_ROLES, _PLAIN: PLAIN_ROLES}.get(maker, (*ROLES, "calibration"))
     if unknown := sorted(set(use) - set(roles)):
@@ -194,7 +193,7 @@ def _damage_as_user_error(source: Path) -> Iterator[None]:
     except ImportError as error:
         raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
-        raise UserError(f"{source}: damaged, or its name has a wrong ending ({first_line(error)})") from error
+        raise formats.unreadable(source, first_line(error)) from error
 
 
 def _refuse_odd(source: Path, found: Intake) -> None:
@@ -274,12 +273,19 @@ def write_recording(
     return out
 
 
-def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
+def one_of(
+    role: str, wanted: str | None, names: list[str], what: str, others: Mapping[str, str] | None = None
+) -> str | None:
     """The name for a role: the requested one, else the only one, else None. UserError if it is missing, or
-    there are several and none is requested."""
+    there are several and none is requested. `others`: kinds of what is there but can't be it, by name."""
     if wanted is not None:
         if wanted not in names:
-            raise UserError(f"--use {role}={wanted}: no such {what}; there are {', '.join(names) or 'none'}")
+            kinds = ", ".join([*names, *(f"{name} ({kind})" for name, kind in (others or {}).items())])
+            if wanted in (others or {}):
+                raise UserError(
+                    f"--use {role}={wanted}: is {(others or {})[wanted]}, no {role}; there are {kinds}"
+                )
+            raise UserError(f"--use {role}={wanted}: no such {what}; there are {kinds or 'none'}")
         return wanted
     if len(names) > 1:
         raise UserError(f"several {what}s could be the {role}: add --use {role}=NAME; {', '.join(names)}")
