@@ -122,7 +122,7 @@ def find_format(source: Path) -> str:
     if not head:
         return "it is empty"
     text = head[:40]
-    return f"it begins with {ascii(text.decode('latin-1'))}"
+    return f"it begins with {text.decode('latin-1')!a}"
 
 
 def _filled(cure: str, source: Path) -> str:

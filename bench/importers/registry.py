@@ -20,7 +20,7 @@ from bench.recording.sensor_table import find_bias
 from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
 from synth.flow.stereo.calibration import read_rig
-from synth.system import checked_file
+from synth.system import camera_file, checked_file
 from synth.system.checked_file import refuse_large
 from synth.video import read as video
 from synth.video import stereo_layout
@@ -133,9 +133,11 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     elif second is None and (
         seems := stereo_layout.find_layout([*islice(found.pictures(), stereo_layout.PICTURES)])
     ):
-        notes.append(f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}")
+        cure = f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}"
+        notes.append(stereo_layout.MIXED.get(seems, cure))
     if calibration is not None:
         found = _calibrated(found, Path(calibration))
+        notes += camera_file.describe(Path(calibration))
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
@@ -165,6 +167,8 @@ def _calibrated(found: Intake, file: Path) -> Intake:
 def _split(found: Intake, layout: str) -> Intake:
     """Two cameras' pictures that are in one, or follow each other. UserError for no such layout."""
     name, _, order = layout.partition(",")
+    if name in stereo_layout.MIXED:
+        raise UserError(f"--stereo-layout {layout}: {stereo_layout.MIXED[name]}")
     if found.second is not None or name not in stereo_layout.LAYOUTS or order not in ("", "right-first"):
         known = ", ".join(stereo_layout.LAYOUTS)
         why = f"one of {known}, or with ,right-first" if found.second is None else "it has a right camera"

@@ -203,7 +203,8 @@ def _force_topic(
 ) -> tuple[str | None, Callable[[Any], tuple[float, ...]]]:
     """The topic of forces, and how they are read from its messages; None: there is none.
 
-    Stamped wrenches and vectors come first, then wrenches inside other messages. Arrays of three or six numbers
+    Stamped wrenches and vectors come first, then wrenches inside other messages. Arrays of three or six
+    numbers
     count only if they are named. UserError: several topics, or one that holds no force.
     """
     wanted = use.get("force")

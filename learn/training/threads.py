@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-
 import torch
 
 from synth.errors import UserError
+from synth.system.packages import count_cores
 
 
 def set_threads(wanted: int | None = None) -> int:
@@ -16,7 +15,7 @@ def set_threads(wanted: int | None = None) -> int:
     """
     if wanted is not None and wanted < 1:
         raise UserError(f"threads {wanted}: must be at least 1")
-    cores = len(os.sched_getaffinity(0))
+    cores = count_cores()
     count = wanted or min(max(cores // 2, 1), 8)
     torch.set_num_threads(count)
     return count

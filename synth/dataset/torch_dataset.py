@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from bisect import bisect_right
 from collections.abc import Callable
 from collections.abc import Sequence as Several
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex
 
 from synth.arguments import checked
 from synth.dataset.index import group_by_side
@@ -85,9 +86,12 @@ class TorchDataset:
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 
-    def __getitem__(self, item: int) -> Any:
-        if not 0 <= item < len(self):
-            raise IndexError(item)
+    def __getitem__(self, item: SupportsIndex) -> Any:
+        """The item of a whole number, also NumPy's or a tensor's; negative ones count from the end."""
+        given, count = operator.index(item), len(self)
+        item = given + count if given < 0 else given
+        if not 0 <= item < count:
+            raise IndexError(f"{given}: there are {count} items")
         which = bisect_right(self._ends, item)
         frame = item - (self._ends[which - 1] if which else 0)
         sequence, readers = _open(os.getpid(), self._dataset, self._chosen[which], self._fields)

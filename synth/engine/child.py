@@ -21,6 +21,7 @@ from synth.dataset.folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import gpu, llvm
+from synth.system.packages import count_cores
 from synth.system.stopwatch import StageCallback
 
 Kind = Literal["done", "input", "error", "crash", "memory", "stalled", "disk", "stopped"]
@@ -181,7 +182,7 @@ def choose_gpus(chosen: str, wanted: bool) -> tuple[str, ...] | None:
 
 def environment(job: Job, workers: int) -> dict[str, str]:
     """What all workers of a machine have in their environment: threads, the program, the renderer's LLVM."""
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
+    threads = max(1, count_cores() // workers)
     library = llvm.find() if job.render.variant in ("auto", "llvm_ad_rgb") else None
     home = str(Path(synth.__file__).resolve().parents[1])
     path = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH", "")]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 from collections import deque
@@ -22,6 +21,7 @@ from synth.errors import UserError, as_positive
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.publish import card
+from synth.system.packages import count_cores
 
 _TRIES = 3  # attempts per sequence
 _VERDICT = 5  # the job is refused if so many sequences fail because of it before any succeeds
@@ -90,7 +90,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
 
     Of a job that can't be carried out nothing is left. KeyboardInterrupt: when the workers have ended.
     """
-    workers, memory = options.workers or len(os.sched_getaffinity(0)), options.memory_gb
+    workers, memory = options.workers or count_cores(), options.memory_gb
     share = share_of_memory(workers) if memory is None else int(memory * 1e9)
     if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)

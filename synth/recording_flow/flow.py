@@ -23,6 +23,7 @@ from synth.flow.confidence import add_deviation
 from synth.flow.estimator import Estimator
 from synth.flow.track import Tracker
 from synth.recording_flow.frame_motion import FrameMotion
+from synth.system.packages import count_cores
 
 
 class LocalFlow:
@@ -85,7 +86,7 @@ class FlowProcess(LocalFlow):
 @contextlib.contextmanager
 def open_flow_process(set_up: Callable[[], object]) -> Iterator[FlowProcess | None]:
     """A process for flow, which calls `set_up` first, closed at the end; None on a single core."""
-    if len(os.sched_getaffinity(0)) < 2:
+    if count_cores() < 2:
         yield None
         return
     with contextlib.closing(FlowProcess(set_up)) as process:

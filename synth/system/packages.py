@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -23,13 +24,22 @@ def versions() -> dict[str, str]:
     return found
 
 
+def count_cores() -> int:
+    """Cores that this process may use; on systems that don't say, all of them."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
+
+
 def machine() -> dict[str, str | int | float]:
     """Processor, cores, memory [GB], system and Python; nothing that identifies the machine."""
-    model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    model = None
+    with suppress(OSError):  # of Linux alone
+        model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    pages = getattr(os, "sysconf", lambda name: 0)  # not on Windows
     return {
         "processor": model.group(1) if model else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "memory_gb": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1),
+        "cores": count_cores(),
+        "memory_gb": round(pages("SC_PHYS_PAGES") * pages("SC_PAGE_SIZE") / 1e9, 1),
         "system": platform.system(),
         "python": platform.python_version(),
     }
