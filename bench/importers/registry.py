@@ -40,9 +40,8 @@ _BAG, _PLAIN = "bench.importers.rosbag", "bench.importers.plain_files"
 _MAKERS = {
     ".mha": "bench.importers.igsio",
     **dict.fromkeys((".h5", ".hdf5"), "bench.importers.hdf5"),
-    **dict.fromkeys((".dcm", ".dicom"), "bench.importers.dicom"),
     **dict.fromkeys((".bag", ".mcap", ".db3"), _BAG),
-    **dict.fromkeys((".npy", ".tif", ".tiff", *video.SUFFIXES), _PLAIN),
+    **dict.fromkeys((".npy", ".tif", ".tiff", ".dcm", ".dicom", *video.SUFFIXES), _PLAIN),
 }
 _LEAST_PX = 8
 _LATEST_S = 1e11

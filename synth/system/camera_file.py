@@ -323,20 +323,20 @@ def _of_text(path: Path, text: str) -> dict[str, Any] | None:
             match = re.search(rf"^\s*{name}\s*\n((?:\s*{_NUMBER.pattern}){{1,{count}}})", ost, re.MULTILINE)
             return match[1] if match else ""
 
-        names = (
+        fields = (
             ("image_width", "width", 1),
             ("image_height", "height", 1),
             ("camera_matrix", "camera matrix", 9),
         )
-        found = {name: block(key, count) for name, key, count in (*names, ("distortion", "distortion", 14))}
+        found = {name: block(key, count) for name, key, count in (*fields, ("distortion", "distortion", 14))}
         return {name: value for name, value in found.items() if value}
     printed = re.fullmatch(
         r"\[\s*(\d+)x(\d+)\s+p\[(\S+) (\S+)\]\s+f\[(\S+) (\S+)\]\s+([A-Za-z ]+?)\s*\[([^\]]*)\]\s*\]", text
     )
     if printed:
         width, height, x, y, fx, fy, model, terms = printed.groups()
-        values = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": x, "cy": y}
-        return values | {"distortion_model": model, "coeffs": terms}
+        stated = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": x, "cy": y}
+        return stated | {"distortion_model": model, "coeffs": terms}
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if all(len(row) > 4 and row[0].isdigit() and row[1].isupper() for row in rows) and rows:
         if len(rows) > 1:
