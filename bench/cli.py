@@ -197,8 +197,8 @@ def import_(
     stereo_layout: Annotated[
         str | None,
         Option(
-            help="Two cameras in one video: side-by-side, top-bottom, half-width, half-height (squeezed) or "
-            "alternating; add ,right-first if so."
+            help="Two cameras in one video: side-by-side, top-bottom, half-width, half-height (squeezed), "
+            "alternating, rows or columns; add ,right-first if so."
         ),
     ] = None,
     newtons: Annotated[

@@ -259,7 +259,7 @@ def _clocks(sensor: SensorMotion) -> Iterator[tuple[str, Floats, int]]:
         for rate in rates:
             late_s = time_s[0] + (k * frame - time_s[0]) / rate
             too = f", sync.offset_s {late_s:+.2f}" if abs(late_s) > frame / 2 else ""
-            what = f"the video is stamped with another rate, or a clock runs wrong: sync.rate {1 / rate:.4f}{too}"
+            what = f"the video is stamped with another rate, or a clock is: sync.rate {1 / rate:.4f}{too}"
             yield what, time_s[0] + since * rate - k * frame, len(lags) * len(rates)
     starts = time_s[_PART : -_PART : max(1, 2 * len(time_s) // _TRIED)]
     for k in lags:

@@ -80,7 +80,8 @@ def check_overlap(recording: Recording, tracked: TrackedRecording) -> list[Findi
 
 
 def _stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
-    """A finding on records whose lengths are as the usual rates of cameras, as if one were stamped for another."""
+    """A finding on records whose lengths are as the usual rates of cameras, as if one were stamped for
+    another."""
     force, sync = recording.force, recording.meta.sync
     if force is None or sync.rate != 1 or sync.method == "correlate":
         return []
@@ -97,7 +98,8 @@ def _stamped_rate(t: Floats, recording: Recording) -> list[Finding]:
                 Finding(
                     "warning",
                     "clocks",
-                    f"the sensor's record is {1 / rate:.4g} times as long as the video, as if pictures taken at "
+                    f"the sensor's record is {1 / rate:.4g} times as long as the video, as if "
+                    "pictures taken at "
                     f"{taken:g} a second were stamped as {likely:g}: if so, set sync.rate to {rate:.4f}",
                 )
             ]

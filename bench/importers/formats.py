@@ -10,7 +10,7 @@ _OWN = {
     "mha": "bench.importers.igsio:read_source",
     **dict.fromkeys(("bag", "mcap", "db3"), BAG),
     **dict.fromkeys(("h5", "hdf5"), "bench.importers.hdf5:read_source"),
-    **dict.fromkeys(("npy", "tif", "tiff", *(ending[1:] for ending in SUFFIXES)), PLAIN),
+    **dict.fromkeys(("npy", "tif", "tiff", "dcm", "dicom", *(ending[1:] for ending in SUFFIXES)), PLAIN),
 }
 IMPORTERS = Registry("sulcus.importers", "bench import", "format", _OWN)
 """Readers by the ending of a file's name, without the dot. An entry point is a function of a path, and of

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from bench.importers import igsio
+from bench.importers import dicom, igsio
 from bench.importers.registry import Intake, SecondView
 from bench.recording import sensor_table
 from bench.recording.sensor_table import SINCE_1970_S, Readings
@@ -105,6 +105,9 @@ def _open(
                 f"{'the start' if film.from_file else 'that picture (--use start=file: from the start)'}"
             )
         return _Film(film), list(range(len(times))), np.array(times, np.float64)
+    if source.suffix.lower() in dicom.SUFFIXES:
+        frames_of, count, stated = dicom.open_dicom(source, notes)
+        return frames_of, list(range(count)), stated
     if source.suffix.lower() == ".npy":
         frames = np.load(source, mmap_mode="r", allow_pickle=False)
         if frames.ndim not in (3, 4):

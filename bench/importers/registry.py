@@ -13,13 +13,14 @@ from typing import Literal
 
 import numpy as np
 
+from bench.importers import file_kinds
 from bench.importers.formats import BAG, IMPORTERS, PLAIN
 from bench.recording import clocks, writer
 from bench.recording.sensor_table import find_bias
 from synth.arrays import Array, Floats, Ints, Pixels
 from synth.errors import UserError, first_line
 from synth.flow.stereo.calibration import read_rig
-from synth.system import checked_file
+from synth.system import camera_file, checked_file
 from synth.system.checked_file import refuse_large
 from synth.video import read as video
 from synth.video import stereo_layout
@@ -90,10 +91,7 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     if source.is_dir():
         ending = _folder_ending(source)
     if ending not in IMPORTERS.names():
-        known = ", ".join(f".{name}" for name in sorted(IMPORTERS.names()))
-        raise UserError(
-            f"{source}: not a format that can be imported ({known}, a folder of pictures or of a ROS 2 bag)"
-        )
+        raise file_kinds.unknown(source, sorted(f".{name}" for name in IMPORTERS.names()))
     place = IMPORTERS.own.get(ending, "")
     is_bag = place == BAG
     roles = {BAG: BAG_ROLES, PLAIN: PLAIN_ROLES}.get(place, (*ROLES, "calibration"))
@@ -130,9 +128,11 @@ def read_source(source: Path, use: Mapping[str, str] | None = None, layout: str 
     elif second is None and (
         seems := stereo_layout.find_layout([*islice(found.pictures(), stereo_layout.PICTURES)])
     ):
-        notes.append(f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}")
+        cure = f"the pictures seem to be of two cameras: import again with --stereo-layout {seems}"
+        notes.append(stereo_layout.MIXED.get(seems, cure))
     if calibration is not None:
         found = _calibrated(found, Path(calibration))
+        notes += camera_file.describe(Path(calibration))
     if found.second is not None and not is_bag and found.second.pair is None:
         notes.append("no calibration of the pair: add stereo to meta.yaml, or --use calibration=FILE")
     return replace(found, notes=tuple(notes))
@@ -162,6 +162,8 @@ def _calibrated(found: Intake, file: Path) -> Intake:
 def _split(found: Intake, layout: str) -> Intake:
     """Two cameras' pictures that are in one, or follow each other. UserError for no such layout."""
     name, _, order = layout.partition(",")
+    if name in stereo_layout.MIXED:
+        raise UserError(f"--stereo-layout {layout}: {stereo_layout.MIXED[name]}")
     if found.second is not None or name not in stereo_layout.LAYOUTS or order not in ("", "right-first"):
         known = ", ".join(stereo_layout.LAYOUTS)
         why = f"one of {known}, or with ,right-first" if found.second is None else "it has a right camera"
@@ -190,7 +192,7 @@ def _damage_as_user_error(source: Path) -> Iterator[None]:
     except ImportError as error:
         raise UserError(f"{source}: needs {error.name}: pip install '.[readers]' in the clone") from None
     except Exception as error:
-        raise UserError(f"{source}: damaged, or its name has a wrong ending ({first_line(error)})") from error
+        raise file_kinds.unreadable(source, first_line(error)) from error
 
 
 def _refuse_odd(source: Path, found: Intake) -> None:
@@ -270,12 +272,19 @@ def write_recording(
     return out
 
 
-def one_of(role: str, wanted: str | None, names: list[str], what: str) -> str | None:
+def one_of(
+    role: str, wanted: str | None, names: list[str], what: str, others: Mapping[str, str] | None = None
+) -> str | None:
     """The name for a role: the requested one, else the only one, else None. UserError if it is missing, or
-    there are several and none is requested."""
+    there are several and none is requested. `others`: kinds of what is there but can't be it, by name."""
     if wanted is not None:
         if wanted not in names:
-            raise UserError(f"--use {role}={wanted}: no such {what}; there are {', '.join(names) or 'none'}")
+            kinds = ", ".join([*names, *(f"{name} ({kind})" for name, kind in (others or {}).items())])
+            if wanted in (others or {}):
+                raise UserError(
+                    f"--use {role}={wanted}: is {(others or {})[wanted]}, no {role}; there are {kinds}"
+                )
+            raise UserError(f"--use {role}={wanted}: no such {what}; there are {kinds or 'none'}")
         return wanted
     if len(names) > 1:
         raise UserError(f"several {what}s could be the {role}: add --use {role}=NAME; {', '.join(names)}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal
 
+import av
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,8 +19,23 @@ from bench.importers.registry import LARGEST_BYTES, Intake, SecondView, one_of
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file
+from synth.system.checked_file import refuse_large
 
-_PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_PICTURES = (
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "foxglove_msgs/msg/CompressedVideo",
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+)
+_CODECS = {
+    "h264": "h264",
+    "x264": "h264",
+    "libx264": "h264",
+    "h265": "hevc",
+    "hevc": "hevc",
+    "libx265": "hevc",
+}
+_CODECS |= {"av1": "av1", "vp9": "vp9", "mpeg4": "mpeg4"}  # decoders by the words of encodings
 _FORCES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3Stamped")
 _UNSTAMPED = ("geometry_msgs/msg/Wrench",)
 _LENSES = ("sensor_msgs/msg/CameraInfo",)
@@ -44,26 +61,34 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    notes, parts = list[str](), [source]
     if source.is_dir():
-        _refuse_elsewhere(source)
+        if (source / "metadata.yaml").is_file():
+            _refuse_elsewhere(source)
+        else:
+            parts = _parts(source, notes)
 
     def opened() -> Any:
-        return AnyReader([source], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        return AnyReader(parts, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
     def pictures(topic: str, read: _Read = _picture) -> Iterator[Array]:
         with opened() as bag:
+            if read is _picture and _is_packets(bag, topic):
+                yield from (picture for _, picture in _decode(bag, topic))
+                return
             for _, message in _messages(bag, topic):
                 yield read(source, message)
 
     with opened() as bag:
         second = use.get("right") or use.get("depth")
-        stamped = "force" not in use and any(c.msgtype in _FORCES for c in bag.connections)
-        forces = _FORCES if stamped else (*_FORCES, *_UNSTAMPED)
-        notes, frames = list[str](), _topic(bag, "frames", _PICTURES, use, second)
+        frames = _topic(bag, "frames", _PICTURES, use, second)
         if frames is None:
-            raise UserError(f"{source}: holds no topic of pictures")
-        stamps = _table(bag, frames, lambda message: (), 0, notes)[:, 0]
-        force = _table(bag, _topic(bag, "force", forces, use), _vector, 3, notes)
+            raise UserError(f"{source}: holds no topic of pictures; there are {_kinds(bag)}")
+        stamps = _stamps(bag, frames, notes)
+        topic, read = _force_topic(bag, use, notes)
+        force = _table(bag, topic, read, 3, notes)
+        if topic is None:
+            notes.append(f"no topic of forces; there are {_kinds(bag)}")
         found = Intake(stamps, partial(pictures, frames), force[:, 0], force[:, 1:], tuple(notes))
         if second is not None:
             return _add_second(bag, found, frames, use, pictures)
@@ -82,7 +107,7 @@ def _add_second(bag: Any, found: Intake, frames: str, use: dict[str, str], pictu
         raise UserError("--use right=... and depth=...: give one of them")
     topic = _topic(bag, kind, _PICTURES, use) or ""
     notes = list(found.notes)
-    frame = partners(_table(bag, topic, lambda message: (), 0, notes)[:, 0], found.times_s)
+    frame = partners(_stamps(bag, topic, notes), found.times_s)
     if (frame < 0).all():
         raise UserError(f"{topic}: no picture is at the time of a frame of {frames}")
     first, last = int(frame[frame >= 0].min()), int(frame.max())
@@ -153,7 +178,135 @@ def _topic(
     bag: Any, role: str, kinds: tuple[str, ...], use: dict[str, str], taken: str | None = None
 ) -> str | None:
     names = sorted({c.topic for c in bag.connections if c.msgtype in kinds} - {taken})
-    return one_of(role, use.get(role), names, "topic")
+    others = {c.topic: c.msgtype for c in bag.connections if c.topic not in names}
+    return one_of(role, use.get(role), names, "topic", others)
+
+
+def _parts(folder: Path, notes: list[str]) -> list[Path]:
+    """The files of a bag whose metadata.yaml is lost, of one kind. UserError: they are of two."""
+    files = sorted(path for path in folder.glob("*") if path.suffix in (".mcap", ".db3"))
+    for path in files:
+        checked_file.check_file(path, LARGEST_BYTES)
+    if len({path.suffix for path in files}) > 1:
+        raise UserError(f"{folder}: holds .mcap and .db3 files and no metadata.yaml: name one of them")
+    notes.append(f"no metadata.yaml: {', '.join(path.name for path in files)} are read as one bag")
+    return files
+
+
+def _kinds(bag: Any) -> str:
+    """The topics of a bag with their types."""
+    return ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in bag.connections})) or "none"
+
+
+def _force_topic(
+    bag: Any, use: dict[str, str], notes: list[str]
+) -> tuple[str | None, Callable[[Any], tuple[float, ...]]]:
+    """The topic of forces, and how they are read from its messages; None: there is none.
+
+    Stamped wrenches and vectors come first, then wrenches inside other messages. Arrays of three or six
+    numbers
+    count only if they are named. UserError: several topics, or one that holds no force.
+    """
+    wanted = use.get("force")
+    stamped = wanted is None and any(c.msgtype in _FORCES for c in bag.connections)
+    forces = _FORCES if stamped else (*_FORCES, *_UNSTAMPED)
+    plain = {c.topic for c in bag.connections if c.msgtype in forces}
+    if (plain and wanted is None) or wanted in plain:
+        return _topic(bag, "force", forces, use), _vector
+    paths: dict[str, tuple[str, ...]] = {}
+    for connection in bag.connections:
+        if connection.msgtype not in _PICTURES and (wanted in (None, connection.topic)):
+            path = _find_vector(next((m for _, m in _messages(bag, connection.topic)), None))
+            if path is not None and (path[-1:] != (_ARRAY,) or wanted is not None):
+                paths[connection.topic] = path
+    others = {c.topic: c.msgtype for c in bag.connections if c.topic not in paths}
+    topic = one_of("force", wanted, sorted(paths), "topic", others)
+    if topic is None:
+        return None, _vector
+    path = paths[topic]
+    if path[-1:] == (_ARRAY,):
+        notes.append(f"{topic}: the first three numbers of {'.'.join(path[:-1])} are taken for fx, fy, fz")
+        return topic, lambda message: tuple(float(x) for x in _inside(message, path[:-1])[:3])
+    notes.append(f"{topic}: the force is its {'.'.join(path)}")
+    return topic, lambda message: _vector(_inside(message, path))
+
+
+_ARRAY = "[]"  # the end of a path to an array of numbers
+
+
+def _find_vector(message: Any, depth: int = 4) -> tuple[str, ...] | None:
+    """Names of the fields that lead to the only force in a message, or to an array of 3 or 6; None: there is
+    none, or several."""
+    found, arrays = list[tuple[str, ...]](), list[tuple[str, ...]]()
+
+    def search(part: Any, path: tuple[str, ...]) -> None:
+        for name in getattr(part, "__dataclass_fields__", ()) if len(path) < depth else ():
+            value = getattr(part, name)
+            if name == "__msgtype__" or "covariance" in name:
+                continue
+            if name == "force" and all(hasattr(value, axis) for axis in "xyz"):
+                found.append((*path, name))
+            elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.size in (3, 6):
+                arrays.append((*path, name, _ARRAY))
+            else:
+                search(value, (*path, name))
+
+    search(message, ())
+    chosen = found or arrays
+    return chosen[0] if len(chosen) == 1 else None
+
+
+def _inside(message: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        message = getattr(message, name)
+    return message
+
+
+def _is_packets(bag: Any, topic: str) -> bool:
+    """Whether a topic's messages are packets of a video, each of which needs those before it."""
+    return _codec(next((m for _, m in _messages(bag, topic)), None)) != ""
+
+
+def _codec(message: Any) -> str:
+    """FFmpeg's name of the decoder of a message; empty: it is a picture of its own."""
+    stated = str(getattr(message, "format", getattr(message, "encoding", ""))).lower()
+    words = re.split("[^a-z0-9]+", stated)
+    return next((codec for word in words for known, codec in _CODECS.items() if word.startswith(known)), "")
+
+
+def _decode(bag: Any, topic: str) -> Iterator[tuple[int, Array]]:
+    """Number of a topic's message and its picture (H, W, 3), of those that can be decoded."""
+    context: Any = None
+    numbered = enumerate(message for _, message in _messages(bag, topic))
+    for k, message in chain(numbered, [(-1, None)]):
+        if context is None:
+            context = av.CodecContext.create(_codec(message), "r")
+        packet = None
+        if message is not None:
+            packet = av.Packet(bytes(message.data))
+            packet.pts = packet.dts = k
+        try:
+            frames = context.decode(packet)
+        except av.error.InvalidDataError:  # before the first key frame, or damaged
+            continue
+        for frame in frames:
+            if frame.pts is not None and not frame.is_corrupt:
+                refuse_large(frame.width, frame.height)
+                yield frame.pts, frame.to_ndarray(format="rgb24")
+
+
+def _stamps(bag: Any, topic: str, notes: list[str]) -> Floats:
+    """Times (T,) s of a topic's pictures."""
+    stamps = _table(bag, topic, lambda message: (), 0, notes)[:, 0]
+    if not _is_packets(bag, topic):
+        return stamps
+    shown = [k for k, _ in _decode(bag, topic)]
+    if len(shown) < len(stamps):
+        lost = len(stamps) - len(shown)
+        notes.append(
+            f"{topic}: {lost} of {len(stamps)} packets give no picture, as before the first key frame"
+        )
+    return stamps[shown]
 
 
 def _messages(bag: Any, topic: str | None) -> Iterator[tuple[float, Any]]:
@@ -171,7 +324,7 @@ def _table(
     """Times [s] and values of a topic's messages, (N, 1 + width), all on one clock."""
     rows = []
     for logged, message in _messages(bag, topic):
-        stamp = message.header.stamp if hasattr(message, "header") else None
+        stamp = message.header.stamp if hasattr(message, "header") else getattr(message, "timestamp", None)
         rows.append((logged, stamp.sec + 1e-9 * stamp.nanosec if stamp else 0.0, *read(message)))
     table = np.array(rows, np.float64).reshape(-1, 2 + width)
     clock = 1 if (table[:, 1] > 0).any() else 0

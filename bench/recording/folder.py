@@ -28,7 +28,7 @@ from bench.recording.meta import Meta
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
 from synth.job.types import Section
-from synth.system import csv_table
+from synth.system import camera_file, csv_table
 from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.mask_files import MaskFiles
@@ -174,6 +174,8 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     about, times, force = _from_start(about, times, force, notes)
     tissue = folder / "tissue.png" if os.path.lexists(folder / "tissue.png") else None
     right, depths = _find_stereo(folder, about)
+    if about.stereo is not None:
+        notes += camera_file.describe(folder / about.stereo.calibration)
     right_frame = file_numbers.match_numbers(_numbers(right), frames, "right", notes)
     depth_frame = file_numbers.match_numbers(depths, frames, "depth/", notes)
     by_frame = {depth_frame[number]: path for number, path in depths.items()}

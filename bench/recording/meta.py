@@ -127,9 +127,9 @@ class Sync(Section):
     offset_s: Number = 0.0
     """Added to the sensor's times to give video times [s]."""
     rate: Annotated[FiniteFloat, Field(ge=0.01, le=100)] = 1.0
-    """Seconds of video time per second of the sensor's clock, where the video is stamped with another rate than
-    it was taken at: 25/30, 0.8333, if 25 pictures a second are stamped as 30. The sensor's times are multiplied
-    by it before `offset_s` is added."""
+    """Seconds of video time per second of the sensor's clock, where the video is stamped with another rate
+    than it was taken at: 25/30, 0.8333, if 25 pictures a second are stamped as 30. The sensor's times are
+    multiplied by it before `offset_s` is added."""
     calibration_s: Span | None = None
     """Span of video time that `correlate` uses [s]; it is not scored."""
     search_s: Positive = 0.5

@@ -177,11 +177,13 @@ class VideoFaults:
         at = dict(zip(self._numbers, self._times, strict=True))
         found = [Finding("warning", "pictures", message) for message in self._rest]
         if self._layout:
-            message = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
+            cure = f"two cameras in one video: split it by bench import --stereo-layout {self._layout}"
+            message = stereo_layout.MIXED.get(self._layout, cure)
             found.append(Finding("error", "pictures", message))
+        combed = [] if self._layout else self._combed  # rows of two cameras differ as two fields do
         for times, fault in (
             (self._damaged, f"damaged in the video's file, of {self._decoded}: they are lost; copy it again"),
-            (self._combed, "interlaced: deinterlace the video"),
+            (combed, "interlaced: deinterlace the video"),
             (self._blurred, "much less sharp than the rest frame: are they out of focus?"),
             ([at[k] for k in sorted(again)], "the previous one again: frozen or doubled"),
             (cuts, "unlike their neighbours: are frames missing, or is there a cut, a bump or other light?"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import functools
 import hashlib
 import os
@@ -31,8 +30,9 @@ def folder(name: str) -> Path:
     user, home = os.environ.get("XDG_CACHE_HOME"), os.environ.get("HOME")
     places = [Path(os.environ["SULCUS_CACHE"])] if "SULCUS_CACHE" in os.environ else []
     places += [Path(user or f"{home}/.cache") / "sulcus"] if user or home else []
-    mine = Path(tempfile.gettempdir()) / f"sulcus-{os.getuid()}"
-    for inside in (*(one for place in places for one in (place, place / f"user-{os.getuid()}")), mine):
+    user_id = _user_id()
+    mine = Path(tempfile.gettempdir()) / f"sulcus-{user_id}"
+    for inside in (*(one for place in places for one in (place, place / f"user-{user_id}")), mine):
         with suppress(OSError):
             (inside / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             (inside / name).mkdir(mode=0o700, exist_ok=True)
@@ -41,11 +41,16 @@ def folder(name: str) -> Path:
     raise PermissionError(f"{mine}: is not writable, or not by this user alone")
 
 
+def _user_id() -> int:
+    """Number of this user; 0 where users have none, as on Windows."""
+    return int(getattr(os, "getuid", lambda: 0)())
+
+
 def is_private(folder: Path) -> bool:
     """Whether a folder exists, is no link, and only this user may write to it."""
     with suppress(OSError):
         about = folder.lstat()
-        own = about.st_uid == os.getuid() and not about.st_mode & 0o022
+        own = about.st_uid == _user_id() and not about.st_mode & 0o022
         return stat.S_ISDIR(about.st_mode) and own and os.access(folder, os.W_OK)
     return False
 
@@ -70,7 +75,10 @@ def cached(
     with suppress(OSError, *faults):
         return load(place.read_bytes())
     with ExitStack() as held:
-        with suppress(OSError):  # few locks, as they are never deleted; sharing one only costs time
+        # Few locks, as they are never deleted; sharing one only costs time. Windows has none.
+        with suppress(OSError, ImportError):
+            import fcntl
+
             fcntl.flock(held.enter_context((place.parent / f"{word[0]}.lock").open("w")), fcntl.LOCK_EX)
         with suppress(OSError, *faults):
             return load(place.read_bytes())

@@ -1,7 +1,9 @@
 """Camera calibrations as programs write them: one pinhole camera, or a stereo pair.
 
-OpenCV's FileStorage (YAML, XML, JSON), `camera_info` of ROS, Kalibr's camchain, and other YAML, JSON or INI
-with matrices, or with fx, fy, cx, cy and k1, k2, p1, p2, k3.
+OpenCV's FileStorage (YAML, XML, JSON), `camera_info` and `ost.txt` of ROS, Kalibr's camchain, EuRoC's
+sensors in one file, MATLAB's parameters as JSON, NeRF's transforms.json, COLMAP's cameras.txt, Metashape's
+XML, a bare matrix, and other YAML, JSON or INI with matrices, or with fx, fy, cx, cy and k1, k2, p1, p2, k3.
+Where no distortion is stated it is 0.
 """
 
 from __future__ import annotations
@@ -27,12 +29,18 @@ from synth.system import checked_file
 # Names in lower case, without punctuation and without the camera's number or side.
 _MATRIX = "cameramatrix", "k", "m", "cm", "mtx", "intrinsicmatrix", "intrinsics", "cameraintrinsics"
 _LENS = "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "d", "dist", "kc", "coeffs"
-_SCALARS = ("fx", "fcx"), ("fy", "fcy"), ("cx", "ccx", "ppx"), ("cy", "ccy", "ppy")
+_SCALARS = ("fx", "fcx", "flx"), ("fy", "fcy", "fly"), ("cx", "ccx", "ppx"), ("cy", "ccy", "ppy")
+_ANGLE, _RECTIFIED = "cameraanglex", ("p", "projectionmatrix")
+_RADIAL, _TANGENTIAL = ("radial", "radialdistortion"), ("tangential", "tangentialdistortion")
+_CORNER = "flx", "colmap"  # values whose principal point counts from the corner of the first pixel
+_POSE = "tbs"  # 4 x 4, from a camera of EuRoC to the body
 _TERMS = "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
-_TURN, _SHIFT = ("r", "rotation", "rotationmatrix"), ("t", "translation", "translationvector")
+_TURN = "r", "rotation", "rotationmatrix"
+_SHIFT = "t", "translation", "translationvector", "translationofcamera"
+_TURN_ROWS = "rotationofcamera"  # of MATLAB, for row vectors
 _KALIBR = "tcncnm1"  # 4 x 4, from the left camera to the right one
-_WIDTH, _HEIGHT = ("imagewidth", "width", "resx"), ("imageheight", "height", "resy")
-_SIZE = "resolution", "imagesize", "imgsize"
+_WIDTH, _HEIGHT = ("imagewidth", "width", "resx", "w"), ("imageheight", "height", "resy", "h")
+_SIZE = "resolution", "imagesize", "imgsize", "imgshape", "imageshape"
 _MODEL = re.compile(r"((distortion|camera|lens|projection)(model|type)|model)(name)?")
 _PINHOLE = "distortion|pinhole|opencv|plumbbob|rad(tan|ialtangential)|brown|conrady|rationalpolynomial|none"
 _OTHER = re.compile("fisheye|omnidir|thinprism|^xi$")  # keys of other models
@@ -40,6 +48,15 @@ _INTRINSIC = {*_MATRIX, *_LENS, *chain.from_iterable(_SCALARS)}
 _SIDED = re.compile("(left|right)?(.*?)(left|right|[012])?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _LARGEST, _MOST_TANGENTIAL, _ORTHOGONAL = 1e6, 0.05, 1e-3
+_ODD_TANGENTIAL, _ODD_RADIAL = 0.01, 0.1  # p1, p2, and k3 next to it, as if k3 came before p1 and p2
+_COLMAP = {
+    "SIMPLE_PINHOLE": "fx cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "fx cx cy k1",
+    "RADIAL": "fx cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+}
 LARGEST_FILE = 1 << 20  # bytes
 
 
@@ -73,6 +90,23 @@ def find_baseline_mm(path: Path) -> float:
     return 0.0
 
 
+def describe(path: Path) -> list[str]:
+    """What is assumed of a calibration that its file doesn't state, in words; nothing if it is unreadable."""
+    notes = list[str]()
+    with suppress(UserError):
+        left, right, is_pair = _load(path)
+        for one in (left, right)[: 1 + is_pair]:
+            if one.numbers(_MATRIX, *_SCALARS).size:
+                notes += (
+                    [] if one.states_distortion else [f"{path.name} states no distortion: it is taken for 0"]
+                )
+            elif one.numbers([_ANGLE]).size:
+                notes.append(f"{path.name} states an angle of view only: centre and distortion are assumed")
+            elif one.numbers(_RECTIFIED).size:
+                notes.append(f"{path.name} holds P1 and P2 alone: the pictures are taken for rectified ones")
+    return list(dict.fromkeys(notes))
+
+
 def _pose(left: _Values, right: _Values) -> tuple[Floats, Floats, float | None]:
     """R (3, 3), T (3,) and its unit of `read_pair`."""
     both = _Values(left.path, {**left.of, **right.of})
@@ -80,9 +114,18 @@ def _pose(left: _Values, right: _Values) -> tuple[Floats, Floats, float | None]:
     in_metres = not rotation.size and _KALIBR in both.of
     if in_metres and (moved := both.numbers([_KALIBR])).size == 16:
         rotation, translation = moved.reshape(4, 4)[:3, :3], moved.reshape(4, 4)[:3, 3]
+    if not rotation.size and (turned := both.numbers([_TURN_ROWS])).size == 9:
+        rotation = turned.reshape(3, 3).T
+    if not rotation.size and (poses := [one.numbers([_POSE]) for one in (left, right)])[1].size == 16:
+        to_body = [pose.reshape(4, 4) if pose.size == 16 else np.eye(4) for pose in poses]
+        if np.abs(np.linalg.det(to_body)).min() > 0:
+            moved, in_metres = np.linalg.inv(to_body[1]) @ to_body[0], True
+            rotation, translation = moved[:3, :3], moved[:3, 3]
+    if not rotation.size and (flat := right.numbers(_RECTIFIED)).size == 12 and flat[0]:
+        rotation, translation = np.eye(3), flat.reshape(3, 4)[:, 3] / flat[0]
     if rotation.size == 3:
         rotation = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
-    if rotation.size != 9 or translation.size != 3 or not translation.any():
+    if rotation.size != 9 or translation.size != 3 or not 0 < np.abs(translation).max() < _LARGEST:
         raise both.error("R or T of the right camera is missing, or has another shape")
     rotation = rotation.reshape(3, 3)
     if not np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHOGONAL or np.linalg.det(rotation) < 0:
@@ -107,19 +150,14 @@ class _Values(NamedTuple):
     def error(self, fault: str) -> UserError:
         return UserError(f"{self.path}: {fault}")
 
+    @property
+    def states_distortion(self) -> bool:
+        """Whether distortion is given in any form."""
+        return any(name in self.of for name in (*_LENS, *_RADIAL, "k1"))
+
     def lens(self, size: tuple[int, int], shifted: bool = False) -> tuple[Floats, Floats]:
         """K and distortion; `shifted`: the principal point may be outside the picture."""
-        matrix, lens = self.numbers(_MATRIX), self.numbers(_LENS)
-        matrix = matrix if matrix.size else self.numbers(*_SCALARS)
-        if matrix.size == 4:
-            matrix = np.array([matrix[0], 0, matrix[2], 0, matrix[1], matrix[3], 0, 0, 1])
-        if not lens.size and "k1" in self.of:
-            lens = np.array([self.numbers([name])[0] if name in self.of else 0.0 for name in _TERMS])
-        if matrix.size != 9:
-            raise self.error(f"no camera matrix (camera_matrix, K or fx, fy, cx, cy): {matrix.size} numbers")
-        if lens.size not in (4, 5, 8, 12, 14) or not (np.abs(lens) < _LARGEST).all():
-            raise self.error(f"{lens.size} distortion coefficients, needed are k1 k2 p1 p2, perhaps k3 ...")
-        K = matrix.reshape(3, 3)
+        K, lens = self._matrix(size), self._distortion()
         if not K[:2, 2].any() and K[2, :2].any():
             raise self.error(
                 "the camera matrix is transposed, as MATLAB's IntrinsicMatrix: transpose it, and R. MATLAB "
@@ -132,23 +170,105 @@ class _Values(NamedTuple):
                 f"p1, p2 = {lens[2]:g}, {lens[3]:g} is too much: of a fisheye lens, or in another order? "
                 "needed are k1 k2 p1 p2 k3 of a pinhole camera"
             )
-        made = self.numbers(_WIDTH, _HEIGHT) if self.numbers(_WIDTH).size else self.numbers(_SIZE)
-        known = made.size == 2 and (made >= 1).all()
-        scale = np.array(size) / (made if known else size)
-        if (made.size and not known) or abs(scale[0] / scale[1] - 1) > 0.01:
+        most = float(np.abs(lens[2:4]).max())
+        if lens.size == 5 and most > _ODD_TANGENTIAL and 0 < abs(lens[4]) < _ODD_RADIAL * most:
+            raise self.error(
+                f"k1 k2 p1 p2 k3 = {', '.join(f'{x:g}' for x in lens)}: is k3 before p1 and p2? "
+                "Name the terms, as "
+                "k1: ..., k2: ..., p1: ..., p2: ..., k3: ..."
+            )
+        K, made = self._cropped(K, size)
+        scale = np.array(size) / made
+        if abs(scale[0] / scale[1] - 1) > 0.01:
             of = " x ".join(f"{one:g}" for one in made)
             raise self.error(f"made from pictures of {of}, whose shape is not that of {size[0]} x {size[1]}")
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # centres, not corners, are whole
         K = np.diag([*scale, 1.0]) @ (K + half) - half
         (fx, skew, x), (_, fy, y), _ = K
         if not (0.1 * size[0] < fx < 200 * size[0] and 1 / 3 < fx / fy < 3 and abs(skew) < 1e-6 * fx):
-            raise self.error(f"focal lengths {fx:g}, {fy:g} px with skew {skew:g} don't fit {size} px")
+            shares = "; they may be shares of width and height: multiply them" if 0 < fx < 10 else ""
+            raise self.error(
+                f"focal lengths {fx:g}, {fy:g} px with skew {skew:g} don't fit {size} px{shares}"
+            )
         if not (0.05 * size[0] < x + 0.5 < 0.95 * size[0] or shifted) or not 0 < y + 0.5 < size[1]:
             raise self.error(
                 f"the principal point {x:g}, {y:g} doesn't fit pictures of {size[0]} x {size[1]}; if the "
                 "calibration's were of another size, add image_width and image_height"
             )
+        if not np.abs(K).max() < _LARGEST:
+            raise self.error(f"the camera matrix holds {np.abs(K).max():g}")
         return K, lens
+
+    def _matrix(self, size: tuple[int, int]) -> Floats:
+        """K (3, 3) as stated, from the centre of the first pixel."""
+        matrix = self.numbers(_MATRIX)
+        matrix = matrix if matrix.size else self.numbers(*_SCALARS)
+        if matrix.size == 3 and "fy" not in self.of:  # one focal length
+            matrix = matrix[[0, 0, 1, 2]]
+        if not matrix.size and (angle := self.numbers([_ANGLE])).size == 1 and 0 < angle[0] < np.pi:
+            focal = 0.5 * size[0] / np.tan(0.5 * angle[0])
+            return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
+        if not matrix.size and (flat := self.numbers(_RECTIFIED)).size == 12:
+            return flat.reshape(3, 4)[:, :3]
+        if matrix.size == 4:
+            matrix = np.array([matrix[0], 0, matrix[2], 0, matrix[1], matrix[3], 0, 0, 1])
+        if matrix.size != 9:
+            raise self.error(f"no camera matrix (camera_matrix, K or fx, fy, cx, cy): {matrix.size} numbers")
+        K = matrix.reshape(3, 3).copy()
+        if "radialdistortion" in self.of and "tangentialdistortion" in self.of:  # MATLAB counts from 1
+            K = K.T.copy() if not K[:2, 2].any() else K
+            K[:2, 2] -= 1
+        if any(name in self.of for name in _CORNER):
+            K[:2, 2] -= 0.5
+        return K
+
+    def _distortion(self) -> Floats:
+        """k1, k2, p1, p2, ...: as one list, by name, or radial and tangential apart; 0 if it isn't stated."""
+        lens = self.numbers(_LENS)
+        if not lens.size and "k1" in self.of:
+            lens = np.array([self.numbers([name])[0] if name in self.of else 0.0 for name in _TERMS])
+        radial, tangential = self.numbers(_RADIAL), self.numbers(_TANGENTIAL)
+        if not lens.size and radial.size in (2, 3) and tangential.size in (0, 2):
+            sides = tangential if tangential.size else np.zeros(2)
+            lens = np.array([*radial[:2], *sides, *(radial[2:] if radial.size == 3 else [0.0])])
+        if not lens.size and not any(name in self.of for name in (*_LENS, *_RADIAL)):
+            lens = np.zeros(5)
+        if lens.size not in (4, 5, 8, 12, 14) or not (np.abs(lens) < _LARGEST).all():
+            raise self.error(f"{lens.size} distortion coefficients, needed are k1 k2 p1 p2, perhaps k3 ...")
+        return lens
+
+    def _cropped(self, K: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
+        """K of the pictures that were calibrated, and their size (2,): a ROS region, binned, of the
+        sensor."""
+        made = self.numbers(_WIDTH, _HEIGHT) if self.numbers(_WIDTH).size else self.numbers(_SIZE)
+        if made.size and not (made.size == 2 and (made >= 1).all()):
+            of = " x ".join(f"{one:g}" for one in made)
+            raise self.error(f"made from pictures of {of}, whose shape is not that of {size[0]} x {size[1]}")
+        made = made if made.size else np.array(size, np.float64)
+        if abs(size[0] * made[0] / (size[1] * made[1]) - 1) < 0.01 and not self.numbers(_WIDTH).size:
+            made = made[::-1]  # rows first
+        area = self.of.get("roi") if isinstance(self.of.get("roi"), dict) else {}
+        values = _Values(
+            self.path, {re.sub("[^a-z]", "", str(k).lower()): v for k, v in (area or {}).items()}
+        )
+        binned = np.array([*self.numbers(["binningx"]), *self.numbers(["binningy"])])
+        binned = np.maximum(binned, 1) if binned.size == 2 else np.ones(2)
+        corner, part = values.numbers(["xoffset"], ["yoffset"]), values.numbers(["width"], ["height"])
+        corner = corner if corner.size == 2 else np.zeros(2)
+        part = part if part.size == 2 and part.all() else made
+        if (binned == 1).all() and not corner.any() and (part == made).all():
+            return K, made
+        shown = part // binned
+        if (shown != size).any():
+            raise self.error(
+                f"of {shown[0]:g} x {shown[1]:g} px, a region (roi) or binning of its sensor of "
+                f"{made[0]:g} x "
+                f"{made[1]:g}, but the pictures are {size[0]} x {size[1]}"
+            )
+        K = K.copy()
+        K[:2, 2] = (K[:2, 2] - corner + 0.5) / binned - 0.5
+        K[[0, 1], [0, 1]] /= binned
+        return K, shown
 
 
 def _load(path: Path) -> tuple[_Values, _Values, bool]:
@@ -158,13 +278,19 @@ def _load(path: Path) -> tuple[_Values, _Values, bool]:
 
 @lru_cache(maxsize=4)  # every sequence of a job reads its calibration several times
 def _parsed(path: Path, text: str) -> tuple[_Values, _Values, bool]:
-    found: Any = None
+    if re.search(r"^\[(LEFT|RIGHT)_CAM_\w+\]", text, re.MULTILINE):
+        raise UserError(
+            f"{path}: of a ZED camera, for several sizes: write the matrices of yours, as its SDK "
+            "gives them, as "
+            "K1, D1, K2, D2, R, T"
+        )
+    found: Any = _of_text(path, text)
     with as_user_error(f"{path}: is no calibration in XML, JSON or INI"):
         if text.startswith("<"):
-            found = _tree(ElementTree.fromstring(text))
+            found = _of_metashape(path, _tree(ElementTree.fromstring(text)))
         elif text.startswith("{"):
             found = json.loads(text)
-        elif path.suffix.lower() == ".ini":
+        elif found is None and path.suffix.lower() == ".ini":
             parser = configparser.ConfigParser(interpolation=None, strict=False)
             parser.read_string(text)
             found = {name: dict(parser[name]) for name in parser.sections()}
@@ -187,6 +313,74 @@ def _parsed(path: Path, text: str) -> tuple[_Values, _Values, bool]:
     return _Values(path, left), _Values(path, right), is_pair
 
 
+def _of_text(path: Path, text: str) -> dict[str, Any] | None:
+    """Values of ROS's ost.txt, COLMAP's cameras.txt, RealSense's printed form, or a bare matrix; None: of
+    another."""
+    if "camera matrix" in text and "[image]" in text:
+        ost = re.sub(r"#.*", "", text)
+
+        def block(name: str, count: int) -> str:
+            match = re.search(rf"^\s*{name}\s*\n((?:\s*{_NUMBER.pattern}){{1,{count}}})", ost, re.MULTILINE)
+            return match[1] if match else ""
+
+        fields = (
+            ("image_width", "width", 1),
+            ("image_height", "height", 1),
+            ("camera_matrix", "camera matrix", 9),
+        )
+        found = {name: block(key, count) for name, key, count in (*fields, ("distortion", "distortion", 14))}
+        return {name: value for name, value in found.items() if value}
+    printed = re.fullmatch(
+        r"\[\s*(\d+)x(\d+)\s+p\[(\S+) (\S+)\]\s+f\[(\S+) (\S+)\]\s+([A-Za-z ]+?)\s*\[([^\]]*)\]\s*\]", text
+    )
+    if printed:
+        width, height, x, y, fx, fy, model, terms = printed.groups()
+        stated = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": x, "cy": y}
+        return stated | {"distortion_model": model, "coeffs": terms}
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if all(len(row) > 4 and row[0].isdigit() and row[1].isupper() for row in rows) and rows:
+        if len(rows) > 1:
+            raise UserError(f"{path}: holds {len(rows)} cameras: leave the one of the video")
+        ((_, model, width, height, *values),) = rows
+        names = _COLMAP.get(model, "").split()
+        if len(names) != len(values):
+            known = ", ".join(_COLMAP)
+            raise UserError(f"{path}: camera model {model} with {len(values)} values; known are {known}")
+        return {**dict(zip(names, values, strict=True)), "width": width, "height": height, "colmap": "yes"}
+    numbers = text.replace(",", " ").split()
+    if len(numbers) in (9, 12, 16) and all(_NUMBER.fullmatch(word) for word in numbers):
+        square = (
+            np.array([float(word) for word in numbers]).reshape(len(rows), -1)
+            if len(rows) in (3, 4)
+            else None
+        )
+        return None if square is None else {"camera_matrix": square[:3, :3].tolist()}
+    return None
+
+
+def _of_metashape(path: Path, found: Any) -> Any:
+    """Values of Metashape's XML, whose centre is relative and whose p1, p2 are exchanged; others as they
+    are."""
+    if not isinstance(found, dict) or not {"projection", "f", "cx"} <= found.keys():
+        return found
+    if found["projection"] != "frame":
+        raise UserError(f"{path}: projection {found['projection']}: calibrate with a pinhole model (frame)")
+    values = {name: float(text) for name, text in found.items() if _NUMBER.fullmatch(str(text))}
+    if values.get("b1") or values.get("b2") or values.get("k4"):
+        raise UserError(f"{path}: b1, b2 or k4 is not 0: calibrate without them")
+    width, height = values["width"], values["height"]
+    terms = {"k1": "k1", "k2": "k2", "p1": "p2", "p2": "p1", "k3": "k3"}
+    return {
+        **{name: values.get(own, 0.0) for name, own in terms.items()},
+        "fx": values["f"],
+        "fy": values["f"],
+        "cx": 0.5 * width + values.get("cx", 0.0) - 0.5,
+        "cy": 0.5 * height + values.get("cy", 0.0) - 0.5,
+        "width": width,
+        "height": height,
+    }
+
+
 def _tree(node: ElementTree.Element) -> Any:
     return {child.tag: _tree(child) for child in node} or node.text
 
@@ -204,19 +398,33 @@ def _collected(path: Path, found: Any, side: str = "", depth: int = 4) -> Iterat
         match = None if word == _KALIBR or (scalar and word in _TERMS) else _SIDED.fullmatch(word)
         name, own = (match[2], match[1] or match[3] or "") if match else (word, "")
         if isinstance(value, str) and _MODEL.fullmatch(name):
-            other = not re.fullmatch(f"({_PINHOLE})+", re.sub("[^a-z0-9]", "", value.lower()))
+            model = re.sub("[^a-z0-9]", "", value.lower())
+            if "inverse" in model and not any(_terms(found)):
+                model = "none"  # of RealSense, whose pictures are free of distortion
+            other = not re.fullmatch(f"({_PINHOLE})+", model)
         else:
             other = bool(_OTHER.search(word)) and str(value).lower() not in ("", "0", "0.0", "false", "none")
         if other:
             raise UserError(f"{path}: {key} is {value}: calibrate with a pinhole model (radtan, plumb_bob)")
         if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
             value = {str(k): one for k, one in enumerate(value)}
-        if isinstance(value, dict) and "data" not in value and depth:
+        if name == "roi":
+            yield own or side, name, value
+        elif isinstance(value, dict) and "data" not in value and depth:
             yield from _collected(path, value, own or side, depth - 1)
-        elif not (own and name in (*_TURN, *_SHIFT)):  # R1 and R2 are of rectification
+        elif not (own and name in (*_TURN, *_SHIFT[:3])):  # R1 and R2 are of rectification
             yield own or side, name, value
     for name, values in rows.items():
         yield side, name, values
+
+
+def _terms(found: Any) -> list[float]:
+    """The distortion next to a model's name; not 0 if it can't be read."""
+    for key, value in found.items():
+        if re.sub("[^a-z0-9]", "", str(key).lower()) in _LENS:
+            with suppress(TypeError, ValueError):
+                return list(_flat(value))
+    return [1.0]
 
 
 def _flat(value: Any) -> Iterator[float]:

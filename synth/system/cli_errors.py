@@ -42,9 +42,13 @@ class Commands(TyperGroup):
         except UserError as error:
             message = str(error)
         except ModuleNotFoundError as error:
-            if (error.name or "").partition(".")[0] != "sklearn":  # the one that a plain installation lacks
+            package = (error.name or "").partition(".")[0]
+            if package in ("fcntl", "resource"):  # of Unix
+                message = "this command runs on Linux only; synth doctor says what to use instead"
+            elif package == "sklearn":  # the one that a plain installation lacks
+                message = "package sklearn is missing: pip install '.[bench]' in the clone"
+            else:
                 raise
-            message = "package sklearn is missing: pip install '.[bench]' in the clone"
         except KeyboardInterrupt:
             typer.echo("stopped", err=True)
             raise typer.Exit(130) from None

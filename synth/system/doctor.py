@@ -6,14 +6,18 @@ import ctypes
 import importlib.util
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from synth.errors import first_line
 from synth.system import cache, gpu, llvm, packages
 from synth.system.checked_file import folder_bytes
 from synth.system.terminal import hang
 
+_ELSEWHERE = "only Linux is supported: use WSL 2 on Windows, or the container (Dockerfile)"
+_OF_SYSTEM = {"fcntl": "synth render and datasets", "resource": "bench score and learn predict"}
 _LEAST_FREE_GB, _LEAST_MEMORY_GB = 5.0, 4.0
 
 
@@ -29,19 +33,40 @@ class Diagnosis:
 
 def diagnose(folder: Path) -> list[Diagnosis]:
     """All lines of the report; `folder` is where datasets are to be written."""
+    parts: tuple[tuple[str, Callable[[], Iterable[Diagnosis]]], ...] = (
+        ("system", _system),
+        ("disk", lambda: [_disk(folder)]),
+        ("renderer", renderer),
+        ("CUDA", lambda: [_cuda()]),
+        ("compiled kernels", lambda: [_kernels()]),
+        ("packages", lambda: [Diagnosis(name, version) for name, version in packages.versions().items()]),
+    )
+    found = list[Diagnosis]()
+    for what, examine in parts:
+        try:
+            found += examine()
+        except Exception as error:  # of another system: the report is about what doesn't work
+            why = f"can't be examined here ({type(error).__name__}: {first_line(error)})"
+            found.append(Diagnosis(what, why, False, _ELSEWHERE))
+    return found
+
+
+def _system() -> Iterator[Diagnosis]:
     machine = packages.machine()
+    name = str(machine["system"])
+    yield Diagnosis("system", f"{name}, {machine['processor']}", name == "Linux", _ELSEWHERE)
+    for module, needed in _OF_SYSTEM.items():
+        if module in sys.modules and sys.modules[module] is None:
+            lacks = True  # find_spec raises over it
+        else:
+            lacks = importlib.util.find_spec(module) is None
+        if lacks:
+            yield Diagnosis(module, f"not in this Python: {needed} can't run", False, _ELSEWHERE)
+    yield Diagnosis("cores", str(machine["cores"]))
     enough = float(machine["memory_gb"]) >= _LEAST_MEMORY_GB
-    smaller = "use --workers 1 and a smaller render.size"
-    return [
-        Diagnosis("system", f"{machine['system']}, {machine['processor']}"),
-        Diagnosis("cores", str(machine["cores"])),
-        Diagnosis("memory", f"{machine['memory_gb']} GB", enough, smaller),
-        _disk(folder),
-        *renderer(),
-        _cuda(),
-        _kernels(),
-        *(Diagnosis(name, version) for name, version in packages.versions().items()),
-    ]
+    yield Diagnosis(
+        "memory", f"{machine['memory_gb']} GB", enough, "use --workers 1 and a smaller render.size"
+    )
 
 
 def lines(found: Sequence[Diagnosis]) -> list[str]:

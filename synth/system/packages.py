@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import re
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -32,7 +33,9 @@ def _versions() -> dict[str, str]:
 
 def machine() -> dict[str, str | int | float]:
     """Processor, cores and memory [GB] of this process, system, Python; nothing that identifies it."""
-    model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    model = None
+    with suppress(OSError):  # of Linux alone
+        model = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
     return {
         "processor": model.group(1) if model else platform.processor() or platform.machine(),
         "cores": resources.cores(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import cv2
@@ -9,8 +10,14 @@ import numpy as np
 
 from synth.arrays import Array, Pixels
 
-LAYOUTS = ("side-by-side", "top-bottom", "half-width", "half-height", "alternating")
-"""Side by side, one over the other, both also squeezed to half, and frame by frame in turn; left first."""
+LAYOUTS = ("side-by-side", "top-bottom", "half-width", "half-height", "alternating", "rows", "columns")
+"""Side by side, one over the other, both also squeezed to half, frame by frame in turn, and in every other
+row or column; left first."""
+MIXED = {
+    "checkerboard": "two cameras as a checkerboard, which are not taken apart: record them side by side",
+    "anaglyph": "two cameras by colour (anaglyph), which can't be taken apart: record them side by side",
+}
+"""Layouts that are recognised but not split, and why."""
 
 PICTURES = 9  # at the start of a video, by which it is judged
 
@@ -21,6 +28,9 @@ _DETAIL = 4.0  # grey levels, least standard deviation of a block
 _BLOCKS, _SHARE = 8, 0.4  # least number of blocks with detail, and share of them found about as far aside,
 _CERTAIN = 0.75  # or this if the picture goes on from half to half, as a periodic one does:
 _STEP, _DARK = 1.5, 2.0  # least step between halves over those nearby; less of them is dark [grey levels]
+# Mixed: least shares and shifts of the pictures of every second pixel; their least correlation and detail;
+# largest motion from picture to picture over the shift of two fields.
+_SURE, _FOUND, _FLAT, _FIELDS = np.array([0.35, 2.0]), 0.7, 0.3, 1.5
 _AGAIN, _ASIDE = 0.6, 1.0  # in turn: largest change to the next but one over that to the next; disparity [px]
 
 
@@ -39,14 +49,80 @@ def find_layout(pictures: Sequence[Pixels]) -> str:
                 return squeezed if (width < 2 * height if axis else width > height) else whole
     fine = [one - cv2.GaussianBlur(one, (0, 0), 3) for one in grey]
     changes = [[np.abs(a - b).mean() for a, b in zip(fine, fine[k:], strict=False)] for k in (1, 2)]
-    if len(fine) < 5 or np.median(changes[1]) > _AGAIN * np.median(changes[0]):
+    if len(fine) >= 5 and np.median(changes[1]) <= _AGAIN * np.median(changes[0]):
+        share, aside = match(grey[0], grey[1], 2 * _COLUMNS)
+        if share > _SHARE and aside >= _ASIDE:
+            return "alternating"
+    return _find_mixed(pictures)
+
+
+def _find_mixed(pictures: Sequence[Pixels]) -> str:
+    """The layout of two cameras in every other row, column, pixel or colour of all pictures; empty: none.
+
+    Of the four pictures of every second pixel, two pairs are then of one camera each. Two fields of an
+    interlaced video differ likewise where the picture moves, but by half as much as from picture to picture.
+    """
+    found = [_mixed_layout(pictures[k]) for k in {0, len(pictures) // 2, len(pictures) - 1}]
+    if len(set(found)) > 1 or not found[0]:
         return ""
-    share, aside = match(grey[0], grey[1], 2 * _COLUMNS)
-    return "alternating" if share > _SHARE and aside >= _ASIDE else ""
+    if found[0] == "rows" and len(pictures) > 1:
+        fields = [[_smooth(rgb[k::2, ::2, 1]) for k in (0, 1)] for rgb in pictures[:3]]
+        apart = [_shift(even, odd)[1] for even, odd in fields]
+        moved = [_shift(a[0], b[0])[1] for a, b in itertools.pairwise(fields)]
+        if max(moved) > _FIELDS * min(apart):
+            return ""
+    return found[0]
+
+
+def _mixed_layout(rgb: Pixels) -> str:
+    height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
+    green = rgb[:height, :width, 1]
+    first, right, below, across = (_smooth(green[k::2, j::2]) for k in (0, 1) for j in (0, 1))
+    apart = [bool(np.prod(_shift(first, other) >= _SURE)) for other in (right, below, across)]
+    for name, pattern in (("rows", [0, 1, 1]), ("columns", [1, 0, 1]), ("checkerboard", [1, 1, 0])):
+        if apart == pattern:
+            return name
+    red, same, blue = (_smooth(rgb[..., k], 4.0) for k in range(3))
+    by_colour = [
+        bool(np.prod(_shift(one, other) >= _SURE)) for one, other in ((red, same), (red, blue), (same, blue))
+    ]
+    return "anaglyph" if by_colour == [True, True, False] else ""
+
+
+def _smooth(channel: Array, coarse: float = 3.0) -> Array:
+    """Detail (H, W) of a channel, with unit standard deviation."""
+    grey = channel.astype(np.float32)
+    fine = cv2.GaussianBlur(grey, (0, 0), 1.0) - cv2.GaussianBlur(grey, (0, 0), coarse)
+    return np.asarray(fine / max(float(fine.std()), 1e-6), np.float32)
+
+
+def _shift(one: Array, other: Array) -> Array:
+    """Share of blocks of a picture (H, W) that are found aside in another but not in place, and the 75th
+    percentile of how far [px]."""
+    shrink = max(1.0, one.shape[1] / (2 * _COLUMNS))
+    size = round(one.shape[1] / shrink), round(one.shape[0] / shrink)
+    one, other = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in (one, other))
+    count, far, reach = 0, list[int](), max(6, size[0] // 12)
+    for y in range(1, size[1] - _BLOCK, _BLOCK // 2):
+        for x in range(reach, size[0] - _BLOCK - reach + 1, _BLOCK // 2):
+            block = one[y : y + _BLOCK, x : x + _BLOCK]
+            if block.std() < _FLAT:
+                continue
+            count += 1
+            around = other[y - 1 : y + _BLOCK + 1, x - reach : x + _BLOCK + reach]
+            scores = cv2.matchTemplate(around, block, cv2.TM_CCOEFF_NORMED).max(axis=0)
+            in_place = scores[reach - 1 : reach + 2].max()
+            if scores.max() > max(_FOUND, in_place + _BETTER):
+                far.append(abs(int(scores.argmax()) - reach))
+    if count < _BLOCKS or not far:
+        return np.zeros(2)
+    return np.array([len(far) / count, float(np.percentile(far, 75))])
 
 
 def split(rgb: Pixels, layout: str) -> tuple[Pixels, Pixels]:
     """The two cameras' pictures (h, w, 3) in one of a layout, not `alternating`; squeezed ones stretched."""
+    if layout in ("rows", "columns"):
+        return _split_lines(rgb, 0, layout), _split_lines(rgb, 1, layout)
     axis = 0 if layout in ("top-bottom", "half-height") else 1
     half = rgb.shape[axis] // 2
     one, other = np.split(rgb.take(range(2 * half), axis), 2, axis)
@@ -54,6 +130,14 @@ def split(rgb: Pixels, layout: str) -> tuple[Pixels, Pixels]:
         size = one.shape[1] * (1 + axis), one.shape[0] * (2 - axis)
         one, other = (cv2.resize(part, size, interpolation=cv2.INTER_CUBIC) for part in (one, other))
     return one, other
+
+
+def _split_lines(rgb: Pixels, first: int, layout: str) -> Pixels:
+    """The picture (H, W, 3) of every other row or column, from the first, with the others in between."""
+    lines = rgb[first::2] if layout == "rows" else rgb[:, first::2]
+    y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]].astype(np.float32)
+    x, y = (x, (y - first) / 2) if layout == "rows" else ((x - first) / 2, y)
+    return np.asarray(cv2.remap(lines, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
 def match(one: Array, other: Array, columns: int = _COLUMNS) -> tuple[float, float]:

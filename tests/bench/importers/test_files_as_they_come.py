@@ -55,6 +55,43 @@ def test_two_cameras_in_one_video_are_recognised_and_split(layout: str, tmp_path
             assert off < (6 if layout.startswith("half") else 1)
 
 
+def interleave(layout: str) -> np.ndarray:
+    both, odd = LEFT.copy(), np.indices(LEFT.shape[:2]) % 2 == 1
+    where = {"rows": odd[0], "columns": odd[1], "checkerboard": odd[0] != odd[1]}
+    if layout == "anaglyph":
+        both[..., 1:] = RIGHT[..., 1:]
+    else:
+        both[where[layout]] = RIGHT[where[layout]]
+    return both
+
+
+@pytest.mark.parametrize("layout", ["rows", "columns", "checkerboard", "anaglyph"])
+def test_two_cameras_in_lines_or_colours_are_recognised_and_those_in_lines_split(
+    layout: str, tmp_path: Path
+) -> None:
+    source = write(tmp_path / "v.mkv", 4 * [interleave(layout)])
+    assert find_layout(9 * [interleave(layout)]) == layout
+    if layout in ("checkerboard", "anaglyph"):
+        with pytest.raises(UserError, match="two cameras"):
+            registry.read_source(source, layout=layout)
+        return
+    found = registry.read_source(source, layout=layout)
+    for got, rgb in ((found.pictures, LEFT), (found.second.pictures, RIGHT)):
+        picture = next(got()).astype(int)
+        # In place, to a fraction of a pixel.
+        assert np.abs(picture - rgb).mean() < 6
+        for axis in (0, 1):
+            for step in (-1, 1):
+                assert np.abs(picture - rgb).mean() < np.abs(picture - np.roll(rgb, step, axis)).mean()
+
+
+def test_interlaced_fields_are_not_taken_for_two_cameras() -> None:
+    moved = [WIDE[:, 8 * k : 8 * k + 640].copy() for k in range(9)]
+    for k, rgb in enumerate(moved):
+        rgb[1::2] = WIDE[1::2, 8 * k + 4 : 8 * k + 644]
+    assert find_layout(moved) == ""
+
+
 def test_one_camera_is_not_taken_for_two() -> None:
     """Also mirrored, black, half black and periodic pictures."""
     board = np.repeat(255 * (np.add.outer(np.arange(480) // 40, np.arange(640) // 40) % 2)[..., None], 3, 2)

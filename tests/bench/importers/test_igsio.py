@@ -1,10 +1,12 @@
 """PLUS/IGSIO sequences as the method's authors publish them: no pixels, and a video beside the header."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import run
+from fake_recording import Maker, scored
 from igs_sequence import write_igs
 
 from bench.cli import app
@@ -89,3 +91,21 @@ def test_six_numbers_of_force_with_pictures_of_which_some_are_invalid(tmp_path: 
     assert found.times_s == pytest.approx(np.delete(TIMES, 2), abs=1e-6)
     assert [int(picture.mean()) // 8 for picture in found.pictures()] == [0, 1, *range(3, N)]
     np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
+
+
+def test_a_recording_in_that_layout_is_scored_as_its_original(make: Maker, tmp_path: Path) -> None:
+    original = make("original", frames=12)
+    recording = open_recording(original)
+    frames = list(recording.frames())
+    times = np.array([frame.time_s for frame in frames])
+    force = np.stack(
+        [np.interp(times, recording.force.time_s, axis) for axis in recording.force.force_mn.T / 1000], 1
+    )
+    writer.write_video(tmp_path / "v.mp4", iter([frame.rgb for frame in frames]), times, crf=0)
+    source = write_igs(tmp_path / "a.igs.mha", times, force, "v.mp4")
+    run(app, "import", source, "-o", tmp_path / "rec", "--scale", 0.2)
+    shutil.copy(original / "meta.yaml", tmp_path / "rec")
+    ours, theirs = (
+        scored(folder, backend="dis").methods["bump"].size_mn for folder in (tmp_path / "rec", original)
+    )
+    np.testing.assert_allclose(ours, theirs, atol=0.02 * np.nanmax(theirs))

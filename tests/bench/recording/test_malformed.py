@@ -12,6 +12,7 @@ from fake_recording import Maker, scored, texture
 from bench.checks.check_recording import check_recording
 from bench.recording import writer
 from synth.errors import UserError
+from synth.system import checked_file
 
 Corruption = Callable[[Path], object]
 
@@ -63,6 +64,36 @@ def test_an_intact_recording_has_no_problems(intact: Path, tmp_path: Path) -> No
     assert severities <= {"ok", "missing"}
     rows, columns = np.array(cv2.imread(str(drawn)).shape[:2]) // (4 * 96, 4 * 128)
     assert (rows, columns) == (2, 3)  # five frames and a legend, enlarged fourfold
+
+
+NUMBERS = [
+    {"scale_mm_per_px": 1e150}, {"scale_mm_per_px": 1e-150}, {"young_kpa": 1e300}, {"fps": 1e-300},
+    {"sync": {"method": "offset", "offset_s": 1e200}}, {"sync": {"rate": 1e9}}, {"rest_frame": 10**30},
+    {"sensor": {"mass_g": 1e200}}, {"sensor": {"free_s": [[0, 1e200]]}}, {"press_s": [-1e200, 1]},
+    {"scale_mm_per_px": None, "calibration": {"focal_px": 1e200, "distance_mm": 1}},
+    {"scale_mm_per_px": None, "calibration": {"bar_px": [[0, 0], [1e200, 0]], "bar_mm": 1}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("changed", NUMBERS)
+def test_numbers_beyond_all_recordings_are_refused(
+    intact: Path, tmp_path: Path, changed: dict[str, object]
+) -> None:
+    folder = tmp_path / "rec"
+    shutil.copytree(intact, folder)
+    about = checked_file.read_yaml(folder / "meta.yaml") | changed
+    writer.write_meta(folder, {key: value for key, value in about.items() if value is not None})
+    (only,) = (one for one in check_recording(folder) if one.severity == "error")
+    assert "\n" not in only.message
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_largest_and_least_numbers_are_reported(intact: Path, tmp_path: Path, scale: float) -> None:
+    folder = tmp_path / "rec"
+    shutil.copytree(intact, folder)
+    about = checked_file.read_yaml(folder / "meta.yaml") | {"scale_mm_per_px": scale, "young_kpa": scale}
+    writer.write_meta(folder, about)
+    assert {one.cause for one in check_recording(folder) if one.severity == "error"} == {"scale", "stiffness"}
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -23,3 +23,15 @@ def test_the_sample_is_small_sound_and_unpacked_once(tmp_path: Path, monkeypatch
     assert moved[0].max() == 0 < 1 < moved.max()
     report = verify_dataset(first.root)
     assert report.good, [check.failures for check in report.checks]
+
+
+def test_items_are_counted_by_whole_numbers_of_any_kind() -> None:
+    torch = pytest.importorskip("torch")
+    frames = synth.TorchDataset(synth.sample().root, ["rgb"])
+    last = len(frames) - 1
+    for index in (3, np.int64(3), torch.tensor(3), 3 - len(frames)):
+        assert frames[index]["frame"] == 3
+    assert frames[-1]["frame"] == frames[last]["frame"]
+    for index in (last + 1, -len(frames) - 1):
+        with pytest.raises(IndexError):
+            frames[index]

@@ -1,0 +1,81 @@
+"""DICOM: pictures of many frames, or a video inside, read by pydicom."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.importers.registry import LARGEST_BYTES, MOST_FRAMES
+from synth.arrays import Array, Floats
+from synth.errors import UserError
+from synth.system import checked_file
+from synth.system.checked_file import refuse_large
+from synth.video.read import read_video
+
+SUFFIXES = (".dcm", ".dicom")
+_VIDEO = "1.2.840.10008.1.2.4.10"  # what the transfer syntaxes of MPEG-2, H.264 and H.265 begin with
+
+
+def open_dicom(source: Path, notes: list[str]) -> tuple[Callable[[], Iterator[Array]], int, Floats | None]:
+    """The pictures of a file, how many, and their times (T,) s if it states them. UserError: it has none."""
+    from pydicom import dcmread
+    from pydicom.errors import InvalidDicomError
+
+    checked_file.check_file(source, LARGEST_BYTES)
+    try:
+        about = dcmread(source, defer_size=4096)
+    except InvalidDicomError:
+        raise UserError(f"{source}: no DICOM file: its preamble is missing") from None
+    if "PixelData" not in about:
+        kind = getattr(about, "Modality", "unknown modality")
+        raise UserError(f"{source}: a DICOM file ({kind}) without pictures")
+    if str(about.file_meta.TransferSyntaxUID).startswith(_VIDEO):
+        video = _Extracted(about)
+        times = [picture.time_s for picture in read_video(video.path)]
+        return video, len(times), np.array(times, np.float64)
+    refuse_large(int(about.Columns), int(about.Rows))
+    count = int(getattr(about, "NumberOfFrames", 1) or 1)
+    if count > MOST_FRAMES:
+        raise UserError(f"{source}: {count} frames, at most {MOST_FRAMES} are read")
+
+    def pictures() -> Iterator[Array]:
+        from pydicom.pixels import iter_pixels
+
+        return iter(iter_pixels(source))
+
+    return pictures, count, _times(about, count, notes)
+
+
+class _Extracted:
+    """The video inside a file, in a temporary one for as long as this object lives."""
+
+    def __init__(self, about: Any) -> None:
+        from pydicom.encaps import generate_fragments
+
+        self._file = tempfile.NamedTemporaryFile(suffix=".ts")  # noqa: SIM115  # deleted with this object
+        for fragment in list(generate_fragments(about.PixelData))[1:]:  # after the table of offsets
+            self._file.write(fragment)
+        self._file.flush()
+        self.path = Path(self._file.name)
+
+    def __call__(self) -> Iterator[Array]:
+        return (picture.rgb for picture in read_video(self.path))
+
+
+def _times(about: Any, count: int, notes: list[str]) -> Floats | None:
+    """Times (T,) s by the frames' stated intervals or rate; None: none is stated."""
+    steps = getattr(about, "FrameTimeVector", None)
+    if steps is not None and np.size(steps) == count:
+        return np.asarray(np.cumsum(np.array(steps, np.float64)) / 1000 - float(steps[0]) / 1000, np.float64)
+    interval_ms = float(getattr(about, "FrameTime", 0) or 0)
+    rate = float(getattr(about, "CineRate", 0) or getattr(about, "RecommendedDisplayFrameRate", 0) or 0)
+    if interval_ms > 0:
+        return np.arange(count) * interval_ms / 1000
+    if rate > 0:
+        notes.append(f"times are those of the stated rate of display, {rate:g} a second")
+        return np.arange(count) / rate
+    return None

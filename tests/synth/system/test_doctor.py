@@ -1,0 +1,26 @@
+"""The report on a machine, on systems that lack what Linux has."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LACKS = {
+    "Windows": "sys.modules['fcntl'] = sys.modules['resource'] = None; del os.getuid, "
+    "os.sched_getaffinity, os.sysconf;"
+    "platform.system = lambda: 'Windows'",
+    "macOS": "del os.sched_getaffinity; platform.system = lambda: 'Darwin'",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", LACKS)
+def test_other_systems_are_named_as_unsupported(system: str, tmp_path: Path) -> None:
+    code = f"import sys, os, platform; {LACKS[system]}\nsys.argv = ['synth', 'doctor', {str(tmp_path)!r}]\n"
+    code += "import runpy; runpy.run_module('synth', run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert any(line.startswith("LACK system") for line in lines)
+    assert any(line.startswith("LACK fcntl") for line in lines) == (system == "Windows")
