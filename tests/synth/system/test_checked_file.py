@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from synth.errors import UserError
-from synth.system import checked_file, memory
+from synth.system import checked_file, resources
 
 HOME = str(Path(checked_file.__file__).parents[2])
 
@@ -86,7 +86,7 @@ def test_an_array_is_expanded_when_it_is_needed_and_fits(
     """800 MB in a file of 0.8 MB, where 1 GB is free: its neighbour is read all the same."""
     npz(tmp_path / "a.npz", (10**8,), 8 * 10**8)
     assert (tmp_path / "a.npz").stat().st_size < 10**6
-    monkeypatch.setattr(memory, "free_bytes", lambda: 10**9)
+    monkeypatch.setattr(resources, "free_memory", lambda: 10**9)
     held = checked_file.ArrayFile(tmp_path / "a.npz")
     assert held.shapes["b"] == (10**8,)
     assert held["a"].tolist() == [0, 1, 2]
@@ -114,12 +114,12 @@ def test_an_array_has_the_size_that_its_header_states(
 
 def test_free_memory_is_at_most_the_machines() -> None:
     whole = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-    free = memory.free_bytes()
+    free = resources.free_memory()
     assert free is not None
     assert 0 < free <= int(whole["MemTotal"].split()[0]) * 1024
     with pytest.raises(ValueError, match="GB"):
-        memory.refuse_excess(free)
-    memory.refuse_excess(free // 10)
+        resources.refuse_excess(free)
+    resources.refuse_excess(free // 10)
 
 
 def test_values_of_valid_files_are_read(tmp_path: Path) -> None:
