@@ -1,7 +1,7 @@
 # No set-up is needed: `make demo` and `make test` make the virtual environment first.
 #
 #   make demo    dataset -> training -> scores -> runs/demo/report.html
-#   make test    lint, types, all tests but trials: six minutes on two cores
+#   make test    lint, types, all tests but trials: minutes on two cores
 #   make trials  kills, clusters, containers, the wheel, the site; must pass as well before a change lands
 #   make quick   lint, types, and the tests that take seconds
 #   make guard   by how much this checkout's values differ from the stored ones, a minute; ACCEPT=1 stores them
@@ -62,8 +62,7 @@ demo: .venv/installed .venv/checked
 	@echo && echo "4 of 4: scores it on a video that it was not trained on, as on a recording with a force sensor"
 	rm -rf $(DEMO)/recordings
 	recording=$$($(BIN)/bench from-dataset $(DEMO)/data --unseen-by mono --unseen-by $(DEMO)/model -o $(DEMO)/recordings) && \
-	  echo "membrane: stripped  # as in this job; else physics computes every possible one first, in two minutes" \
-	    >> $$recording/meta.yaml && \
+	  echo "membrane: stripped  # as in this job" >> $$recording/meta.yaml && \
 	  $(BIN)/bench score $$recording --model mono --also "trained here=$(DEMO)/model" --rate 0 -o $(DEMO) \
 	    --title "Force from video: a sequence unseen in training"
 	@echo && echo "done: open $(DEMO)/report.html"
