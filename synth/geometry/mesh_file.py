@@ -203,9 +203,12 @@ def _read_xml(data: bytes) -> MeshFile:
     array, found, cells = _xml_arrays(root, rest), MeshFile(), _Cells()
     points, each, before = list[Floats](), list[tuple[int, dict[str, ET.Element]]](), 0
     for piece in root.iter("Piece"):
-        if (count := int(piece.get("NumberOfPoints", 0))) == 0:
+        listed = piece.get("NumberOfPoints")
+        if listed is not None and int(listed) == 0:
             continue
-        points.append(array(piece.find("Points/DataArray"), 3 * count).reshape(-1, 3).astype(np.float64))
+        here = array(piece.find("Points/DataArray"), None if listed is None else 3 * int(listed))
+        points.append(here.reshape(-1, 3).astype(np.float64))
+        count = len(points[-1])
         for name, kind in _XML_CELLS.items():
             stated = piece.get("NumberOfCells" if kind is None else f"NumberOf{name}")
             number = None if stated is None else int(stated)
@@ -215,7 +218,8 @@ def _read_xml(data: bytes) -> MeshFile:
                 kinds = whole(array(parts["types"], number)) if kind is None else kind
                 cells.add(kinds, before + whole(array(parts["connectivity"])), ends)
         data_here = {str(one.get("Name")): one for one in piece.iterfind("PointData/DataArray")}
-        each.append((count, data_here))
+        if count:
+            each.append((count, data_here))
         before += count
     found.points, found.cells = np.concatenate([np.zeros((0, 3)), *points]), cells.join()
     for name in dict.fromkeys(name for _, here in each for name in here):
