@@ -179,7 +179,9 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help="A .mha, .bag, .mcap, .db3, ROS 2 bag folder, .h5, video, .npy, pictures' folder."),
+        Argument(
+            help="A .mha, .bag, .mcap, .db3, .h5, .dcm, video, .npy; a folder of pictures, chapters or a bag."
+        ),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
@@ -188,7 +190,8 @@ def import_(
         list[str] | None,
         Option(
             help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, fps, "
-            "right, calibration; in a ROS bag also depth, right_calibration."
+            "right, calibration, columns (of the table of forces), stream (of a video), start (picture or "
+            "file); in a ROS bag also depth, right_calibration."
         ),
     ] = None,
     stereo_layout: Annotated[
