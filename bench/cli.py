@@ -182,7 +182,7 @@ def check(
 def import_(
     source: Annotated[
         Path,
-        Argument(help=f"A video, {list_endings()}, or a folder of pictures or of a ROS 2 bag."),
+        Argument(help=f"A video, {list_endings()}, or a folder of pictures, chapters or of a bag."),
     ],
     out: Annotated[Path, Option("--out", "-o", help="Recording folder to write.")],
     scale: Annotated[str | None, Option(help="mm per pixel, or unknown; else edit meta.yaml.")] = None,
@@ -191,7 +191,8 @@ def import_(
         list[str] | None,
         Option(
             help="ROLE=NAME where the choice is ambiguous: frames, frame_time, force, force_time, fps, "
-            "right, calibration; in a ROS bag also depth, right_calibration."
+            "right, calibration, columns (of the table of forces), stream (of a video), start (picture or "
+            "file); in a ROS bag also depth, right_calibration."
         ),
     ] = None,
     stereo_layout: Annotated[

@@ -238,7 +238,7 @@ def _find_video(folder: Path, name: str, pictures: str, about: Meta, notes: list
     if named and stills:
         raise UserError(f"{folder}: has {named[0].name} and pictures in {pictures}/; keep one of them")
     if named:
-        return VideoFile(named[0], about.stream, about.start == "file")
+        return VideoFile(named[0], about.stream if name == "video" else None, about.start == "file")
     return stills
 
 

@@ -41,14 +41,14 @@ _SECONDS = {
 _WORDS = "|".join(sorted(map(re.escape, {*_NEWTONS, *_SECONDS}), key=len, reverse=True))
 _UNIT = re.compile(rf"(.*?)(?:\s*[\[({{<]\s*([^\])}}>]*?)\s*[\])}}>]|[ _.,]+({_WORDS}))")
 # Names without "%", "_" or "/" in front, with "." for "/", and without a unit.
-_AXIS = r"(?:f[ _.]?{0}|force[ _.]?{0}|{0}[ _.]?force)(?:[ _.](?:axis|component))?"
+_AXIS = r"(?:f[ _.]?{0}|(?:force|kraft)[ _.]?{0}|{0}[ _.]?force)(?:[ _.](?:axis|component))?"
 _SHEAR = r"(?:shear|tangential|lateral)[ _.]?(?:force|load|f)"
 _SIZE = (
-    r"(?:(?:normal|axial|total|resultant|measured|contact|tip|tool)[ _.])?(?:force|load|load ?cell|f)"
+    r"(?:(?:normal|axial|total|resultant|measured|contact|tip|tool)[ _.])?(?:force|load|load ?cell|kraft|f)"
     r"(?:[ _.](?:magnitude|norm|size|total|resultant))?"
 )
 _TIME = (
-    r"(?:(?:elapsed|relative|sample|host|local|utc|system)[ _.]?)?(?:t|time|time[ "
+    r"(?:(?:elapsed|relative|sample|host|local|utc|system)[ _.]?)?(?:t|time|zeit|uhrzeit|time[ "
     "_]?stamp|stamp|elapsed|clock)"
     r"|x_value|date[ _.]?time|time of day"
 )

@@ -31,6 +31,7 @@ _STEP, _DARK = 1.5, 2.0  # least step between halves over those nearby; less of 
 # Mixed: least shares and shifts of the pictures of every second pixel; their least correlation and detail;
 # largest motion from picture to picture over the shift of two fields.
 _SURE, _FOUND, _FLAT, _FIELDS = np.array([0.35, 2.0]), 0.7, 0.3, 1.5
+_REPEATS = 0.9  # correlation of a block with its own surroundings from which it is periodic
 _AGAIN, _ASIDE = 0.6, 1.0  # in turn: largest change to the next but one over that to the next; disparity [px]
 
 
@@ -107,6 +108,12 @@ def _shift(one: Array, other: Array) -> Array:
         for x in range(reach, size[0] - _BLOCK - reach + 1, _BLOCK // 2):
             block = one[y : y + _BLOCK, x : x + _BLOCK]
             if block.std() < _FLAT:
+                continue
+            own = cv2.matchTemplate(
+                one[y : y + _BLOCK, x - reach : x + _BLOCK + reach], block, cv2.TM_CCOEFF_NORMED
+            )
+            own[:, reach - 2 : reach + 3] = 0
+            if own.max() > _REPEATS:  # stripes are found everywhere
                 continue
             count += 1
             around = other[y - 1 : y + _BLOCK + 1, x - reach : x + _BLOCK + reach]

@@ -45,6 +45,15 @@ WRITTEN = {
     "Fortran": "t_s,fx_n,fy_n,fz_n\n" + plain(form="{:.9e}").replace("e", "D"),
     "torques first": "time,mx,my,mz,fx,fy,fz\n" + rows([t, 9, 9, 9, *f] for t, f in zip(T, F, strict=True)),
     "a counter": "t,timestamp,Fx,Fy,Fz\n" + rows([k, t, *F[k]] for k, t in enumerate(T)),
+    "bars": "t_s|fx_n|fy_n|fz_n\n" + plain("|"),
+    "commas at the ends": "t_s,fx_n,fy_n,fz_n,\n" + plain().replace("\n", ",\n"),
+    "a comment at the end": "t_s,fx_n,fy_n,fz_n\r\n" + plain().replace("\n", "\r\n") + "# end\n",
+    "raw values too": "t,fx_raw,fy_raw,fz_raw,fx,fy,fz\n"
+    + rows([t, 9, 9, 9, *f] for t, f in zip(T, F, strict=True)),
+    "paths of topics": "__time,/ft/wrench/force/x,/ft/wrench/force/y,/ft/wrench/force/z\n" + plain(),
+    "German": "Zeit [s];Kraft x [N];Kraft y [N];Kraft z [N]\n" + plain(";").replace(".", ","),
+    "quotes around all": '"t_s","fx_n","fy_n","fz_n"\n'
+    + "".join(f'"{line}"\n' for line in plain('","').splitlines()),
     "decimal commas": "t_s;fx_n;fy_n;fz_n\n" + plain(";").replace(".", ","),
     "tabs and commas": "t_s\tfx_n\tfy_n\tfz_n\n" + plain("\t").replace(".", ","),
     "names of another order": "t_ms,Force Z (N),Force Y (N),Force X (N)\n"
@@ -145,6 +154,14 @@ def test_one_axis_or_a_size(header: str, axes: str, place: int, tmp_path: Path) 
     assert found.axes == axes
     np.testing.assert_allclose(found.force[:, place], F[:, 1])
     assert not np.delete(found.force, place, 1).any()
+
+
+def test_the_table_of_a_testing_machine(tmp_path: Path) -> None:
+    """A title, and units in a quoted row of their own."""
+    cells = "".join(f'"{t:.3f}","0.1","{f[1]:.6f}"\n' for t, f in zip(T, F, strict=True))
+    (tmp_path / "f.csv").write_text('Results\n"Time","Extension","Load"\n"(sec)","(mm)","(lbf)"\n\n' + cells)
+    found = read_forces(tmp_path / "f.csv")
+    np.testing.assert_allclose(found.force[:, 0], POUND * F[:, 1], atol=1e-5)
 
 
 def test_columns_can_be_named(tmp_path: Path) -> None:
