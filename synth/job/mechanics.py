@@ -28,8 +28,8 @@ INSTRUMENTS: dict[Kind, dict[Instrument, float]] = {
 DRIVEN_SIZES_MM: dict[Instrument, tuple[tuple[float, float], tuple[float, float]]] = {
     "spatula": ((10.0, 30.0), (8.0, 15.0)),
     "dissector": ((5.0, 9.0), (3.0, 6.0)),
-    "forceps": ((5.0, 8.0), (2.0, 4.0)),
-    "bayonet": ((5.0, 8.0), (2.0, 4.0)),
+    "forceps": ((5.0, 8.0), (4.0, 8.0)),  # the fold between two tips of 2 to 4 mm each
+    "bayonet": ((5.0, 8.0), (4.0, 8.0)),
     "suction": ((2.0, 4.0), (2.0, 4.0)),
     "probe": ((3.0, 6.0), (3.0, 6.0)),
     "none": ((6.0, 12.0), (6.0, 12.0)),
@@ -224,8 +224,9 @@ class FemSection(Section):
     def _contacts_are_loaded_or_driven(self) -> FemSection:
         named = [(f"instrument_list[{k}].", one) for k, one in enumerate(self.instrument_list)]
         if self.contact == "loaded":
-            for at, one in [("", self), *named]:
-                if one.travel_mm is not None:
+            ways = [("", self.travel_mm), *((at, one.travel_mm) for at, one in named)]
+            for at, way in ways:
+                if way is not None:
                     raise ValueError(f"{at}travel_mm needs contact: driven")
             return self
         if self.time == "dynamic":
@@ -234,12 +235,13 @@ class FemSection(Section):
             raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
         if self.travel_mm is not None and self.force_mn is not None:
             raise ValueError("travel_mm: either the way or force_mn, not both")
-        drawn = self.instruments[1] > len(self.instrument_list)
-        for at, one in [*([("", self)] if drawn else []), *named]:
-            given = one.travel_mm or one.force_mn or self.travel_mm or self.force_mn
-            if given is None or (at and one.load is not None):
+        general = self.travel_mm or self.force_mn
+        if self.instruments[1] > len(named) and general is None:
+            raise ValueError("travel_mm: a driven contact needs travel_mm or force_mn")
+        for at, one in named:
+            if not (one.travel_mm or one.force_mn or general) or one.load is not None:
                 raise ValueError(f"{at}travel_mm: a driven contact needs travel_mm or force_mn")
-            if at and one.gesture == "slide":
+            if one.gesture == "slide":
                 raise ValueError(f"{at}gesture: a driven contact holds the tissue and doesn't slide")
         return self
 

@@ -47,17 +47,15 @@ _STRETCH = 1.01, 1.03
 mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
 ATTEMPTS = 4  # draws of a sequence's gestures, each where the mesh did not bear those before
+DRIVEN_ATTEMPTS = 12  # likewise, of driven instruments, whose range is found while solving
 _REDRAW = 32  # third element of the spawn key of further attempts
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
 _ROUND = "suction", "probe", "none"
 _TIP_LENGTH = 1.5  # of a driven end that presses, over its width
-_GRASPED_MM, _CLOSING = (
-    (2.5, 5.0),
-    (0.3, 0.6),
-)  # tissue between two tips, and the part of it that they close by
-_HOLDS = {"pull": 0.9, "grasp": 0.7, "push": 0.55, "tap": 0.4, "retract": 0.5}
+_CLOSING = 0.1, 0.4  # part by which the fold between two tips is closed
+_HOLDS = {"pull": 0.75, "grasp": 0.7, "push": 0.6, "tap": 0.5, "retract": 0.5}
 """Longest way of a driven contact over its size, the root of length times width: beyond it most draws end at
 det F of 0.2."""
 _FRAMES: int = Job.model_fields["frames"].default  # of a sequence, where no job states them
@@ -304,10 +302,11 @@ def draw_driven_gesture(
     if given.footprint_mm is not None:
         scale = 2 * _uniform(rng, given.footprint_mm) / np.sqrt(length * width)
         length, width = scale * length, scale * width
-    mean = float(np.sqrt(length * width))
-    spread = width + _uniform(rng, _GRASPED_MM) if kind == "grasp" else 0.1 * width
-    closing = 0.5 * (spread - width) * _uniform(rng, _CLOSING) if kind == "grasp" else 0.0
-    reach = 0.5 * float(np.hypot(length, width)) + 0.5 * (spread if kind == "grasp" else 0.0)
+    mean = float(np.sqrt(length * width))  # of the fold that a grasp holds
+    spread, closing, reach = 0.1 * width, 0.0, 0.5 * float(np.hypot(length, width))
+    if kind == "grasp":  # each tip holds a half of it
+        width *= 0.5
+        spread, closing = width, 0.5 * width * _uniform(rng, _CLOSING)
     largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
     radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
     point = radius * np.array([np.cos(angle), np.sin(angle)])
@@ -322,7 +321,7 @@ def draw_driven_gesture(
     if own.force_mn is not None:
         force = float(own.force_mn[0] * (own.force_mn[1] / own.force_mn[0]) ** way)
     low, high = own.travel_mm or (0.0, 0.0)
-    holds = _HOLDS[kind] * mean + (spread - width if kind == "grasp" else 0.0)
+    holds = _HOLDS[kind] * mean
     if given.travel_mm is None:  # one that is named is as given
         low, high = min(low, holds), min(high, holds)
     travel = float(low + way * (high - low)) if force is None else None
@@ -332,7 +331,7 @@ def draw_driven_gesture(
         kind=kind,
         instrument=tool,
         contacts=tuple(ToolContact((float(x), float(y)), (0.0, 0.0, 0.0)) for x, y in places),
-        footprint_mm=0.5 * mean,
+        footprint_mm=0.5 * float(np.sqrt(length * width)),
         load=0.0,
         point_mm=(float(point[0]), float(point[1])),
         direction=_vector(direction),
