@@ -46,6 +46,10 @@ TOLERANCE = 2e-4
 _FAINT = 0.05  # part of the peak below which it is a part of this share of the peak's
 _SEARCH, _ROUNDS = 20, 6  # iterations until the stiffness is taken anew, and how often
 _FIRST_MM, _LONGEST_MM, _SHORTEST_MM = 0.25, 1.0, 0.02  # steps of a drive
+_YIELDING, _ENOUGH = 0.06, 0.3  # shortest step of a plan that yields, and least way, as parts of its way
+_SLACK = (
+    0.7  # part of the drive's least J that is accepted in time, where several instruments and history act
+)
 _FARTHEST_MM = 15.0  # path of an instrument whose force isn't reached
 _SUBSTEPS = 4  # of a frame in which the search fails
 _REACHED = 0.005  # relative difference from the wanted force
@@ -157,10 +161,11 @@ class _Balance:
         self._near = self.system
 
     def find(
-        self, load: Floats, start: Floats, safe: Floats, energy: float
+        self, load: Floats, start: Floats, safe: Floats, energy: float, least_jacobian: float
     ) -> tuple[Floats, float, float, float]:
         """Displacement (N, 3) mm under nodal forces (N, 3) mN, the layers' included, its least J, stored
-        energy [mN mm] without the layers' and residual. `energy`: least that the residual is measured by.
+        energy [mN mm] without the layers' and residual. `energy`: least that the residual is measured by;
+        `least_jacobian`: smallest J that is accepted.
 
         Raises InvertedElement or NoEquilibrium.
         """
@@ -177,8 +182,8 @@ class _Balance:
             stored = self._stored(u)
             if norm <= 1.01 * TOLERANCE * float(np.sqrt(2 * max(stored, energy, 1e-12))):
                 least, element = self.system.least_jacobian(u)
-                if least <= equilibrium.LEAST_JACOBIAN:
-                    limit = f"(det F {least:.2f}, more than {equilibrium.LEAST_JACOBIAN:g} is needed)"
+                if least <= least_jacobian:
+                    limit = f"(det F {least:.2f}, more than {least_jacobian:.2g} is needed)"
                     raise InvertedElement(f"element {element} is inside out or nearly so {limit}")
                 return u, least, stored, norm / float(np.sqrt(2 * max(stored, energy, 1e-12)))
             if turn < _ROUNDS:
@@ -193,12 +198,17 @@ class _Balance:
 def drive(balance: _Balance, layer: Layer, wanted: Callable[[_Drive], float | None]) -> _Drive:
     """Drives one instrument from rest until `wanted` gives the way at which to end, within what is known.
 
-    `wanted`: from the states so far to the last way [mm]; None, or a way beyond the last state: further.
-    Raises ExcessiveLoad, with the way and the force that were reached.
+    `wanted`: from the states so far to the last way [mm]; None, or a way beyond the last state: further. A
+    plan that yields ends where tissue bears no more, if that is `_ENOUGH` of its way. Raises ExcessiveLoad,
+    with the way and the force that were reached.
     """
+    plan = layer.gesture.drive
+    assert plan is not None
     rest = np.zeros((layer.springs.shape[0] // 3, 3))
     path = _Drive([0.0], [rest], [np.zeros(3)], [0.0])
-    step = _FIRST_MM
+    step, shortest = _FIRST_MM, _SHORTEST_MM
+    if plan.yields and plan.travel_mm is not None:
+        shortest = _YIELDING * plan.travel_mm
     for _ in range(200):
         end = wanted(path)
         if end is not None and path.way[-1] >= end - 1e-9:
@@ -211,13 +221,16 @@ def drive(balance: _Balance, layer: Layer, wanted: Callable[[_Drive], float | No
             raise ExcessiveLoad(f"the force isn't reached within {_FARTHEST_MM:g} mm ({_reached(path)})")
         last = path.state[-1]
         start = last if len(path.way) < 2 else path.at(way)
+        limit = equilibrium.LEAST_JACOBIAN
         try:
-            u, _, energy, _ = balance.find(layer.pull(way), start, last, path.energy[-1])
+            u, _, energy, _ = balance.find(layer.pull(way), start, last, path.energy[-1], limit)
         except ExcessiveLoad as error:
             step = 0.5 * (way - path.way[-1])
-            if step < _SHORTEST_MM:
-                raise type(error)(f"{error} beyond {_reached(path)}") from None
-            continue
+            if step >= shortest:
+                continue
+            if plan.yields and plan.travel_mm is not None and path.way[-1] >= _ENOUGH * plan.travel_mm:
+                return path
+            raise type(error)(f"{error} beyond {_reached(path)}") from None
         path.way.append(way)
         path.state.append(u)
         path.reaction.append(layer.reaction(u, way))
@@ -282,7 +295,7 @@ def follow(
         alone = _Balance(base, [layer])
         end = partial(_end_of, layer.gesture, young_kpa, clock, frames)
         paths.append(drive(alone, layer, end))
-        way[:, k] = (end(paths[-1]) or 0.0) * motion.load
+        way[:, k] = min(end(paths[-1]) or 0.0, paths[-1].way[-1]) * motion.load
         if count == 1 and not clock.relaxation:
             first[True,] = alone
     march = _March(base, held, paths, clock, first)
@@ -356,7 +369,8 @@ class _March:
 
         def find(ways: Floats, start: Floats, safe: Floats) -> tuple[Floats, float, float, float]:
             load = sum((self._held[k].pull(ways[k]) for k in active), start=history)
-            return self._balances[key].find(load, start, safe, self._faint)
+            least = _SLACK * equilibrium.LEAST_JACOBIAN
+            return self._balances[key].find(load, start, safe, self._faint, least)
 
         alone = sum((self._paths[k].at(way[k]) for k in active), start=still)
         shifted = alone + self._u - sum((self._paths[k].at(self._way[k]) for k in active), start=still)

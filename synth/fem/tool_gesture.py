@@ -40,6 +40,7 @@ class Drive:
     force_mn: float | None  # peak of the reaction, found by driving
     closing_mm: float  # way of each tip of a grasp towards the other
     size_mm: tuple[float, float]  # of a contact, along and across the instrument
+    yields: bool = False  # whether it ends earlier where tissue bears no more; else that is an error
 
 
 @dataclass(frozen=True)

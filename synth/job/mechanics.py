@@ -193,7 +193,7 @@ class FemSection(Section):
     and there are no slides."""
     travel_mm: Range[Positive] | None = None
     """Way of the tips of a driven instrument to its peak [mm], drawn uniformly, at most that over which a
-    contact of its size holds. Either this or `force_mn`."""
+    contact of its size holds; it ends earlier where tissue bears no more. Either this or `force_mn`."""
     footprint_mm: Range[Positive] = (3.0, 6.0)
     """Radius a of a loaded contact [mm]."""
     gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)

@@ -343,7 +343,7 @@ def draw_driven_gesture(
         hover_mm=_uniform(rng, (6, 12)),
         taps=min(int(rng.integers(2, 4)), max((frames - 1) // 3, 1)) if kind == "tap" else 1,
         timing=(touch, full, fall, release),
-        drive=Drive(travel, force, closing, (length, width)),
+        drive=Drive(travel, force, closing, (length, width), yields=given.travel_mm is None),
     )
 
 

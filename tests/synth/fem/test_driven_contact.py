@@ -70,7 +70,7 @@ def run(
 
 
 @lru_cache
-def flat_block(tets: int = 2500) -> tuple[Tets, Shape]:
+def flat_block(tets: int = 1600) -> tuple[Tets, Shape]:
     """The block of `tests/helpers/felupe_ogden.py`, finest under the contact, and a fine surface on it."""
     size = np.array([40.0, 40.0, 20.0])
     points, cells = tetrahedra._bricks(size, 40)
@@ -170,6 +170,16 @@ def test_a_stiff_pia_carries_a_part_of_the_load() -> None:
     covered = run(gesture(direction=ASIDE, kind="pull"), replace(TISSUE, membrane=Pia(500.0, 0.1, 1.02)))
     bare_mn, covered_mn = (np.linalg.norm(motion.force, axis=1).max() for motion in (bare, covered))
     assert covered_mn > 1.3 * bare_mn
+
+
+def test_a_way_that_yields_ends_where_tissue_bears_no_more() -> None:
+    far = gesture(travel=7.0, size=(5.0, 5.0))
+    assert far.drive is not None
+    motion = run(replace(far, drive=replace(far.drive, yields=True)))
+    deepest = -motion.displacement[5, :, 2].min()
+    assert 2.1 < deepest < 6.5
+    assert motion.min_jacobian is not None
+    assert motion.min_jacobian.min() > 0.14
 
 
 def test_what_tissue_does_not_bear_is_refused_with_what_it_bore() -> None:
