@@ -194,6 +194,8 @@ class FemSection(Section):
     travel_mm: Range[Positive] | None = None
     """Way of the tips of a driven instrument to its peak [mm], drawn uniformly, at most that over which a
     contact of its size holds; it ends earlier where tissue bears no more. Either this or `force_mn`."""
+    travel_scale: Literal["even", "log"] = "even"
+    """Whether `travel_mm` is drawn evenly or evenly in its logarithm, as many small motions as large ones."""
     footprint_mm: Range[Positive] = (3.0, 6.0)
     """Radius a of a loaded contact [mm]."""
     gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)

@@ -55,9 +55,9 @@ _RINGS = 4  # every fourth ring of an instrument is compared with those of other
 _ROUND = "suction", "probe", "none"
 _TIP_LENGTH = 1.5  # of a driven end that presses, over its width
 _CLOSING = 0.1, 0.4  # part by which the fold between two tips is closed
-_HOLDS = {"pull": 0.75, "grasp": 0.7, "push": 0.6, "tap": 0.5, "retract": 0.5}
-"""Longest way of a driven contact over its size, the root of length times width: beyond it most draws end at
-det F of 0.2."""
+_HOLDS = {"pull": 0.9, "grasp": 0.8, "push": 0.75, "tap": 0.55, "retract": 0.7}
+"""Longest way of a driven contact over its size, the root of length times width: about where det F of 0.2 ends
+most of them."""
 _FRAMES: int = Job.model_fields["frames"].default  # of a sequence, where no job states them
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
@@ -324,7 +324,10 @@ def draw_driven_gesture(
     holds = _HOLDS[kind] * mean
     if given.travel_mm is None:  # one that is named is as given
         low, high = min(low, holds), min(high, holds)
-    travel = float(low + way * (high - low)) if force is None else None
+    travel = None
+    if force is None:
+        log = fem.travel_scale == "log"
+        travel = float(low * (high / low) ** way if log else low + way * (high - low))
     places, _ = tool_gesture.grip(kind, point, direction, spread, azimuth)
     touch, full, fall, release = map(float, given.timing or _draw_timing(kind, rng, frames))
     return Gesture(

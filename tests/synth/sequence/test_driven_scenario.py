@@ -6,11 +6,12 @@ from pydantic import ValidationError
 
 from synth.fem import equilibrium
 from synth.fem.deformation import Deformation
+from synth.fem.tool_gesture import trajectory
 from synth.job import reader
 from synth.job.mechanics import DRIVEN_SIZES_MM
 from synth.job.schema import FemSection, Job
 from synth.sequence.fem_mechanics import FemMechanics
-from synth.sequence.scenario import draw_scenario
+from synth.sequence.scenario import draw_gestures, draw_scenario
 from synth.sequence.scene import RestScene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
@@ -102,3 +103,19 @@ def test_the_label_adds_up_to_the_reaction_in_the_picture() -> None:
     assert force > 20
     total = (frame.traction * scene.area[..., None]).sum(axis=(0, 1), dtype=np.float64)
     assert np.linalg.norm(total - frame.force) <= 0.01 * force
+
+
+def test_motions_of_the_job_for_flow_are_spread_evenly_over_decades() -> None:
+    flow, pixels = reader.load_job("flow"), []
+    for index in range(120):
+        drawn = [np.random.default_rng([index, k]) for k in range(3)]
+        gesture = draw_gestures(flow.fem, 12.0, 1.0, *drawn[:2], frames=flow.frames)[0]
+        assert gesture.drive is not None
+        assert gesture.drive.travel_mm is not None
+        aside = np.hypot(*gesture.direction[:2])
+        per_mm = flow.render.size[0] / drawn[2].uniform(*flow.render.field_mm)
+        load = trajectory(gesture, flow.frames).load
+        pixels += (load[load > 0] * gesture.drive.travel_mm * aside * per_mm).tolist()
+    ends = [0.1, 1, 10, 80]
+    share = np.histogram(pixels, ends)[0] / np.diff(np.log10(ends))
+    assert np.abs(share / share.mean() - 1).max() < 0.3
