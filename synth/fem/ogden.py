@@ -158,4 +158,4 @@ def tangent(
         local[:, i, j, j, i] += crossed
         local[:, j, i, i, j] += crossed
     half = np.einsum("nia,nabcd,nbj->nijcd", u, local, w, optimize=True)
-    return np.einsum("nijcd,nkc,ndm->nijkm", half, u, w, optimize=True)
+    return np.asarray(np.einsum("nijcd,nkc,ndm->nijkm", half, u, w, optimize=True))

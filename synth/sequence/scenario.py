@@ -56,8 +56,8 @@ _ROUND = "suction", "probe", "none"
 _TIP_LENGTH = 1.5  # of a driven end that presses, over its width
 _CLOSING = 0.1, 0.4  # part by which the fold between two tips is closed
 _HOLDS = {"pull": 0.9, "grasp": 0.8, "push": 0.75, "tap": 0.55, "retract": 0.7}
-"""Longest way of a driven contact over its size, the root of length times width: about where det F of 0.2 ends
-most of them."""
+"""Longest way of a driven contact over its size, the root of length times width: about where a det F of 0.2
+ends most of them."""
 _FRAMES: int = Job.model_fields["frames"].default  # of a sequence, where no job states them
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
