@@ -28,7 +28,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from synth.arrays import Floats, Mask
-from synth.fem import equilibrium, tool_gesture
+from synth.fem import tool_gesture
 from synth.fem.equilibrium import ExcessiveLoad, InvertedElement, NoEquilibrium, minimise_energy
 from synth.fem.material import Tissue
 from synth.fem.motion import Clock, PronyHistory
@@ -36,12 +36,13 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, factorise
 from synth.fem.tangent import linearise
 from synth.fem.tool_gesture import Gesture, ToolMotion
+from synth.job.laws import LEAST_JACOBIAN
 
 FIRMNESS = 40.0
 """k0 over E/a: tissue under a flat punch has 0.8 E/a, so that it lags by some 3% of the way."""
 _SHEET_FIRMNESS = 20.0  # the same over S/a^2, S the membrane's stiffness
 
-TOLERANCE = 2e-4
+TOLERANCE = 4e-4
 """Residual's norm, as a part of that of the stored energy, at which a state is in equilibrium."""
 _FAINT = 0.05  # part of the peak below which it is a part of this share of the peak's
 _SEARCH, _ROUNDS = 20, 6  # iterations until the stiffness is taken anew, and how often
@@ -221,7 +222,7 @@ def drive(balance: _Balance, layer: Layer, wanted: Callable[[_Drive], float | No
             raise ExcessiveLoad(f"the force isn't reached within {_FARTHEST_MM:g} mm ({_reached(path)})")
         last = path.state[-1]
         start = last if len(path.way) < 2 else path.at(way)
-        limit = equilibrium.LEAST_JACOBIAN
+        limit = LEAST_JACOBIAN
         try:
             u, _, energy, _ = balance.find(layer.pull(way), start, last, path.energy[-1], limit)
         except ExcessiveLoad as error:
@@ -343,7 +344,7 @@ class _March:
             except ExcessiveLoad as error:
                 raise type(error)(f"frame {frame}: {error}") from None
             back = np.zeros(len(way), bool)
-            for k in np.flatnonzero(holds & (self._gone | ~rising)):
+            for k in np.flatnonzero(holds & (self._gone | ~rising)).tolist():
                 layer = self._held[k]
                 forward = float(layer.reaction(u, way[k]) @ np.asarray(layer.gesture.direction))
                 back[k] = forward < 0
@@ -369,7 +370,7 @@ class _March:
 
         def find(ways: Floats, start: Floats, safe: Floats) -> tuple[Floats, float, float, float]:
             load = sum((self._held[k].pull(ways[k]) for k in active), start=history)
-            least = _SLACK * equilibrium.LEAST_JACOBIAN
+            least = _SLACK * LEAST_JACOBIAN
             return self._balances[key].find(load, start, safe, self._faint, least)
 
         alone = sum((self._paths[k].at(way[k]) for k in active), start=still)

@@ -112,7 +112,7 @@ def _driven(
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     traction, parts = np.zeros_like(displacement), np.zeros((frames, len(tools), 3))
     for t in range(frames):
-        for k in np.flatnonzero(path.holds[t]):
+        for k in np.flatnonzero(path.holds[t]).tolist():
             part = tissue.young_kpa * held[k].traction(path.displacement[t], path.way[t, k])
             traction[t] += part
             parts[t, k] = area @ part
@@ -120,8 +120,8 @@ def _driven(
     raised = embedding.move(system.solve(raising))
     pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
     tips, shafts = np.zeros((frames, 2 * len(tools), 3)), np.zeros((frames, 2 * len(tools), 3))
-    for k, (gesture, motion) in enumerate(tools):
-        of = slice(2 * k, 2 * k + 2)
+    for number, (gesture, motion) in enumerate(tools):
+        of = slice(2 * number, 2 * number + 2)
         tips[:, of], shafts[:, of] = tool_gesture.pose(
             gesture, motion, surface, surface.vertices + displacement
         )

@@ -293,7 +293,7 @@ def draw_driven_gesture(
     choices = fem.choices(given)
     kind = list(choices)[int(rng.integers(len(choices)))]
     tools = choices[kind]
-    tool = str(rng.choice(list(tools), p=list(tools.values())))
+    tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
     length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[tool])
     if tool in _ROUND:
         width = length
