@@ -52,6 +52,7 @@ _SLACK = (
     0.7  # part of the drive's least J that is accepted in time, where several instruments and history act
 )
 _FARTHEST_MM = 15.0  # path of an instrument whose force isn't reached
+_MIDDLE = 0.7  # part of the way at whose state the stiffness is taken for the steps in time
 _SUBSTEPS = 4  # of a frame in which the search fails
 _REACHED = 0.005  # relative difference from the wanted force
 
@@ -171,29 +172,35 @@ class _Balance:
         Raises InvertedElement or NoEquilibrium.
         """
         load = load / self.firm
-        u = start
-        if not np.isfinite(self.system.state(u).energy):
-            u = safe
+        u, stored = start, self._stored(start, self.system.state(start).energy)
+        if not np.isfinite(stored):
+            u, stored = safe, self._stored(safe, self.system.state(safe).energy)
         for turn in range(_ROUNDS + 1):
-            stored = max(self._stored(u), energy, 1e-12)
-            tolerance = TOLERANCE * float(np.sqrt(2 * stored))
-            u, _, norm = minimise_energy(self._near, load, u, tolerance, safe, _SEARCH)
+            size = float(np.sqrt(2 * max(stored, energy, 1e-12)))
+            u, state, norm = minimise_energy(self._near, load, u, TOLERANCE * size, safe, _SEARCH)
             if not np.isfinite(u).all():
                 break
-            stored = self._stored(u)
-            if norm <= 1.01 * TOLERANCE * float(np.sqrt(2 * max(stored, energy, 1e-12))):
+            stored = self._stored(u, state.energy)
+            size = float(np.sqrt(2 * max(stored, energy, 1e-12)))
+            if norm <= 1.01 * TOLERANCE * size:
                 least, element = self.system.least_jacobian(u)
                 if least <= least_jacobian:
                     limit = f"(det F {least:.2f}, more than {least_jacobian:.2g} is needed)"
                     raise InvertedElement(f"element {element} is inside out or nearly so {limit}")
-                return u, least, stored, norm / float(np.sqrt(2 * max(stored, energy, 1e-12)))
+                return u, least, stored, norm / size
             if turn < _ROUNDS:
                 self._near = linearise(self.system, u)
         raise NoEquilibrium("no equilibrium")
 
-    def _stored(self, u: Floats) -> float:
+    def approach(self, u: Floats) -> None:
+        """Searches from now on with the stiffness at (N, 3) mm."""
+        if np.isfinite(self.system.state(u).energy):
+            self._near = linearise(self.system, u)
+
+    def _stored(self, u: Floats, energy: float) -> float:
+        """Energy [mN mm] at (N, 3) mm without the layers', of the whole."""
         springs = sum(float(u.ravel() @ (layer.springs @ u.ravel())) for layer in self.layers)
-        return self.system.state(u).energy - 0.5 * springs / self.firm
+        return energy - 0.5 * springs / self.firm
 
 
 def drive(balance: _Balance, layer: Layer, wanted: Callable[[_Drive], float | None]) -> _Drive:
@@ -365,7 +372,11 @@ class _March:
         active = [k for k, on in enumerate(key) if on]
         if key not in self._balances:
             firm = self._clock.relative_stiffness
-            self._balances[key] = _Balance(self._base, [self._held[k] for k in active], firm)
+            balance = _Balance(self._base, [self._held[k] for k in active], firm)
+            middle = sum((self._paths[k].at(_MIDDLE * self._paths[k].way[-1]) for k in active), start=still)
+            if active:  # most frames are nearer to this state than to rest
+                balance.approach(middle)
+            self._balances[key] = balance
         history = self._past.add_to(further)
 
         def find(ways: Floats, start: Floats, safe: Floats) -> tuple[Floats, float, float, float]:

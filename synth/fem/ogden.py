@@ -48,7 +48,9 @@ def stress(strain: Floats, mu: float, lam: float, alpha: float, out: Floats, ene
         det += f[0, 2] * (f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0])
         if not det > 0:
             energy[n] = np.inf
-            out[n] = 0.0
+            for i in range(3):
+                for j in range(3):
+                    out[n, i, j] = 0.0
             continue
         for i in range(3):
             for j in range(3):
@@ -78,9 +80,9 @@ def stress(strain: Floats, mu: float, lam: float, alpha: float, out: Floats, ene
 def _eigenvectors(a: Floats, v: Floats) -> None:
     """Turns a symmetric (3, 3) `a` into its diagonal form and writes its eigenvectors into the columns of
     `v`, by Jacobi's rotations (Golub & Van Loan, Matrix Computations, 8.5)."""
-    v[:] = 0.0
     for i in range(3):
-        v[i, i] = 1.0
+        for j in range(3):
+            v[i, j] = 1.0 if i == j else 0.0
     for _ in range(_SWEEPS):
         off = a[0, 1] ** 2 + a[0, 2] ** 2 + a[1, 2] ** 2
         if off <= 1e-32 * (a[0, 0] ** 2 + a[1, 1] ** 2 + a[2, 2] ** 2):

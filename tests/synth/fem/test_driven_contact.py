@@ -128,9 +128,9 @@ def test_the_load_is_the_reaction_where_the_instrument_holds(
         lag = 2.0 * np.array(way) - motion.displacement[5]
         layer = 0.5 * np.einsum("v,vd,vd->", area, motion.traction[5], lag)
         assert motion.energy[5] + layer == pytest.approx(work, rel=0.03)
-    held = np.linalg.norm(motion.traction[5], axis=1) > 0.5 * np.linalg.norm(motion.traction[5], axis=1).max()
-    along = motion.displacement[5][held] @ np.array(way)
-    assert along.mean() == pytest.approx(2.0, rel=0.1)  # tissue follows
+    inner = np.hypot(*surface.vertices[:, :2].T) < (1.0 if kind == "grasp" else 2.0)
+    along = motion.displacement[5][inner] @ np.array(way)
+    assert along.mean() == pytest.approx(2.0, rel=0.06 if kind != "grasp" else 0.2)  # tissue follows
 
 
 def test_a_small_press_is_that_of_a_flat_punch() -> None:
