@@ -202,8 +202,8 @@ class FemSection(Section):
     """Kinds of gesture that sequences are drawn from, in equal shares. Not given: those that the named
     instruments suit."""
     instrument: Annotated[tuple[Instrument, ...], _OneOrMore] = ()
-    """Instruments, one or more: each gesture is made with one that it takes, in equal shares. None: it is not
-    drawn. Empty: those usual for each gesture."""
+    """Instruments, one or more: each gesture is made with one that it takes, in equal shares; one named twice
+    has two. None: it is not drawn. Empty: those usual for each gesture."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
@@ -277,7 +277,7 @@ class FemSection(Section):
         for kind in self.gestures if one.gesture is None else (one.gesture,):
             shares = INSTRUMENTS[kind]
             if named:
-                shares = {name: 1.0 for name in named if name in (*shares, "none")}
+                shares = {name: float(named.count(name)) for name in named if name in (*shares, "none")}
             total = sum(shares.values())
             found[kind] = {name: share / total for name, share in shares.items() if share}
         if self.contact == "driven":

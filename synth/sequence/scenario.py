@@ -291,7 +291,8 @@ def draw_driven_gesture(
     Sizes are drawn from those of instruments; the way is at most that over which a contact of its size holds.
     """
     choices = fem.choices(given)
-    kind = list(choices)[int(rng.integers(len(choices)))]
+    kinds = [kind for kind in fem.gestures if kind in choices] or list(choices)
+    kind = kinds[int(rng.integers(len(kinds)))]
     tools = choices[kind]
     tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
     length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[tool])

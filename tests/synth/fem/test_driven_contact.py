@@ -18,6 +18,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock
+from synth.fem.pulse import Pulse
 from synth.fem.solver import deform
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact, grip, trajectory
 from synth.geometry.triangles import Shape
@@ -170,6 +171,25 @@ def test_a_stiff_pia_carries_a_part_of_the_load() -> None:
     covered = run(gesture(direction=ASIDE, kind="pull"), replace(TISSUE, membrane=Pia(500.0, 0.1, 1.02)))
     bare_mn, covered_mn = (np.linalg.norm(motion.force, axis=1).max() for motion in (bare, covered))
     assert covered_mn > 1.3 * bare_mn
+
+
+def test_two_instruments_and_a_pulse_act_at_once() -> None:
+    def moved(kind: str, x: float, way: tuple[float, float, float]) -> Gesture:
+        one = gesture(kind, way, 1.5, size=(5.0, 5.0))
+        return replace(one, contacts=(ToolContact((x, 0.0), (0.0, 0.0, 0.0)),), point_mm=(x, 0.0))
+
+    both = [moved("push", -5.0, DOWN), replace(moved("pull", 5.0, UP), timing=(0.2, 0.5, 0.7, 0.95))]
+    tets = tetrahedra.block(ANATOMY, 600, [place for one in both for place in one.focus])
+    fem, pulse = FemSection(tets=600, relaxation=RELAXING), Pulse(0.3, 1.2, 0.5, 0.0, 0.3, 0.0)
+    motion = deform(fem, TISSUE, both, tets, patch(), 11, 5.0, pulse)
+    area = surface_embedding.vertex_area(*patch())
+    assert motion.by_instrument.shape == (11, 2, 3)
+    most = np.abs(motion.force).max()
+    assert np.abs(motion.by_instrument.sum(axis=1) - motion.force).max() <= 1e-9 * most
+    assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * most
+    assert motion.by_instrument[5, 0, 2] < 0 < motion.by_instrument[6, 1, 2]
+    assert np.abs(motion.displacement[1]).max() > 0.02  # the pulse alone
+    assert not motion.by_instrument[1].any()
 
 
 def test_a_way_that_yields_ends_where_tissue_bears_no_more() -> None:
