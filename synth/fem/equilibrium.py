@@ -168,7 +168,7 @@ def check_state(system: System, u: Floats, state: State, frame: int, load: float
 
 
 def minimise_energy(
-    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats
+    system: System, load: Floats, start: Floats, tolerance: float, safe: Floats, iterations: int = _ITERATIONS
 ) -> tuple[Floats, State, float]:
     """Minimises stored energy less the load's work by L-BFGS on the factored rest stiffness.
 
@@ -176,8 +176,8 @@ def minimise_energy(
     simulation of hyperelastic materials" (ACM Trans. Graph. 36, 2017).
 
     `load`: (N, 3) mN; `start`, `safe`: (N, 3) mm, and one of finite energy, used where `start` has none;
-    `tolerance`: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm). Returns displacement, its state and
-    the residual's norm, which may exceed the tolerance.
+    `tolerance`: on the residual's norm sqrt(r' K^-1 r), in sqrt(mN mm); `iterations`: at most. Returns
+    displacement, its state and the residual's norm, which may exceed the tolerance.
     """
     u, state = start, system.state(start)
     if not np.isfinite(state.energy):
@@ -186,7 +186,7 @@ def minimise_energy(
     history: list[_Step] = []
     norm = np.inf
     preconditioned = system.solve(gradient)
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         norm = max(float(np.vdot(gradient, preconditioned)), 0.0) ** 0.5
         if norm <= tolerance:
             break

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from synth.fem import ogden
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
@@ -24,14 +25,15 @@ class Tissue:
 
     young_kpa: float  # Young's modulus E
     poisson: float  # Poisson's ratio
-    law: str  # material law, a key of `laws.NUMBER` or a plug-in's name
+    law: str  # material law, a key of `laws.NUMBER`, ogden or a plug-in's name
     why: str = "set by the job"  # reason for this law
     membrane: Pia | None = None  # on the surface; None where it is removed
     skull: str = "bonded"  # `bonded` or `slip`
+    alpha: float = ogden.ALPHA  # exponent of Ogden's law
 
     def equations(self, tets: Tets) -> System:
         """The equations of a volume of this tissue."""
         pia, sheet = self.membrane, None
         if pia is not None:
             sheet = MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
-        return assemble(tets, self.law, self.poisson, sheet)
+        return assemble(tets, self.law, self.poisson, sheet, self.alpha)

@@ -63,7 +63,7 @@ class Clock:
         return np.asarray(momentum / self.inertia_spring)
 
 
-class _PronyHistory:
+class PronyHistory:
     """History of relaxing tissue, as nodal forces."""
 
     def __init__(self, clock: Clock) -> None:
@@ -102,7 +102,7 @@ def march_in_time(
 
     peak = loads[np.abs(loads).max(axis=(1, 2)).argmax()]
     size = float(np.sqrt(np.vdot(peak, system.solve(peak)))) / firm or 1.0
-    past, before = _PronyHistory(clock), np.zeros_like(peak)
+    past, before = PronyHistory(clock), np.zeros_like(peak)
 
     def step(load: Floats, u: Floats) -> tuple[Floats, State, float]:
         nonlocal before

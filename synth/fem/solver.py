@@ -9,13 +9,14 @@ import numpy as np
 
 from synth.arrays import Floats
 from synth.errors import UserError
-from synth.fem import surface_embedding, tool_gesture
+from synth.fem import driven_contact, surface_embedding, tool_gesture
 from synth.fem.deformation import Deformation, Volume
 from synth.fem.equilibrium import solve_path
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.motion import Clock, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
+from synth.fem.system import System
 from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
@@ -52,6 +53,10 @@ def deform(
     tools = list(zip(gestures, motions, strict=True))
     area = surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
+    if any(gesture.drive for gesture in gestures):
+        with _naming(gestures, tissue.young_kpa):
+            lifted = None if pulse is None else (pulse, opening_mm)
+            return _driven(fem, tissue, tools, tets, embedding, surface, frames, fps, lifted, inside)
     traction, load_parameter = _load(tools, tissue.law, surface.vertices, area, frames)
     # Loads for E = 1 kPa: displacement depends on force over stiffness alone.
     pressed = np.moveaxis(area[:, None] * traction / tissue.young_kpa, 0, -1)
@@ -71,14 +76,10 @@ def deform(
     work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
     raised = embedding.move(system.solve(raising))
     pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
-    under = None
-    if inside:
-        stress = tissue.young_kpa * np.stack([system.cauchy(u) for u in path.displacement])
-        under = Volume(tets.points, tets.cells[:, _TO_VTK], np.asarray(path.displacement), stress)
     return Deformation(
         displacement=displacement,
         traction=traction,
-        volume=under,
+        volume=_volume(tissue, system, tets, path.displacement) if inside else None,
         **_instruments(tools, surface, displacement),
         min_jacobian=path.jacobian,
         energy=path.energy * tissue.young_kpa,
@@ -89,14 +90,79 @@ def deform(
     )
 
 
+def _driven(
+    fem: schema.FemSection,
+    tissue: Tissue,
+    tools: Sequence[tuple[Gesture, ToolMotion]],
+    tets: Tets,
+    embedding: surface_embedding.Embedding,
+    surface: Shape,
+    frames: int,
+    fps: float,
+    lifted: tuple[Pulse, float] | None,
+    inside: bool,
+) -> Deformation:
+    """Deformation by instruments that hold the tissue under them, as `deform`; `lifted`: pulse, opening."""
+    system, area = tissue.equations(tets), surface_embedding.vertex_area(*surface)
+    gestures, motions = [gesture for gesture, _ in tools], [motion for _, motion in tools]
+    held = driven_contact.layers(gestures, tissue, embedding, surface.vertices, area)
+    height, raising = np.zeros(frames), np.zeros_like(tets.points)
+    if lifted is not None:
+        pulse, opening_mm = lifted
+        height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
+    time, loads = clock(fem, fps, tets), height[:, None, None] * raising
+    path = driven_contact.follow(system, tissue.young_kpa, held, motions, time, loads)
+    displacement = np.stack([embedding.move(u) for u in path.displacement])
+    traction, parts = np.zeros_like(displacement), np.zeros((frames, len(tools), 3))
+    for t in range(frames):
+        for k in np.flatnonzero(path.holds[t]).tolist():
+            part = tissue.young_kpa * held[k].traction(path.displacement[t], path.way[t, k])
+            traction[t] += part
+            parts[t, k] = area @ part
+    work = 0.5 * np.einsum("v,tvd,tvd->t", area, traction, displacement, optimize=True)
+    raised = embedding.move(system.solve(raising))
+    pulse_work = 0.5 * height * np.einsum("v,tvd,vd->t", area, traction, raised, optimize=True)
+    tips, shafts = np.zeros((frames, 2 * len(tools), 3)), np.zeros((frames, 2 * len(tools), 3))
+    for number, (gesture, motion) in enumerate(tools):
+        of = slice(2 * number, 2 * number + 2)
+        tips[:, of], shafts[:, of] = tool_gesture.pose(
+            gesture, motion, surface, surface.vertices + displacement
+        )
+    return Deformation(
+        displacement=displacement,
+        traction=traction,
+        force=parts.sum(axis=1),
+        by_instrument=parts,
+        tip=tips,
+        shaft=shafts,
+        min_jacobian=path.jacobian,
+        energy=path.energy * tissue.young_kpa,
+        residual=path.residual,
+        tool_work=work - pulse_work,
+        pulse_work=pulse_work,
+        volume=_volume(tissue, system, tets, path.displacement) if inside else None,
+    )
+
+
+def _volume(tissue: Tissue, system: System, tets: Tets, displacement: Floats) -> Volume:
+    stress = tissue.young_kpa * np.stack([system.cauchy(u) for u in displacement])
+    return Volume(tets.points, tets.cells[:, _TO_VTK], np.asarray(displacement), stress)
+
+
 @contextmanager
 def _naming(gestures: Sequence[Gesture], young_kpa: float) -> Iterator[None]:
     """Adds force, radius and stiffness to an error of the block, whose numbers are per stiffness."""
     try:
         yield
     except UserError as error:
-        each = (f"{one.kind} {one.force_mn:.3g} mN, radius {one.footprint_mm:.3g} mm" for one in gestures)
+        each = [f"{one.kind} {_size_of(one)}, radius {one.footprint_mm:.3g} mm" for one in gestures]
         raise type(error)(f"{error}: {', '.join(each)}, E {young_kpa:.3g} kPa") from None
+
+
+def _size_of(gesture: Gesture) -> str:
+    if gesture.drive is not None and gesture.drive.travel_mm is not None:
+        return f"{gesture.drive.travel_mm:.3g} mm"
+    return f"{gesture.force_mn:.3g} mN"
 
 
 def clock(fem: schema.FemSection, fps: float, tets: Tets) -> Clock:

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from synth.arrays import Floats, Ints
 from synth.errors import UserError
-from synth.fem import foreign_law
+from synth.fem import foreign_law, ogden
 from synth.fem.assembly import divergence, gradient, stiffness
 from synth.fem.laws import NUMBER, lame, least_determinant, resist_swelling, stress
 from synth.fem.membrane import Membrane, MembraneSheet, cover
@@ -50,6 +50,7 @@ class System:
     membrane: Membrane | None = None  # on its surface
     averaged: float = 0.0  # kPa, the part of lambda that acts on elements' mean swelling, see `POINTWISE`
     slip: sp.csr_array | None = None  # (3N, 3N) mN/mm, as in `Tets`
+    alpha: float = ogden.ALPHA  # exponent of Ogden's law
 
     def solve(self, force: Floats) -> Floats:
         """Displacement of the linear law, (N, 3) mm, under (N, 3) mN; of K loads at once, (N, 3, K) each."""
@@ -89,13 +90,15 @@ class System:
         """First Piola-Kirchhoff stress (M * Q, 3, 3) kPa and energy mN mm at displacement gradients."""
         (mu, lam), weight = lame(1.0, self.poisson), self.mesh.weight
         answer, density = np.empty_like(strain), np.empty(len(strain))
-        if self.law in NUMBER:
+        if self.law == "ogden":
+            ogden.stress(strain, mu, lam - self.averaged, self.alpha, answer, density)
+        elif self.law in NUMBER:
             stress(NUMBER[self.law], strain, mu, lam - self.averaged, answer, density)
         else:
             foreign_law.stress(self.law, strain, mu, lam - self.averaged, answer, density)
         energy = float(density @ weight.ravel())
         if self.averaged:
-            swelling = NUMBER.get(self.law, NUMBER["neo-hookean"])  # of a plug-in: log J
+            swelling = NUMBER.get(self.law, NUMBER["neo-hookean"])  # of Ogden's and of a plug-in: log J
             energy += resist_swelling(swelling, strain, weight, self.averaged, answer)
         return answer, energy
 
@@ -113,10 +116,13 @@ class System:
         return min(found)
 
 
-def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None) -> System:
+def assemble(
+    tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None = None, alpha: float = ogden.ALPHA
+) -> System:
     """Builds and factors the equations; UserError: the mesh holds a tetrahedron that is flat or inside out.
 
-    `law`: a key of `laws.NUMBER`, or a plug-in's name; `poisson`: below 0.5; `sheet`: on the surface.
+    `law`: a key of `laws.NUMBER`, ogden, or a plug-in's name; `poisson`: below 0.5; `sheet`: on the surface;
+    `alpha`: of Ogden's law.
     """
     shape = quality(tets.points[tets.cells[:, :4]])
     if shape.min() < _FLATTEST:
@@ -129,11 +135,17 @@ def assemble(tets: Tets, law: str, poisson: float, sheet: MembraneSheet | None =
     if membrane is not None:
         whole = (whole + membrane.rest_stiffness()).tocsr()
     free = np.flatnonzero(np.repeat(~tets.fixed, 3))
-    # Symmetric and positive definite: no pivoting, an ordering of A + A'.
-    inner, symmetric = whole[free][:, free].tocsc(), {"SymmetricMode": True}
-    factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    factor = factorise(whole, free)
     corners = quadrature(tets.points, tets.cells, np.eye(4))
-    return System(mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip)
+    parts = mesh, law, poisson, free, tets.hold, whole, factor, corners, membrane, mean, tets.slip
+    return System(*parts, alpha)
+
+
+def factorise(whole: sp.csr_array, free: Ints) -> SuperLU:
+    """Factor of the free part of a stiffness (3N, 3N), symmetric and positive definite there."""
+    # No pivoting, an ordering of A + A'.
+    inner, symmetric = whole[free][:, free].tocsc(), {"SymmetricMode": True}
+    return splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
 
 
 def tissue_stiffness(mesh: Quadrature, poisson: float) -> tuple[sp.csr_array, float]:

@@ -14,6 +14,7 @@ from synth.plugins import check_answer
 
 _PINCH = 0.5  # force of a grasp's tips towards each other, as a part of their pull
 FRICTION = 0.4  # drag of a sliding tip, as a part of its push
+CLOSED_MM = 2.0  # way of a driven grasp after which its tips are closed
 _OVERLAP = 0.6  # least distance of contacts over their radii's sum: together they peak at 1.1 of one's peak
 _RING = 0.6  # radius of a ring's largest pressure over its own
 _RING_SIZE = (32 / 5 * _RING * (1 - _RING)) ** -0.5  # radius over that of a round contact of its area
@@ -27,6 +28,19 @@ class ToolContact:
 
     point_mm: tuple[float, float]  # world x, y of its centre at rest
     force_mn: tuple[float, float, float]  # force on the tissue at full load, world axes
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The way of an instrument that holds the tissue under its tips and moves it; see `driven_contact`."""
+
+    travel_mm: (
+        float | None
+    )  # way of its tips at the peak, along the gesture's direction; None: force_mn decides
+    force_mn: float | None  # peak of the reaction, found by driving
+    closing_mm: float  # way of each tip of a grasp towards the other
+    size_mm: tuple[float, float]  # of a contact, along and across the instrument
+    yields: bool = False  # whether it ends earlier where tissue bears no more; else that is an error
 
 
 @dataclass(frozen=True)
@@ -48,6 +62,14 @@ class Gesture:
     hover_mm: float  # distance of the tips from the tissue in the rest frame
     taps: int  # number of times that the load comes and goes
     timing: tuple[float, float, float, float]  # touch, full load, start of its fall, release: sequence parts
+    drive: Drive | None = None  # of a contact that is driven: loads and forces above are then 0 if not given
+
+    def ways(self, way_mm: float) -> Floats:
+        """Ways (C, 3) mm of its tips where it is `way_mm` along its path; tips of a grasp close first."""
+        ways = np.tile(way_mm * np.asarray(self.direction), (len(self.contacts), 1))
+        if self.drive is not None and len(self.contacts) == 2:
+            ways[:, :2] -= self.drive.closing_mm * _smooth(way_mm / CLOSED_MM) * _unit(self.sides)
+        return ways
 
     @property
     def axes(self) -> Floats:
@@ -55,9 +77,13 @@ class Gesture:
 
         All forms have the area of a circle of radius a, so that P means the same largest pressure.
         """
-        along = form(self.kind, self.instrument)
-        turn, size = np.radians(self.azimuth_deg), self.footprint_mm * np.sqrt([along, 1 / along])
-        size *= _RING_SIZE if self.instrument == "suction" else 1.0
+        turn = np.radians(self.azimuth_deg)
+        if self.drive is not None:
+            size = 0.5 * np.asarray(self.drive.size_mm)
+        else:
+            along = form(self.kind, self.instrument)
+            size = self.footprint_mm * np.sqrt([along, 1 / along])
+            size *= _RING_SIZE if self.instrument == "suction" else 1.0
         return np.asarray(size[:, None] * [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
 
     @property
@@ -249,7 +275,11 @@ def _under(xy: Floats, vertices: Floats, faces: Array) -> tuple[Ints, Floats]:
     return faces[best].astype(np.int64), bary[best]
 
 
-def _smooth(s: Floats) -> Floats:
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _smooth(s: Floats | float) -> Floats:
     """0 to 1 with level ends."""
     s = np.clip(s, 0, 1)
     return np.asarray(s * s * (3 - 2 * s))

@@ -25,6 +25,18 @@ INSTRUMENTS: dict[Kind, dict[Instrument, float]] = {
 }
 """Instruments that each gesture takes, with their shares where a job names none; `none` suits every one."""
 
+DRIVEN_SIZES_MM: dict[Instrument, tuple[tuple[float, float], tuple[float, float]]] = {
+    "spatula": ((10.0, 30.0), (8.0, 15.0)),
+    "dissector": ((5.0, 9.0), (3.0, 6.0)),
+    "forceps": ((5.0, 8.0), (4.0, 8.0)),  # the fold between two tips of 2 to 4 mm each
+    "bayonet": ((5.0, 8.0), (4.0, 8.0)),
+    "suction": ((2.0, 4.0), (2.0, 4.0)),
+    "probe": ((3.0, 6.0), (3.0, 6.0)),
+    "none": ((6.0, 12.0), (6.0, 12.0)),
+}
+"""Lengths along and widths across an instrument of the tissue that a driven one holds; suction, probe and
+none are round."""
+
 CLEAR_MM = 1.0  # least distance of a contact from the rim
 
 _Rule = tuple[str, Callable[[float, float, float], bool]]
@@ -62,9 +74,11 @@ class InstrumentSection(Section):
     load: Range[Positive] | None = None
     """Peak load as P = F/(E a^2)."""
     force_mn: Range[Positive] | None = None
-    """Peak force of a contact [mN], instead of `load`."""
+    """Peak force of a contact [mN], instead of `load`; of a driven instrument, of all its contacts."""
+    travel_mm: Range[Positive] | None = None
+    """Way of the tips of a driven instrument to its peak [mm], instead of `force_mn`."""
     footprint_mm: Range[Positive] | None = None
-    """Radius a of its contact [mm]."""
+    """Radius a of its contact [mm]; of a driven one, that of a circle of its area."""
     timing: tuple[_Time, _Time, _Time, _Time] | None = None
     """Touch, full load, beginning of the unloading, release: rising fractions of the sequence, or times such
     as 0.2 s or 200 ms from its first frame. For a tap only the first and the last are used."""
@@ -73,6 +87,8 @@ class InstrumentSection(Section):
     def _goes_together(self) -> InstrumentSection:
         if self.load is not None and self.force_mn is not None:
             raise ValueError("either load or force_mn, not both")
+        if self.travel_mm is not None and (self.load is not None or self.force_mn is not None):
+            raise ValueError("travel_mm: either the way or the force, not both")
         if self.timing is not None:
             touch, full, fall, release = _read_times(self.timing)[0]
             if not 0 < touch < full <= fall < release:
@@ -138,12 +154,22 @@ def _of_tissue(young_kpa: tuple[float, float]) -> tuple[float, float]:
     return young_kpa
 
 
+def _of_ogden(alpha: tuple[float, float]) -> tuple[float, float]:
+    if not -40 <= alpha[0] <= alpha[1] <= 40 or alpha[0] <= 0 <= alpha[1]:
+        raise ValueError("both ends must be below 0, at least -40, or both above 0, at most 40")
+    return alpha
+
+
 class FemSection(Section):
     """The mechanics of the tissue and of the load."""
 
     law: Annotated[PlugInName, AfterValidator(LAWS.check_name)] = "auto"
-    """Material law: linear, corotational, neo-hookean or that of an installed plug-in; auto selects the
-    cheapest built-in one whose error relative to neo-Hookean at the largest load is within 5%."""
+    """Material law: linear, corotational, neo-hookean, ogden, which stiffens, or that of an installed
+    plug-in; auto selects the cheapest built-in one whose error relative to neo-Hookean at the largest load is
+    within 5%, and ogden for driven contacts."""
+    alpha: Annotated[Range[FiniteFloat], AfterValidator(_of_ogden)] = (-4.7, -4.7)
+    """Exponent of law ogden, drawn uniformly. Swine: -4.7 (Miller & Chinzei, J. Biomech. 35, 2002); human
+    about -20 (Budday et al., Acta Biomater. 48, 2017; Bennion et al., J. R. Soc. Interface, 2022)."""
     tets: Annotated[int, Field(ge=100, le=200_000)] = 1600
     """Target number of quadratic tetrahedra; graded towards the craniotomy."""
     young_kpa: Annotated[Range[Positive], AfterValidator(_of_tissue)] = (0.5, 3.0)
@@ -160,15 +186,24 @@ class FemSection(Section):
     load: Range[Positive] = (0.05, 0.4)
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
     force_mn: Range[Positive] | None = None
-    """Peak force of a contact [mN], instead of `load`."""
+    """Peak force of a contact [mN], instead of `load`; of a driven instrument, of all its contacts."""
+    contact: Literal["loaded", "driven"] = "loaded"
+    """Loaded: a pressure that is given, in the range of small strain. Driven: the instrument holds the tissue
+    under it and moves it; the force is the reaction. For large loads; sizes are then those of instruments,
+    and there are no slides."""
+    travel_mm: Range[Positive] | None = None
+    """Way of the tips of a driven instrument to its peak [mm], drawn uniformly, at most that over which a
+    contact of its size holds; it ends earlier where tissue bears no more. Either this or `force_mn`."""
+    travel_scale: Literal["even", "log"] = "even"
+    """Whether `travel_mm` is drawn evenly or evenly in its logarithm, as many small motions as large ones."""
     footprint_mm: Range[Positive] = (3.0, 6.0)
-    """Radius a of the contact [mm]."""
+    """Radius a of a loaded contact [mm]."""
     gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)
     """Kinds of gesture that sequences are drawn from, in equal shares. Not given: those that the named
     instruments suit."""
     instrument: Annotated[tuple[Instrument, ...], _OneOrMore] = ()
-    """Instruments, one or more: each gesture is made with one that it takes, in equal shares. None: it is not
-    drawn. Empty: those usual for each gesture."""
+    """Instruments, one or more: each gesture is made with one that it takes, in equal shares; one named twice
+    has two. None: it is not drawn. Empty: those usual for each gesture."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
@@ -188,10 +223,36 @@ class FemSection(Section):
     modulus."""
 
     @model_validator(mode="after")
+    def _contacts_are_loaded_or_driven(self) -> FemSection:
+        named = [(f"instrument_list[{k}].", one) for k, one in enumerate(self.instrument_list)]
+        if self.contact == "loaded":
+            ways = [("", self.travel_mm), *((at, one.travel_mm) for at, one in named)]
+            for at, way in ways:
+                if way is not None:
+                    raise ValueError(f"{at}travel_mm needs contact: driven")
+            return self
+        if self.time == "dynamic":
+            raise ValueError("contact: driven needs time: quasi-static")
+        if "gestures" in self.model_fields_set and "slide" in self.gestures:
+            raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
+        if self.travel_mm is not None and self.force_mn is not None:
+            raise ValueError("travel_mm: either the way or force_mn, not both")
+        general = self.travel_mm or self.force_mn
+        if self.instruments[1] > len(named) and general is None:
+            raise ValueError("travel_mm: a driven contact needs travel_mm or force_mn")
+        for at, one in named:
+            if not (one.travel_mm or one.force_mn or general) or one.load is not None:
+                raise ValueError(f"{at}travel_mm: a driven contact needs travel_mm or force_mn")
+            if one.gesture == "slide":
+                raise ValueError(f"{at}gesture: a driven contact holds the tissue and doesn't slide")
+        return self
+
+    @model_validator(mode="after")
     def _law_bears_loads_and_relaxation(self, info: ValidationInfo) -> FemSection:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the lost shares add up to the whole stiffness or more")
-        for name, loads in () if info.context is STORED else self.load_ranges:
+        checked = info.context is not STORED and self.contact == "loaded"
+        for name, loads in self.load_ranges if checked else ():
             check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
         return self
 
@@ -216,9 +277,11 @@ class FemSection(Section):
         for kind in self.gestures if one.gesture is None else (one.gesture,):
             shares = INSTRUMENTS[kind]
             if named:
-                shares = {name: 1.0 for name in named if name in (*shares, "none")}
+                shares = {name: float(named.count(name)) for name in named if name in (*shares, "none")}
             total = sum(shares.values())
             found[kind] = {name: share / total for name, share in shares.items() if share}
+        if self.contact == "driven":
+            found.pop("slide", None)
         return {kind: shares for kind, shares in found.items() if shares}
 
     def load_range(self, instrument: InstrumentSection) -> LoadRange:
@@ -236,6 +299,8 @@ class FemSection(Section):
     @property
     def chosen_law(self) -> tuple[str, str]:
         """The material law of every sequence, and the reason for it."""
+        if self.law == "auto" and self.contact == "driven":
+            return "ogden", "driven contacts strain tissue beyond the range of the other laws"
         if self.law == "auto" and self.membrane.probability > 0:
             return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"
         return choose_law(self.law, self.largest_load)

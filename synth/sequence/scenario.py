@@ -16,9 +16,9 @@ from synth.errors import UserError
 from synth.fem import tool_gesture
 from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
-from synth.fem.tool_gesture import Gesture, ToolContact
+from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics import CLEAR_MM, InstrumentSection
+from synth.job.mechanics import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
@@ -47,10 +47,17 @@ _STRETCH = 1.01, 1.03
 mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
 ATTEMPTS = 4  # draws of a sequence's gestures, each where the mesh did not bear those before
+DRIVEN_ATTEMPTS = 12  # likewise, of driven instruments, whose range is found while solving
 _REDRAW = 32  # third element of the spawn key of further attempts
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
+_ROUND = "suction", "probe", "none"
+_TIP_LENGTH = 1.5  # of a driven end that presses, over its width
+_CLOSING = 0.1, 0.4  # part by which the fold between two tips is closed
+_HOLDS = {"pull": 0.9, "grasp": 0.8, "push": 0.75, "tap": 0.55, "retract": 0.7}
+"""Longest way of a driven contact over its size, the root of length times width: about where a det F of 0.2
+ends most of them."""
 _FRAMES: int = Job.model_fields["frames"].default  # of a sequence, where no job states them
 _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highlights are fewest
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
@@ -145,7 +152,8 @@ def draw_tissue(fem: FemSection, rng: Random) -> Tissue:
     stiff, thick = _log_uniform(rng, membrane.young_kpa), _uniform(rng, membrane.thickness_mm)
     pia = Pia(stiff, thick, _uniform(rng, _STRETCH))
     poisson, skull = _uniform(rng, fem.poisson), str(rng.choice(fem.skull))
-    return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull)
+    alpha = _uniform(rng, fem.alpha)  # the last one drawn
+    return Tissue(young, poisson, law, why, pia if drawn < membrane.probability else None, skull, alpha)
 
 
 def draw_pulse(pulse: schema.PulseSection, rng: Random) -> Pulse | None:
@@ -184,7 +192,10 @@ def draw_gestures(
         for k in order:
             for _ in range(_TRIES):
                 own = others if k else rng
-                trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
+                if fem.contact == "driven":
+                    trial = draw_driven_gesture(fem, opening_mm, own, wanted[k], visible_mm, frames)
+                else:
+                    trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
                 longest = np.linalg.norm(trial.axes, axis=1).max()
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
@@ -264,6 +275,79 @@ def draw_gesture(
         hover_mm=_uniform(rng, (6, 12)),
         taps=min(int(rng.integers(2, 4)), max((frames - 1) // 3, 1)) if kind == "tap" else 1,
         timing=(touch, full, fall, release),
+    )
+
+
+def draw_driven_gesture(
+    fem: FemSection,
+    opening_mm: float,
+    rng: Random,
+    given: InstrumentSection = InstrumentSection(),
+    visible_mm: float = np.inf,
+    frames: int = _FRAMES,
+) -> Gesture:
+    """Draws a gesture of an instrument that holds the tissue and moves it, as `draw_gesture`.
+
+    Sizes are drawn from those of instruments; the way is at most that over which a contact of its size holds.
+    """
+    choices = fem.choices(given)
+    kinds = [kind for kind in fem.gestures if kind in choices] or list(choices)
+    kind = kinds[int(rng.integers(len(kinds)))]
+    tools = choices[kind]
+    tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
+    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[tool])
+    if tool in _ROUND:
+        width = length
+    elif kind in ("push", "tap"):
+        length = min(length, _TIP_LENGTH * width)  # it presses with its end
+    if given.footprint_mm is not None:
+        scale = 2 * _uniform(rng, given.footprint_mm) / np.sqrt(length * width)
+        length, width = scale * length, scale * width
+    mean = float(np.sqrt(length * width))  # of the fold that a grasp holds
+    spread, closing, reach = 0.1 * width, 0.0, 0.5 * float(np.hypot(length, width))
+    if kind == "grasp":  # each tip holds a half of it
+        width *= 0.5
+        spread, closing = width, 0.5 * width * _uniform(rng, _CLOSING)
+    largest = max(min(opening_mm - reach - CLEAR_MM, visible_mm - reach), 0.0)
+    radius, angle = largest * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+    point = radius * np.array([np.cos(angle), np.sin(angle)])
+    if given.place is not None:
+        point = np.asarray(given.place, np.float64)
+    along, direction = _draw_direction(fem, kind, rng, given)
+    azimuth = _uniform(rng, (0, 360))
+    if kind == "retract":  # the hand is on the side that tissue is drawn to
+        azimuth = float((np.degrees(np.arctan2(along[1], along[0])) + _uniform(rng, (-30, 30))) % 360)
+    way, force = rng.uniform(), None
+    own = given if given.travel_mm or given.force_mn else fem
+    if own.force_mn is not None:
+        force = float(own.force_mn[0] * (own.force_mn[1] / own.force_mn[0]) ** way)
+    low, high = own.travel_mm or (0.0, 0.0)
+    holds = _HOLDS[kind] * mean
+    if given.travel_mm is None:  # one that is named is as given
+        low, high = min(low, holds), min(high, holds)
+    travel = None
+    if force is None:
+        log = fem.travel_scale == "log"
+        travel = float(low * (high / low) ** way if log else low + way * (high - low))
+    places, _ = tool_gesture.grip(kind, point, direction, spread, azimuth)
+    touch, full, fall, release = map(float, given.timing or _draw_timing(kind, rng, frames))
+    return Gesture(
+        kind=kind,
+        instrument=tool,
+        contacts=tuple(ToolContact((float(x), float(y)), (0.0, 0.0, 0.0)) for x, y in places),
+        footprint_mm=0.5 * float(np.sqrt(length * width)),
+        load=0.0,
+        point_mm=(float(point[0]), float(point[1])),
+        direction=_vector(direction),
+        force_mn=force or 0.0,
+        path_mm=(0.0, 0.0),
+        azimuth_deg=azimuth,
+        elevation_deg=_uniform(rng, (35, 65)),
+        spread_mm=spread,
+        hover_mm=_uniform(rng, (6, 12)),
+        taps=min(int(rng.integers(2, 4)), max((frames - 1) // 3, 1)) if kind == "tap" else 1,
+        timing=(touch, full, fall, release),
+        drive=Drive(travel, force, closing, (length, width), yields=given.travel_mm is None),
     )
 
 

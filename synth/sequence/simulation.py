@@ -16,7 +16,7 @@ from synth.job.schema import Job
 from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
-from synth.sequence.scenario import ATTEMPTS, Scenario, draw_scenario
+from synth.sequence.scenario import ATTEMPTS, DRIVEN_ATTEMPTS, Scenario, draw_scenario
 from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.sequence.series_mechanics import SeriesMechanics
 from synth.system.stopwatch import StageCallback, Stopwatch
@@ -61,8 +61,9 @@ def simulate(
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
-    stated = any(one.load or one.force_mn for one in job.fem.instrument_list)
-    left = 0 if case or stated or not ours else ATTEMPTS - 1
+    stated = any(one.load or one.force_mn or one.travel_mm for one in job.fem.instrument_list)
+    attempts = DRIVEN_ATTEMPTS if job.fem.contact == "driven" else ATTEMPTS
+    left = 0 if case or stated or not ours else attempts - 1
     case = case or draw_scenario(job, index)
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)

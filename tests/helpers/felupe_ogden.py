@@ -1,0 +1,140 @@
+"""Ogden's law and driven contacts by felupe: writes `felupe_ogden.json`, what ours is measured against.
+
+Run it with a Python that has felupe (GPL: it judges and never ships):
+
+    python tests/helpers/felupe_ogden.py
+
+`points`: stress and tangent of the law at deformation gradients. `scenes`: a block of 40 x 40 x 20 mm, E 1
+kPa, fixed but for its top, on which a layer of springs k0 (1 - (r/a)^2)^2 joins a disc to an instrument that
+is driven. Of felupe are the law (its Ogden energy, differentiated automatically) and the elements (bricks of
+20 nodes); of this file the springs, on the same faces, and Newton's loop. Half of the block is solved.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import felupe as fem
+import numpy as np
+import scipy.sparse as sp
+import tensortrax.math as tm
+from felupe.constitution.tensortrax import Hyperelastic
+from felupe.constitution.tensortrax.models.hyperelastic import ogden
+
+HALF, DEPTH, RADIUS, FIRM = 20.0, 20.0, 5.0, 40.0  # mm; k0 over E/a
+SCENES = [  # Poisson's ratio, alpha, way of the instrument in mm
+    (0.45, -5.0, [0.0, 0.0, -3.0]),
+    (0.45, -5.0, [3.0, 0.0, 0.0]),
+    (0.45, -15.0, [0.0, 0.0, -4.0]),
+    (0.45, -15.0, [2.0, 0.0, 3.0]),
+]
+PLACES = [[0, 0], [2.5, 0], [-2.5, 0], [0, 5], [6, 0], [-6, 0], [0, 8], [10, 0], [-10, 0]]
+
+
+def energy(C, mu, lam, alpha):
+    return ogden(C, mu=[mu], alpha=[alpha]) + (lam / 2 + mu / 3) * (0.5 * tm.log(tm.linalg.det(C))) ** 2
+
+
+def lame(poisson):
+    return 1 / (2 * (1 + poisson)), poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def points():
+    rng, rows = np.random.default_rng(0), []
+    for poisson, alpha in ((0.45, -4.7), (0.4, -15.0), (0.49, 3.0)):
+        f = np.eye(3) + 0.25 * rng.uniform(-1, 1, (6, 3, 3))
+        law = Hyperelastic(energy, mu=lame(poisson)[0], lam=lame(poisson)[1], alpha=alpha)
+        turned = np.ascontiguousarray(np.moveaxis(f, 0, -1))[..., None]
+        stress, tangent = law.gradient([turned, None])[0], law.hessian([turned, None])[0]
+        rows.append(
+            {
+                "poisson": poisson,
+                "alpha": alpha,
+                "f": f.tolist(),
+                "stress": np.moveaxis(stress[..., 0], -1, 0).tolist(),
+                "tangent": np.moveaxis(tangent[..., 0], -1, 0).tolist(),
+            }
+        )
+    return rows
+
+
+class Layer:
+    """Springs between the top and an instrument."""
+
+    def __init__(self, field, mesh, way):
+        self.field, self.way, self.part = field, np.array(way), 0.0
+        top = mesh.points[:, 2] > -1e-9
+        region = fem.RegionQuadraticHexahedronBoundary(mesh, only_surface=True, mask=top)
+        cells, size = region.mesh.cells, len(mesh.points)
+        h = np.broadcast_to(region.h, (*region.h.shape[:2], len(cells)))  # nodes, points, cells
+        place = np.einsum("cai,aqc->qci", mesh.points[cells], h)
+        r = np.hypot(place[..., 0], place[..., 1]) / RADIUS
+        weight = FIRM / RADIUS * np.maximum(1 - r**2, 0) ** 2 * region.dV
+        local, n = np.einsum("qc,aqc,bqc->cab", weight, h, h), cells.shape[1]
+        rows, columns = np.repeat(cells, n, axis=1).ravel(), np.tile(cells, (1, n)).ravel()
+        nodal = sp.csr_matrix((local.ravel(), (rows, columns)), shape=(size, size))
+        self.springs = sp.csr_matrix(sp.kron(nodal, np.eye(3)))
+        self.load = np.zeros(size)
+        np.add.at(self.load, cells, np.einsum("qc,aqc->ca", weight, h))
+
+    def force(self):
+        u = self.field[0].values.ravel()
+        return np.kron(self.load, self.part * self.way) - self.springs @ u
+
+
+def graded(end, count, first):
+    """Coordinates (count + 1,) from 0 to `end` in growing steps, the first about `first`."""
+    steps = np.geomspace(first, first * 8, count)
+    return np.append(0, np.cumsum(steps) * end / steps.sum())
+
+
+def scene(poisson, alpha, way, fine):
+    side = graded(HALF, fine, 1.0)
+    x, y, z = np.append(-side[:0:-1], side), side, -graded(DEPTH, fine - 1, 1.2)[::-1]
+    grid = [np.unique(a) for a in (x, y, z)]
+    mesh = fem.mesh.add_midpoints_edges(fem.mesh.Grid(*grid))
+    region = fem.RegionQuadraticHexahedron(mesh)
+    field = fem.FieldContainer([fem.Field(region, dim=3)])
+    p = mesh.points
+    held = (
+        (np.abs(np.abs(p[:, 0]) - HALF) < 1e-9) | (np.abs(p[:, 1] - HALF) < 1e-9) | (p[:, 2] < 1e-9 - DEPTH)
+    )
+    bounds = {
+        "held": fem.Boundary(field[0], mask=held),
+        "middle": fem.Boundary(field[0], mask=np.abs(p[:, 1]) < 1e-9, skip=(1, 0, 1)),
+    }
+    mu, lam = lame(poisson)
+    body = fem.SolidBody(Hyperelastic(energy, mu=mu, lam=lam, alpha=alpha), field)
+    layer = Layer(field, mesh, way)
+    dof0, dof1 = fem.dof.partition(field, bounds)
+    steps = int(np.ceil(np.linalg.norm(way)))
+    for k in range(steps):
+        layer.part = (k + 1) / steps
+        for _ in range(30):
+            force = body.assemble.vector(field) - sp.csr_matrix(layer.force()[:, None])
+            stiff = body.assemble.matrix(field) + layer.springs
+            system = fem.solve.partition(field, stiff, dof1, dof0, force)
+            du = fem.solve.solve(*system)
+            field += du
+            if np.linalg.norm(du) < 1e-7 * np.linalg.norm(field[0].values):
+                break
+        else:
+            raise SystemExit("no convergence")
+    u = field[0].values
+    near = [int(np.abs(p - [x, y, 0]).sum(axis=1).argmin()) for x, y in PLACES]
+    reaction = 2 * layer.force().reshape(-1, 3).sum(axis=0) * [1, 0, 1]  # by symmetry
+    print(fine, poisson, alpha, way, reaction, flush=True)
+    return {
+        "poisson": poisson,
+        "alpha": alpha,
+        "way": way,
+        "reaction": reaction.tolist(),
+        "places": p[near].tolist(),
+        "displacement": u[near].tolist(),
+    }
+
+
+if __name__ == "__main__":
+    fine = int(sys.argv[1]) if len(sys.argv) > 1 else 8  # elements from the middle to a side
+    found = {"felupe": fem.__version__, "points": points(), "scenes": [scene(*one, fine) for one in SCENES]}
+    Path(__file__).with_suffix(".json").write_text(json.dumps(found))

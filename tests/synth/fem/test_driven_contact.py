@@ -1,0 +1,209 @@
+"""Instruments that hold and move the tissue: against felupe, closed forms, and the solver of given loads."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from dome import ANATOMY, patch
+
+from synth.fem import driven_contact, surface_embedding
+from synth.fem.deformation import Deformation
+from synth.fem.equilibrium import ExcessiveLoad
+from synth.fem.material import Pia, Tissue
+from synth.fem.mesh import tetrahedra
+from synth.fem.mesh.refine import refine
+from synth.fem.mesh.tetrahedra import Tets
+from synth.fem.motion import Clock
+from synth.fem.pulse import Pulse
+from synth.fem.solver import deform
+from synth.fem.tool_gesture import Drive, Gesture, ToolContact, grip, trajectory
+from synth.geometry.triangles import Shape
+from synth.job.schema import FemSection
+
+FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())
+DOWN, ASIDE, UP = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+TISSUE = Tissue(2.0, 0.45, "ogden", alpha=-8.0)
+RELAXING = ((0.45, 0.5), (0.3, 5.0))
+
+
+def gesture(
+    kind: str = "push",
+    direction: tuple[float, float, float] = DOWN,
+    travel: float | None = 2.0,
+    force: float | None = None,
+    size: tuple[float, float] = (8.0, 8.0),
+) -> Gesture:
+    spread, closing = (6.0, 1.0) if kind == "grasp" else (1.0, 0.0)
+    places, _ = grip(kind, np.zeros(2), np.array(direction), spread, 0.0)
+    return Gesture(
+        kind=kind,
+        instrument="forceps" if kind == "grasp" else "dissector",
+        contacts=tuple(ToolContact((float(x), float(y)), (0.0, 0.0, 0.0)) for x, y in places),
+        footprint_mm=0.5 * float(np.sqrt(size[0] * size[1])),
+        load=0.0,
+        point_mm=(0.0, 0.0),
+        direction=direction,
+        force_mn=force or 0.0,
+        path_mm=(0.0, 0.0),
+        azimuth_deg=0.0,
+        elevation_deg=50.0,
+        spread_mm=spread,
+        hover_mm=8.0,
+        taps=1,
+        timing=(0.1, 0.4, 0.6, 0.9),
+        drive=Drive(travel, force, closing, size),
+    )
+
+
+def run(
+    driven: Gesture,
+    tissue: Tissue = TISSUE,
+    frames: int = 11,
+    relaxation: tuple[tuple[float, float], ...] = (),
+) -> Deformation:
+    fem = FemSection(tets=500, relaxation=relaxation)
+    tets = tetrahedra.block(ANATOMY, fem.tets, list(driven.focus))
+    return deform(fem, tissue, [driven], tets, patch(), frames, 5.0)
+
+
+@lru_cache
+def flat_block(tets: int = 1600) -> tuple[Tets, Shape]:
+    """The block of `tests/helpers/felupe_ogden.py`, finest under the contact, and a fine surface on it."""
+    size = np.array([40.0, 40.0, 20.0])
+    points, cells = tetrahedra._bricks(size, 40)
+    points, cells = refine(points, cells, lambda at: np.maximum(2.5, np.linalg.norm(at, axis=1)), tets)
+    points, cells = tetrahedra.with_midsides(points, cells)
+    fixed = (np.abs(np.abs(points[:, :2]) - 20) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - 20)
+    vertices, faces = patch(121, 24.0)
+    vertices[:, 2] = 0
+    return Tets(points, cells, fixed, sp.csr_array((len(points),) * 2)), Shape(vertices, faces)
+
+
+@pytest.mark.parametrize("scene", FELUPE["scenes"], ids=lambda scene: f"{scene['alpha']:g} {scene['way']}")
+def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[type-arg]
+    tets, surface = flat_block()
+    way = np.array(scene["way"])
+    length = float(np.linalg.norm(way))
+    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(10.0, 10.0))
+    tissue = Tissue(1.0, scene["poisson"], "ogden", alpha=scene["alpha"])
+    area = surface_embedding.vertex_area(*surface)
+    embedding = surface_embedding.embed(tets, surface.vertices)
+    held = driven_contact.layers([one], tissue, embedding, surface.vertices, area)
+    base, motion = tissue.equations(tets), trajectory(one, 3)
+    path = driven_contact.follow(base, 1.0, held, [motion], Clock(1.0), np.zeros((3, *tets.points.shape)))
+    force = held[0].reaction(path.displacement[1], path.way[1, 0])
+    assert path.way[1, 0] == pytest.approx(length)
+    wanted = np.array(scene["reaction"])
+    assert np.linalg.norm(force - wanted) <= 0.02 * np.linalg.norm(wanted)
+    places = surface_embedding.embed(tets, np.array(scene["places"]))
+    moved = places.move(path.displacement[1])
+    assert (
+        np.abs(moved - scene["displacement"]).max()
+        <= 0.03 * np.linalg.norm(scene["displacement"], axis=1).max()
+    )
+
+
+@pytest.mark.parametrize(("kind", "way"), [("push", DOWN), ("retract", ASIDE), ("grasp", UP)])
+def test_the_load_is_the_reaction_where_the_instrument_holds(
+    kind: str, way: tuple[float, float, float]
+) -> None:
+    motion, surface = run(gesture(kind, way)), patch()
+    area = surface_embedding.vertex_area(*surface)
+    force = motion.force @ np.array(way)
+    assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * force.max()
+    assert not motion.displacement[0].any()
+    assert not motion.force[[0, -1]].any()
+    assert np.abs(motion.displacement[-1]).max() < 1e-3
+    assert force.argmax() in range(4, 7)
+    assert motion.residual is not None
+    assert motion.residual.max() <= 5e-4
+    # The instrument's work is the energy that tissue and layer store: by the trapezoidal rule.
+    if kind != "grasp":
+        assert motion.energy is not None
+        load = trajectory(gesture(kind, way), 11).load[:6]
+        work = np.sum(0.5 * (force[1:6] + force[:5]) * np.diff(2.0 * load))
+        lag = 2.0 * np.array(way) - motion.displacement[5]
+        layer = 0.5 * np.einsum("v,vd,vd->", area, motion.traction[5], lag)
+        assert motion.energy[5] + layer == pytest.approx(work, rel=0.03)
+    inner = np.hypot(*surface.vertices[:, :2].T) < (1.0 if kind == "grasp" else 2.0)
+    along = motion.displacement[5][inner] @ np.array(way)
+    assert along.mean() == pytest.approx(2.0, rel=0.06 if kind != "grasp" else 0.2)  # tissue follows
+
+
+def test_a_small_press_is_that_of_a_flat_punch() -> None:
+    """F = 2 a E* d under a rigid disc without friction (Johnson 1985, 3.4); the layer's border is softer."""
+    tissue = replace(TISSUE, poisson=0.49)
+    motion = run(gesture(travel=0.05, size=(6.0, 6.0)), tissue)
+    punch = 2 * 3.0 * tissue.young_kpa / (1 - tissue.poisson**2) * 0.05
+    assert 0.7 * punch < np.linalg.norm(motion.force, axis=1).max() < punch
+
+
+@pytest.mark.parametrize("relaxation", [(), RELAXING])
+def test_a_wanted_force_is_reached(relaxation: tuple[tuple[float, float], ...]) -> None:
+    motion = run(gesture(travel=None, force=60.0), relaxation=relaxation)
+    close = 0.05 if relaxation else 0.01  # the layer doesn't relax, which the search for the way leaves out
+    assert np.linalg.norm(motion.force, axis=1).max() == pytest.approx(60.0, rel=close)
+
+
+def test_held_tissue_relaxes_and_lets_go_before_the_instrument_is_back() -> None:
+    elastic, relaxing = (run(gesture(), frames=21, relaxation=terms) for terms in ((), RELAXING))
+    firm, soft = (-motion.force[:, 2] for motion in (elastic, relaxing))
+    assert soft.max() < 0.9 * firm.max()
+    hold = slice(9, 12)
+    assert np.ptp(firm[hold]) < 0.02 * firm.max()
+    assert np.all(np.diff(soft[hold]) < 0)
+    assert soft.min() >= 0  # it doesn't pull
+    assert np.count_nonzero(soft) < np.count_nonzero(firm)
+    assert np.abs(relaxing.displacement[-1]).max() > 0.05  # and the tissue creeps back
+    # By the Prony series of the elastic force, but for skull and layer, which don't relax.
+    clock = Clock(0.2, relaxation=RELAXING)
+    still = soft > 0
+    expected = driven_contact.relaxed(elastic.force, clock)[:, 2]
+    assert np.abs(-expected - soft)[still].max() <= 0.1 * soft.max()
+
+
+def test_a_stiff_pia_carries_a_part_of_the_load() -> None:
+    bare = run(gesture(direction=ASIDE, kind="pull"))
+    covered = run(gesture(direction=ASIDE, kind="pull"), replace(TISSUE, membrane=Pia(500.0, 0.1, 1.02)))
+    bare_mn, covered_mn = (np.linalg.norm(motion.force, axis=1).max() for motion in (bare, covered))
+    assert covered_mn > 1.3 * bare_mn
+
+
+def test_two_instruments_and_a_pulse_act_at_once() -> None:
+    def moved(kind: str, x: float, way: tuple[float, float, float]) -> Gesture:
+        one = gesture(kind, way, 1.5, size=(5.0, 5.0))
+        return replace(one, contacts=(ToolContact((x, 0.0), (0.0, 0.0, 0.0)),), point_mm=(x, 0.0))
+
+    both = [moved("push", -5.0, DOWN), replace(moved("pull", 5.0, UP), timing=(0.2, 0.5, 0.7, 0.95))]
+    tets = tetrahedra.block(ANATOMY, 600, [place for one in both for place in one.focus])
+    fem, pulse = FemSection(tets=600, relaxation=RELAXING), Pulse(0.3, 1.2, 0.5, 0.0, 0.3, 0.0)
+    motion = deform(fem, TISSUE, both, tets, patch(), 11, 5.0, pulse)
+    area = surface_embedding.vertex_area(*patch())
+    assert motion.by_instrument.shape == (11, 2, 3)
+    most = np.abs(motion.force).max()
+    assert np.abs(motion.by_instrument.sum(axis=1) - motion.force).max() <= 1e-9 * most
+    assert np.abs(np.einsum("v,tvd->td", area, motion.traction) - motion.force).max() <= 1e-9 * most
+    assert motion.by_instrument[5, 0, 2] < 0 < motion.by_instrument[6, 1, 2]
+    assert np.abs(motion.displacement[1]).max() > 0.02  # the pulse alone
+    assert not motion.by_instrument[1].any()
+
+
+def test_a_way_that_yields_ends_where_tissue_bears_no_more() -> None:
+    far = gesture(travel=7.0, size=(5.0, 5.0))
+    assert far.drive is not None
+    motion = run(replace(far, drive=replace(far.drive, yields=True)))
+    deepest = -motion.displacement[5, :, 2].min()
+    assert 2.1 < deepest < 6.5
+    assert motion.min_jacobian is not None
+    assert motion.min_jacobian.min() > 0.14
+
+
+def test_what_tissue_does_not_bear_is_refused_with_what_it_bore() -> None:
+    with pytest.raises(ExcessiveLoad, match="mm"):
+        run(gesture(travel=14.0, size=(4.0, 4.0)))
+    with pytest.raises(ExcessiveLoad):
+        run(gesture(travel=None, force=1e6))

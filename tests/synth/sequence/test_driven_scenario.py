@@ -1,0 +1,121 @@
+"""Driven instruments as jobs describe them: draws, refusals, and a scene with its label in the picture."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from synth.fem import equilibrium
+from synth.fem.deformation import Deformation
+from synth.fem.tool_gesture import trajectory
+from synth.job import reader
+from synth.job.mechanics import DRIVEN_SIZES_MM
+from synth.job.schema import FemSection, Job
+from synth.sequence.fem_mechanics import FemMechanics
+from synth.sequence.scenario import draw_gestures, draw_scenario
+from synth.sequence.scene import RestScene
+from synth.sequence.simulation import simulate
+from synth.system.stopwatch import StageCallback, Stopwatch
+
+SMALL = {"sequences": 40, "frames": 9, "fps": 5.0, "anatomy": {"vertices": 3000}}
+
+
+def job(**fem: object) -> Job:
+    keys = {"contact": "driven", "travel_mm": [1, 3], "tets": 500, "law": "ogden", **fem}
+    return Job.model_validate({**SMALL, "fem": keys, "render": {"size": [160, 120]}})
+
+
+def test_sizes_ways_and_kinds_are_those_of_the_job() -> None:
+    drawn = [draw_scenario(reader.load_job("clinical"), index) for index in range(40)]
+    assert {one.gestures[0].kind for one in drawn} == {"retract", "push", "tap", "pull", "grasp"}
+    assert 0.4 < np.mean([one.tissue.membrane is not None for one in drawn]) < 0.9
+    for one in drawn:
+        gesture = one.gestures[0]
+        assert gesture.drive is not None
+        assert gesture.drive.travel_mm is not None
+        assert 0 < gesture.drive.travel_mm <= 11
+        length, width = gesture.drive.size_mm
+        assert length <= DRIVEN_SIZES_MM[gesture.instrument][0][1]
+        assert width <= DRIVEN_SIZES_MM[gesture.instrument][1][1]
+        assert -20 <= one.tissue.alpha <= -4.7
+        assert gesture.reach_mm <= 18
+        assert draw_scenario(reader.load_job("clinical"), one.index) == one
+
+
+def test_a_named_way_or_force_is_kept() -> None:
+    place = {"gesture": "pull", "instrument": "forceps", "place": [1, 0], "footprint_mm": 3}
+    way = draw_scenario(job(instrument_list=[place | {"travel_mm": 4}]), 0).gestures[0]
+    assert way.drive is not None
+    assert (way.drive.travel_mm, way.drive.force_mn) == (4, None)
+    assert way.footprint_mm == pytest.approx(3)
+    force = draw_scenario(job(instrument_list=[place | {"force_mn": 50}]), 0).gestures[0]
+    assert force.drive is not None
+    assert force.drive.travel_mm is None
+    assert force.drive.force_mn == pytest.approx(50)
+
+
+@pytest.mark.parametrize(
+    "fem",
+    [
+        {"travel_mm": 1},
+        {"contact": "driven"},
+        {"contact": "driven", "travel_mm": 1, "force_mn": 5},
+        {"contact": "driven", "travel_mm": 1, "gestures": ["slide"]},
+        {"contact": "driven", "travel_mm": 1, "time": "dynamic"},
+        {"contact": "driven", "travel_mm": 1, "instrument_list": [{"load": 0.1}]},
+        {"contact": "driven", "travel_mm": 1, "instrument_list": [{"gesture": "slide"}]},
+        {"contact": "driven", "instrument_list": [{"travel_mm": 1, "force_mn": 1}]},
+        {"instrument_list": [{"travel_mm": 1}]},
+        {"alpha": [-5, 5]},
+        {"alpha": -60},
+    ],
+)
+def test_what_does_not_go_together_is_refused(fem: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        FemSection.model_validate(fem)
+
+
+def test_driven_contacts_take_the_law_that_stiffens_and_do_not_slide() -> None:
+    fem = FemSection.model_validate({"contact": "driven", "travel_mm": 1})
+    assert fem.chosen_law[0] == "ogden"
+    assert "slide" not in fem.gestures
+
+
+def test_a_draw_that_fails_is_drawn_anew_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    bear = FemMechanics.deform
+
+    def deform(self: FemMechanics, rest: RestScene, report: StageCallback, watch: Stopwatch) -> Deformation:
+        if rest.scenario.attempt < 6:
+            raise equilibrium.InvertedElement("too far")
+        return bear(self, rest, report, watch)
+
+    monkeypatch.setattr(FemMechanics, "deform", deform)
+    case = simulate(job(travel_mm=0.5), 1).scenario
+    assert case.attempt == 6
+    assert case.gestures != draw_scenario(job(travel_mm=0.5), 1).gestures
+
+
+def test_the_label_adds_up_to_the_reaction_in_the_picture() -> None:
+    given = {"gesture": "retract", "instrument": "spatula", "place": [0, 0], "travel_mm": 3}
+    given |= {"footprint_mm": 4, "direction": [1, 0, -0.2]}
+    scene = simulate(job(instrument_list=[given]))
+    frame = scene.frame(scene.strongest)
+    force = np.linalg.norm(frame.force)
+    assert force > 20
+    total = (frame.traction * scene.area[..., None]).sum(axis=(0, 1), dtype=np.float64)
+    assert np.linalg.norm(total - frame.force) <= 0.01 * force
+
+
+def test_motions_of_the_job_for_flow_are_spread_evenly_over_decades() -> None:
+    flow, pixels = reader.load_job("flow"), []
+    for index in range(120):
+        drawn = [np.random.default_rng([index, k]) for k in range(3)]
+        gesture = draw_gestures(flow.fem, 12.0, 1.0, *drawn[:2], frames=flow.frames)[0]
+        assert gesture.drive is not None
+        assert gesture.drive.travel_mm is not None
+        aside = np.hypot(*gesture.direction[:2])
+        per_mm = flow.render.size[0] / drawn[2].uniform(*flow.render.field_mm)
+        load = trajectory(gesture, flow.frames).load
+        pixels += (load[load > 0] * gesture.drive.travel_mm * aside * per_mm).tolist()
+    ends = [0.1, 1, 10, 80]
+    share = np.histogram(pixels, ends)[0] / np.diff(np.log10(ends))
+    assert np.abs(share / share.mean() - 1).max() < 0.3
