@@ -32,7 +32,7 @@ def test_sizes_ways_and_kinds_are_those_of_the_job() -> None:
         gesture = one.gestures[0]
         assert gesture.drive is not None
         assert gesture.drive.travel_mm is not None
-        assert 0 < gesture.drive.travel_mm <= 11
+        assert 0 < gesture.drive.travel_mm <= 12
         length, width = gesture.drive.size_mm
         assert length <= DRIVEN_SIZES_MM[gesture.instrument][0][1]
         assert width <= DRIVEN_SIZES_MM[gesture.instrument][1][1]
