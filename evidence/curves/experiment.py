@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from sklearn.decomposition import TruncatedSVD
 
 from evidence import cache, report, status, training
+from evidence.curves import models
 from evidence.datasets import coarser
-from evidence.end_to_end import models
 from evidence.intervals import mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from evidence import cache, gap
-from evidence.curves import experiment
+from evidence.curves import experiment, models
 from evidence.curves.experiment import GRID, SAME, Estimator
-from evidence.end_to_end import models
 from learn.data.clips import Clip
 from synth import formats
 from synth.errors import UserError

@@ -1,10 +1,10 @@
-"""Force estimators: rules fitted on flow, physics alone, a network.
+"""Force estimators: ridge regression on flow, a network.
 
-Force rotates with the image, so rules are fitted on every sequence in its eight rotations and reflections,
+Force rotates with the image, so ridge is fitted on every sequence in its eight rotations and reflections,
 which the network draws at random.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,48 +14,14 @@ import torch
 from numpy.typing import NDArray
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import PredefinedSplit
-from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods import physics, posterior
-from bench.methods.compliance import TissueKind
-from bench.methods.protocol import Field
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, total_force
 from learn.network.channels import turned as turned_tensors
 from synth.arrays import Array, Floats
-from synth.flow.confidence import deviation
 
-Estimate = Callable[[Clip], Floats]  # clip with `recovered` displacement → force (T, 3) mN, camera axes
-
-RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "physics"
 _FOLDS = 4
-_MM_PER_PX = 0.12  # of the bench's scenes; flow's deviations are in pixels
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
-
-
-def build(model: str, fit: Sequence[Clip]) -> Estimate:
-    """An estimator by its name, fitted on sequences unless it is physics alone."""
-    if model == PHYSICS:
-        return _by_physics
-    x, force, group = samples(fit)
-    live = np.abs(x).max(axis=0) > 0
-    x = x[:, live]
-    nearest = KNeighborsRegressor(min(5, len(x)), algorithm="brute")
-    regressor = nearest.fit(x, force) if model == NEAREST else fit_ridge(x, force, group)
-    return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
-
-
-def _by_physics(clip: Clip) -> Floats:
-    frames = zip(clip.displacement["recovered"], clip.confidence, strict=True)
-    return clip.young_kpa * np.stack([read_bare(moved, clip.mask, sure) for moved, sure in frames])
-
-
-def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
-    """Force of one frame, the posterior mean for still tissue without a membrane, as a baseline's rule."""
-    spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
-    basis = posterior.load_basis(len(moved), TissueKind())
-    still = np.zeros((len(moved), 6, 0))
-    return posterior.infer(basis, physics.observe(moved, spread, mask), still).force.mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
