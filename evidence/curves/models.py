@@ -16,9 +16,10 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import PredefinedSplit
 
 from learn.data.clips import Clip
+from learn.data.grid import settled
 from learn.inference.predict import Predictor, total_force
 from learn.network.channels import turned as turned_tensors
-from synth.arrays import Array, Floats
+from synth.arrays import Array, Floats, Map
 
 _FOLDS = 4
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
@@ -67,6 +68,29 @@ def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Flo
     force = np.concatenate([t.force / t.young_kpa for turns in clips for t in turns])
     group = np.repeat(np.arange(len(fit)), [sum(t.frames for t in turns) for turns in clips])
     return x, force, group
+
+
+def coarser(clip: Clip, times: int = 2) -> Clip:
+    """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
+
+    def blocks(values: Map) -> Map:
+        n = values.shape[-1] // times
+        pooled: Map = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
+        return pooled
+
+    def mean(values: Map) -> Map:
+        return (blocks(values * clip.mask) / share * mask).astype(np.float32)
+
+    cover = blocks(np.asarray(clip.mask))
+    mask = (cover > 0.5).astype(np.float32)
+    share = np.where(mask > 0, cover, np.float32(1))
+    return replace(
+        clip,
+        mask=mask,
+        displacement={name: mean(np.asarray(moved)) for name, moved in clip.displacement.items()},
+        confidence=mean(np.asarray(clip.confidence)),
+        density=np.stack([settled(d, mask) for d in blocks(np.asarray(clip.density))]),
+    )
 
 
 def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bool = False) -> Floats:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
 from evidence.intervals import difference, mean_of
-from evidence.learn.runs import Run, base_settings, by_sequence, carry_out
+from evidence.learn.runs import base_settings, by_sequence, carry_out
 from evidence.study import Study
 from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips
@@ -40,7 +39,6 @@ HEAVY: tuple[tuple[int, int, int, int], ...] = (
 )  # fmt: skip
 """Grid, width, stem and levels of networks that are only timed, including the published one."""
 ROUNDS = 4  # of timing all networks in turn
-LIGHT = 5e9  # FLOP a frame up to which a network is timed `repeats` times
 
 
 def measure(
@@ -76,8 +74,8 @@ def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, ...], dict
             dropout = preset.arch.model_dump()["dropout"]
             arch = {"width": width, "stem": stem, "levels": levels, "dropout": dropout}
             settings = replace(usual, arch=replace(usual.arch, **arch), seed=seed)
-            run = Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
-            runs.setdefault(shape, []).append(carry_out(run, clips, cache))
+            title = f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}"
+            runs.setdefault(shape, []).append(carry_out(title, settings, clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
         for network, own in runs.items():
             rmse = by_sequence(own, "map_rmse")
@@ -105,16 +103,15 @@ def _shape(arch: Shape) -> tuple[int, ...]:
 def time_networks(shapes: Sequence[tuple[int, int, int, int]], repeats: int) -> list[dict[str, Any]]:
     """CPU time of one frame from displacement on the grid to the force map on it, by ONNX Runtime.
 
-    Heavy networks are timed at least five times, light ones `repeats` times, all of them in turn, so that
+    Networks of `HEAVY` are timed at least five times, others `repeats` times, all of them in turn, so that
     variations of the machine's speed affect all alike.
     """
     archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]  # type: ignore[arg-type]
     frames = [_frame(arch, size) for size, arch in archs]
-    costs = [flops(arch, size) for size, arch in archs]
     times: list[list[float]] = [[] for _ in shapes]
     for _ in range(ROUNDS):
-        for frame, cost, own in zip(frames, costs, times, strict=True):
-            own += _time(frame, -(-(repeats if cost < LIGHT else 5) // ROUNDS))
+        for shape, frame, own in zip(shapes, frames, times, strict=True):
+            own += _time(frame, -(-(5 if shape in HEAVY else repeats) // ROUNDS))
     return [
         {
             "size": size,
@@ -145,13 +142,6 @@ def _time(frame: Callable[[], object], repeats: int) -> Iterator[float]:
         frame()
         if k >= 3:
             yield 1e3 * (time.process_time() - start)
-
-
-def flops(arch: Architecture, size: int) -> float:
-    """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
-    with torch.device("meta"), FlopCounterMode(display=False) as counter:
-        build("d2fnet", arch).eval()(torch.zeros(1, len(arch.channels), size, size))
-    return float(counter.get_total_flops())
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

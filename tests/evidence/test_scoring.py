@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pulsating_tissue
 import pytest
@@ -15,7 +16,7 @@ from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import writer
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from evidence.datasets import coarser
+from evidence.curves.models import coarser
 from evidence.scoring import degradations, exvivo, stability
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView
@@ -103,3 +104,21 @@ def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
     after = [frame.rgb.copy() for frame in dropped.frames()]
     assert len(after) == 20
     assert (after[8] == before[12]).all()
+
+
+def test_each_degradation_changes_a_recording(tmp_path: Path) -> None:
+    source = Maker(tmp_path)(frames=degradations.FRAMES, meta={"membrane": "stripped"})
+    (source / "right").mkdir()
+    for file in (source / "frames").iterdir():
+        cv2.imwrite(str(source / "right" / file.name), cv2.imread(str(file))[:, ::-1])
+    meta = degradations.read_meta(source)
+    writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
+
+    def read(folder: Path) -> dict[str, bytes]:
+        files = (file for file in sorted(folder.rglob("*")) if file.is_file())
+        return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+    case = {"given": 3, "cameras": 2}
+    before = read(stability.degrade(source, None, case, tmp_path))
+    for name, (change, _) in (degradations.MONOCULAR | degradations.STEREO).items():
+        assert read(stability.degrade(source, change, case, tmp_path)) != before, name
