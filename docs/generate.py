@@ -292,15 +292,12 @@ def _package(module: str, folders: dict[str, Path]) -> str:
 
 
 _TITLES = {
-    "end-to-end": "Whole pipelines",
-    "engine": "Engine and clusters",
     "exvivo": "Ex vivo stand-ins",
     "fem": "Physics",
     "flow": "Optical flow and stereo",
     "gap": "Sim-to-real gap",
     "inverse": "Force by physics alone",
     "learn": "Networks",
-    "pulse": "Heartbeat and breathing",
     "scoring": "Cost of scoring",
     "tune": "Choice of fidelity",
 }

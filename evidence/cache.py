@@ -1,4 +1,4 @@
-"""Results and packed clips, cached in a folder by a key of all inputs: an interrupted run continues.
+"""Results, cached in a folder by a key of all inputs: an interrupted run continues.
 
 Code enters by the integers of `synth.formats`, which are raised when a probe of the guard moves: a comment or
 a new name makes nothing stale.
@@ -13,14 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from evidence.guard import guard
-from learn.data.clips import Clip, pack, unpack
 from synth import formats
 from synth.dataset.folder import write_whole
 from synth.job import identity
 from synth.system import packages
-
-SCENES = ("MESH", "CONTENT", "MOTION")
-"""Versions that rendered sequences depend on."""
 
 
 @cache
@@ -35,8 +31,7 @@ def key(*parts: Any, versions: Sequence[str] = ()) -> str:
 
     `versions`: names of `synth.formats` that the value depends on; all of them if none is named.
     """
-    known = guard.versions()
-    ours = {name: known[name] for name in versions or known}
+    ours = {name: getattr(formats, name) for name in versions or guard.versions()}
     described = [formats.motion_version(), libraries(), ours, *parts]
     return hashlib.blake2b(identity.canonical(described), digest_size=8).hexdigest()
 
@@ -48,10 +43,3 @@ def result(folder: Path, name: str, key: str, compute: Callable[[], Any]) -> Any
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(file, json.dumps(compute()), durable=False)
     return json.loads(file.read_text("utf-8"))
-
-
-def clip(file: Path, make: Callable[[], Clip]) -> Clip:
-    """Clip packed in a file whose name contains its key; made and packed if there is none."""
-    if not file.is_file():
-        pack(make(), file)
-    return unpack(file)

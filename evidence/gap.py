@@ -312,7 +312,8 @@ def page(found: Mapping[str, Any]) -> report.Page:
             f"out of distribution ({found['held_out']}), '': recordings by felupe and Blender's Cycles, "
             "whose ideal flow is that of the contacts alone. "
             f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
-            f"networks a training: {found['seeds']}; 95% BCa intervals.",
+            f"networks a training: {found['seeds']}; 95% BCa intervals. "
+            "[The same question by four commands](../../howto/gap.md).",
         ),
         [report.Section(f"{flow}: {_UNIT}", rows)],
         report.interval_charts(*charts),

@@ -12,6 +12,7 @@ from learn.settings import TrainingSettings
 from learn.split import Split, groups
 from learn.training.train import train
 from synth.dataset.split import draw_groups
+from synth.formats import CLIPS
 
 
 def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]:
@@ -45,6 +46,7 @@ def fit(
     `name`: part of the key, next to settings and the clips' hashes.
     """
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
-    model = folder / f"{name}-{cache.key(settings.model_dump(), used, versions=('CLIPS', 'TRAINING'))}"
+    key = cache.key(settings.model_dump(), used, CLIPS, versions=("TRAINING",))
+    model = folder / f"{name}-{key}"
     train(clips, split, settings, model, device=device)
     return load_model(model)

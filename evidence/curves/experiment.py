@@ -17,8 +17,7 @@ from matplotlib.axes import Axes
 from sklearn.decomposition import TruncatedSVD
 
 from evidence import cache, report, status, training
-from evidence.datasets import coarser
-from evidence.end_to_end import models
+from evidence.curves import models
 from evidence.intervals import mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
@@ -89,7 +88,7 @@ def fitted(one: Estimator, fit: Sequence[Clip], select: Sequence[Clip], steps: i
 
 def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
     """Ridge on principal components of displacement, in eight orientations."""
-    small = [coarser(clip) for clip in fit]
+    small = [models.coarser(clip) for clip in fit]
     # Not centred, so that zero motion stays zero.
     x, _, _ = models.samples(small[:_BASIS], one.source)
     basis = TruncatedSVD(min(_COMPONENTS, min(x.shape) - 1), random_state=0).fit(x)
@@ -103,7 +102,7 @@ def _by_components(one: Estimator, fit: Sequence[Clip]) -> Estimate:
     regressor = models.fit_ridge(x, force, group)
     return lambda clip: (
         clip.young_kpa
-        * np.asarray(regressor.predict(basis.transform(models.rows(coarser(clip), one.source))))
+        * np.asarray(regressor.predict(basis.transform(models.rows(models.coarser(clip), one.source))))
     )
 
 

@@ -138,8 +138,10 @@ def main(
         typer.echo(line)
     if accept and not unraised:
         # Sketches of probes that have not moved stay, so that small changes of many commits add up visibly.
-        still = {change.probe for change in changes if not change.moved}
-        kept = {name: before[name] if name in still else now.get(name, before.get(name)) for name in PROBES}
+        moved = {change.probe for change in changes if change.moved}
+        kept = {
+            name: {**now.get(name, {}), **({} if name in moved else before.get(name, {}))} for name in PROBES
+        }
         _write({name: sketches for name, sketches in kept.items() if sketches})
         from evidence import status  # which compares results with the guard
 

@@ -20,7 +20,8 @@ import numpy as np
 
 import synth
 from bench.cli import app as bench_app
-from learn.data.clips import Clip
+from learn.data.clips import Clip, read_clip
+from learn.data.grid import Grid
 from learn.settings import preset
 from learn.split import Split
 from synth.arrays import Mask, Pixels
@@ -166,7 +167,10 @@ def probe_stereo() -> Arrays:
 
 
 def probe_network() -> Arrays:
-    """Losses of four epochs by two loss functions, and the networks' answers, on clips of closed form."""
+    """Losses of four epochs by two loss functions, and the networks' answers, on clips of closed form.
+
+    Also what the package's own sequences are on a network's grid.
+    """
     from learn.training.train import train  # PyTorch is loaded by training alone
 
     clips = [_clip(k) for k in range(6)]
@@ -183,6 +187,10 @@ def probe_network() -> Arrays:
             history = [json.loads(line) for line in (out / "history.jsonl").read_text("utf-8").splitlines()]
             arrays[f"{loss}: losses"] = [epoch["loss"] for epoch in history]
             arrays[f"{loss}: answer"] = _answer(out)
+    for k, sequence in enumerate(synth.sample()):
+        clip = read_clip(sequence, Grid(32), ("ideal", "recovered"))
+        arrays[f"grid {k}: density"] = clip.density
+        arrays |= {f"grid {k}: {source}": moved for source, moved in clip.displacement.items()}
     return arrays
 
 
@@ -203,7 +211,7 @@ PROBES: Mapping[str, Probe] = {
     "truth": Probe(probe_truth, 1e-3, ("CONTENT",), ("synth/render", "synth/sequence", "synth/job")),
     "flow": Probe(probe_flow, 1e-2, ("MOTION",), ("synth/flow",)),
     "stereo": Probe(probe_stereo, 1e-2, ("MOTION",), ("synth/flow/stereo",)),
-    "network": Probe(probe_network, 1e-2, ("TRAINING",), ("learn",)),
+    "network": Probe(probe_network, 1e-2, ("TRAINING", "CLIPS"), ("learn",)),
     "score": Probe(
         probe_score,
         3e-2,

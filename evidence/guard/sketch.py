@@ -54,10 +54,8 @@ def compare(before: Sketch, now: Sketch) -> float:
 
 
 def compare_all(before: Mapping[str, Sketch], now: Mapping[str, Sketch]) -> dict[str, float]:
-    """Relative change by array of a probe; infinite for an array that only one of the two has."""
-    names = dict.fromkeys((*before, *now))
-    both = before.keys() & now.keys()
-    return {name: compare(before[name], now[name]) if name in both else math.inf for name in names}
+    """Relative change by array of a probe; infinite for one that is gone. New arrays move nothing."""
+    return {name: compare(old, now[name]) if name in now else math.inf for name, old in before.items()}
 
 
 def sketch_all(arrays: Mapping[str, Any]) -> dict[str, Sketch]:

@@ -13,18 +13,16 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from torch.utils.flop_counter import FlopCounterMode
 
 from evidence import report, status
 from evidence.intervals import difference, mean_of
-from evidence.learn.runs import Run, base_settings, by_sequence, carry_out
+from evidence.learn.runs import base_settings, by_sequence, carry_out
 from evidence.study import Study
 from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips
 from learn.data.grid import Grid, Scales
 from learn.inference.convert import examples, to_onnx
 from learn.inference.predict import input_names
-from learn.network.channels import channels
 from learn.network.registry import build
 from learn.network.shape import Architecture, Shape
 from learn.settings import PRESETS, TrainingSettings, replace
@@ -41,22 +39,16 @@ HEAVY: tuple[tuple[int, int, int, int], ...] = (
 )  # fmt: skip
 """Grid, width, stem and levels of networks that are only timed, including the published one."""
 ROUNDS = 4  # of timing all networks in turn
-LIGHT = 5e9  # FLOP a frame up to which a network is timed `repeats` times
 
 
 def measure(
-    dataset: Path | None = None,
-    cache: Path = Path("runs/networks"),
-    repeats: int = 60,
-    seeds: int = 1,
-    device: str = "cpu",
+    dataset: Path | None = None, cache: Path = Path("runs/networks"), repeats: int = 60, seeds: int = 1
 ) -> dict[str, Any]:
-    """Errors of networks trained in equal steps, and the time of one frame on one core or a GPU."""
+    """Errors of networks trained in equal steps, and the time of one frame on one core."""
     shapes = [(PRESETS[name].size, *shape) for name, group in OTHERS.items() for shape in group]
     known = {} if dataset is None else errors(dataset, cache, seeds)
-    rows = time_networks([*shapes, *HEAVY], repeats, device)
+    rows = time_networks([*shapes, *HEAVY], repeats)
     return {
-        "device": device if device == "cpu" else torch.cuda.get_device_name(),
         "torch": torch.__version__,
         "data": status.data(*filter(None, [dataset])),
         "trained": {name: PRESETS[name].loss for name in OTHERS if known},
@@ -82,8 +74,8 @@ def errors(dataset: Path, cache: Path, seeds: int) -> dict[tuple[int, ...], dict
             dropout = preset.arch.model_dump()["dropout"]
             arch = {"width": width, "stem": stem, "levels": levels, "dropout": dropout}
             settings = replace(usual, arch=replace(usual.arch, **arch), seed=seed)
-            run = Run(f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}", settings)
-            runs.setdefault(shape, []).append(carry_out(run, clips, cache))
+            title = f"{preset.size}-w{width}-stem{stem}-depth{levels}-seed{seed}"
+            runs.setdefault(shape, []).append(carry_out(title, settings, clips, cache))
         base = by_sequence(runs[_shape(preset.arch)], "map_rmse")
         for network, own in runs.items():
             rmse = by_sequence(own, "map_rmse")
@@ -108,22 +100,18 @@ def _shape(arch: Shape) -> tuple[int, ...]:
     return (arch.width, arch.stem, arch.levels) if isinstance(arch, Architecture) else ()
 
 
-def time_networks(
-    shapes: Sequence[tuple[int, int, int, int]], repeats: int, device: str
-) -> list[dict[str, Any]]:
-    """Latency of one frame from displacement on the grid to the force map on it, on a CPU by ONNX Runtime.
+def time_networks(shapes: Sequence[tuple[int, int, int, int]], repeats: int) -> list[dict[str, Any]]:
+    """CPU time of one frame from displacement on the grid to the force map on it, by ONNX Runtime.
 
-    CPU time on the CPU (without other processes), wall time on a GPU. Heavy networks are timed at least five
-    times, light ones `repeats` times, all of them in turn, so that variations of the machine's speed affect
-    all alike.
+    Networks of `HEAVY` are timed at least five times, others `repeats` times, all of them in turn, so that
+    variations of the machine's speed affect all alike.
     """
     archs = [(size, Architecture(width=w, stem=s, levels=n)) for size, w, s, n in shapes]  # type: ignore[arg-type]
-    frames = [_frame(arch, size, device) for size, arch in archs]
-    costs = [flops(arch, size) for size, arch in archs]
+    frames = [_frame(arch, size) for size, arch in archs]
     times: list[list[float]] = [[] for _ in shapes]
     for _ in range(ROUNDS):
-        for frame, cost, own in zip(frames, costs, times, strict=True):
-            own += _timed(frame, -(-(repeats if cost < LIGHT else 5) // ROUNDS), device)
+        for shape, frame, own in zip(shapes, frames, times, strict=True):
+            own += _time(frame, -(-(5 if shape in HEAVY else repeats) // ROUNDS))
     return [
         {
             "size": size,
@@ -137,44 +125,23 @@ def time_networks(
     ]
 
 
-def _frame(arch: Architecture, size: int, device: str) -> Callable[[], None]:
+def _frame(arch: Architecture, size: int) -> Callable[[], object]:
     """A function that processes one frame as in live use, prepared."""
     torch.manual_seed(0)
-    model = build("d2fnet", arch).eval()
-    grid, scales = Grid(size), Scales(0.2, 0.03, 0.07, 2.0, 0.003)
-    if device == "cpu":
-        card = ModelCard(TrainingSettings(size=size, arch=arch), scales, 1.0, {}, {})
-        session = open_network(to_onnx(model, card)[0], "network")
-        given = dict(zip(input_names(card), (one.numpy() for one in examples(card, 1)), strict=True))
-        return lambda: session.run(None, given)
-    net = model.to(device)
-    displacement = torch.randn(1, 2, size, size, device=device) * 0.1
-    mask = torch.ones(1, 1, size, size, device=device)
-
-    @torch.inference_mode()
-    def frame() -> None:
-        net(channels(displacement, mask, grid.pitch_mm, scales))
-
-    return frame
+    scales = Scales(0.2, 0.03, 0.07, 2.0, 0.003)
+    card = ModelCard(TrainingSettings(size=size, arch=arch), scales, 1.0, {}, {})
+    session = open_network(to_onnx(build("d2fnet", arch).eval(), card)[0], "network")
+    planes = dict(zip(input_names(card), (values.numpy() for values in examples(card, 1)), strict=True))
+    return lambda: session.run(None, planes)
 
 
-def _timed(frame: Callable[[], None], repeats: int, device: str) -> Iterator[float]:
-    """Milliseconds of every frame after three for warm-up."""
-    clock = time.process_time if device == "cpu" else time.perf_counter
+def _time(frame: Callable[[], object], repeats: int) -> Iterator[float]:
+    """CPU milliseconds of every frame after three for warm-up."""
     for k in range(3 + repeats):
-        start = clock()
+        start = time.process_time()
         frame()
-        if device != "cpu":
-            torch.cuda.synchronize()
         if k >= 3:
-            yield 1e3 * (clock() - start)
-
-
-def flops(arch: Architecture, size: int) -> float:
-    """Floating-point operations (2 a multiply-add) of the convolutions for one N×N frame."""
-    with torch.device("meta"), FlopCounterMode(display=False) as counter:
-        build("d2fnet", arch).eval()(torch.zeros(1, len(arch.channels), size, size))
-    return float(counter.get_total_flops())
+            yield 1e3 * (time.process_time() - start)
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
@@ -192,13 +159,13 @@ def page(found: Mapping[str, Any]) -> report.Page:
         for one in sorted(rows, key=lambda one: float(one["ms_p50"]))
     ]
     words = (
-        "From displacement to the force map, a frame at a time; CPU time of one thread (GPU: wall time).",
+        "From displacement to the force map, a frame at a time; CPU time of one thread.",
         "Trained for equal steps on the same batches; mean over tested sequences with BCa interval, and the "
         "difference from the grid's preset relative to its error. Compare within a grid only: a coarser one "
         "averages over more of a contact's rim. The published network (32, no stem, 256²) can't be trained "
         "on a CPU.",
     )
-    sections = [report.Section(found["device"], table)]
+    sections = [report.Section("", table)]
     return report.Page("Networks: time and error", found, words, sections, drawn)
 
 

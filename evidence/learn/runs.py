@@ -1,8 +1,7 @@
-"""Comparison of losses: networks trained on ideal flow, over seeds and folds, paired by sequence."""
+"""Comparison of losses: networks trained on ideal flow, over seeds, paired by sequence."""
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,7 @@ from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.evaluation.evaluate import evaluate
 from learn.evaluation.metrics import METRICS
-from learn.inference.predict import Predictor
 from learn.settings import TrainingSettings, preset, replace
-from learn.split import Split
 from synth.arrays import Floats
 
 LOSSES = ("mse", "antighost", "off-target")
@@ -41,25 +38,15 @@ def base_settings() -> TrainingSettings:
     return replace(base, arch=replace(base.arch, output="magnitude"))
 
 
-@dataclass(frozen=True)
-class Run:
-    """One training."""
-
-    name: str
-    settings: TrainingSettings
-    fold: int = 0  # of three
-
-
 def measure(
-    dataset: Path, cache: Path = Path("runs/losses"), folds: int = 1, seeds: int = 3, epochs: int = 8
+    dataset: Path, cache: Path = Path("runs/losses"), seeds: int = 3, epochs: int = 8
 ) -> dict[str, Any]:
     """Trains with every loss; `cache` gets packed sequences and networks, and completed runs are reused."""
     clips = load_clips(dataset, base_settings().grid, ("ideal",), cache=cache)
     runs: dict[str, list[dict[str, Any]]] = {}
-    for loss, fold, seed in product(LOSSES, range(folds), range(seeds)):
+    for loss, seed in product(LOSSES, range(seeds)):
         settings = replace(base_settings(), loss=loss, seed=seed, epochs=epochs)
-        one = carry_out(Run(f"{loss}-fold{fold}-seed{seed}", settings, fold), clips, cache)
-        runs.setdefault(loss, []).append(one)
+        runs.setdefault(loss, []).append(carry_out(f"{loss}-seed{seed}", settings, clips, cache))
     return {"data": status.data(dataset), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
 
 
@@ -105,34 +92,26 @@ def by_sequence(runs: Sequence[Mapping[str, Any]], key: str) -> Floats:
     return np.array([np.mean(values[name]) for name in sorted(values)], np.float64)
 
 
-def carry_out(run: Run, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
-    """Scores of a run on its test fold: `sequences`, `map_r2_pooled`, `train_cpu_s`.
+def carry_out(name: str, settings: TrainingSettings, clips: Sequence[Clip], cache: Path) -> dict[str, Any]:
+    """Scores of a training on the first of three folds: `sequences`, `map_r2_pooled`, `train_cpu_s`.
 
-    From `cache` if it has those of the same run and data; an interrupted training continues.
+    From `cache` if it has those of the same settings and data; an interrupted training continues.
     """
+    split = training.nested(clips, 3, 0, 0)
 
     def compute() -> dict[str, Any]:
         began = time.process_time()
-        predictor = fit(run, clips, cache)
+        predictor = training.fit(name, clips, split, settings, cache / "models")
         spent = time.process_time() - began
-        found = evaluate(predictor, [clips[i] for i in _split(run, clips).test], "ideal")
-        typer.echo(f"{run.name}: {spent:.0f} CPU-s", err=True)
-        pooled = found.summary()["map_r2_pooled"]
-        rows = [{"name": c.name} | one for c, one in zip(found.clips, found.per_clip(), strict=True)]
+        scores = evaluate(predictor, [clips[i] for i in split.test], "ideal")
+        typer.echo(f"{name}: {spent:.0f} CPU-s", err=True)
+        pooled = scores.summary()["map_r2_pooled"]
+        rows = [{"name": c.name} | one for c, one in zip(scores.clips, scores.per_clip(), strict=True)]
         return {"sequences": rows, "map_r2_pooled": pooled, "train_cpu_s": spent}
 
-    key = stored.key(run.settings.model_dump(), run.fold, [clip.content_hash for clip in clips])
-    done: dict[str, Any] = stored.result(cache / "runs", run.name, key, compute)
+    key = stored.key(settings.model_dump(), [clip.content_hash for clip in clips])
+    done: dict[str, Any] = stored.result(cache / "runs", name, key, compute)
     return done
-
-
-def fit(run: Run, clips: Sequence[Clip], cache: Path) -> Predictor:
-    """The run's network, trained unless it is in `cache`."""
-    return training.fit(run.name, clips, _split(run, clips), run.settings, cache / "models")
-
-
-def _split(run: Run, clips: Sequence[Clip]) -> Split:
-    return training.nested(clips, 3, run.fold, 0)
 
 
 STUDY = Study(

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from evidence import report, status
+from evidence.curves import models
 from evidence.curves.experiment import figures
-from evidence.end_to_end import models
 from evidence.study import Study
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover

@@ -1,1 +1,1 @@
-"""Scoring measured: ex vivo stand-ins, cost, fusion, pulse removal, degraded recordings."""
+"""Scoring measured: ex vivo stand-ins, cost, fusion, degraded recordings."""

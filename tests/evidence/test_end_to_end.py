@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evidence import cache, gap
-from evidence.curves import experiment
+from evidence import cache, gap, training
+from evidence.curves import experiment, models
 from evidence.curves.experiment import GRID, SAME, Estimator
-from evidence.end_to_end import models
 from learn.data.clips import Clip
+from learn.settings import preset
+from learn.split import Split
 from synth import formats
 from synth.errors import UserError
 
@@ -141,6 +142,28 @@ def test_tested_sequences_are_held_out(
     monkeypatch.setattr(experiment, "fitted", fitted)
     assert row(Estimator("ridge", 2, 6), clips, tmp_path)["whole"][0] == 0
     assert used == {"fit": [*map(str, range(6, 12))], "select": ["4", "5"], "test": ["0", "1", "2", "3"]}
+
+
+@pytest.mark.slow
+def test_a_training_of_a_study_is_stored_and_reused(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = Split(tuple(range(8)), (8, 9), (10, 11))
+    settings = preset("tiny", input="recovered", epochs=1)
+
+    def predict() -> NDArray[Any]:
+        predictor = training.fit("x", clips, split, settings, tmp_path)
+        return models.read_force(predictor, clips[11], "recovered")
+
+    force = predict()
+    assert force.shape == (6, 3)
+    (folder,) = tmp_path.iterdir()
+    made = (folder / "config.json").stat().st_mtime_ns
+    np.testing.assert_array_equal(predict(), force)
+    assert (folder / "config.json").stat().st_mtime_ns == made
+    monkeypatch.setattr(formats, "TRAINING", formats.TRAINING + 1)
+    predict()
+    assert len([*tmp_path.iterdir()]) == 2
 
 
 def test_share_closed_of_known_errors() -> None:

@@ -2,21 +2,25 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pulsating_tissue
 import pytest
 from fake_recording import Maker
 
+from bench.methods import physics as physics_method
+from bench.methods import posterior
+from bench.methods.compliance import TissueKind
 from bench.methods.physics import GRID
 from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import writer
 from bench.recording.folder import open_recording
 from bench.tracking.tracking import track_recording
-from evidence.datasets import coarser
-from evidence.end_to_end import models
-from evidence.scoring import exvivo, stability
-from evidence.scoring import pulse as experiment
+from evidence.curves.models import coarser
+from evidence.scoring import degradations, exvivo, stability
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView
+from synth.flow.confidence import deviation
 from synth.recording_flow.decode import RecordingFlowSettings
 from synth.tune.search import changed
 
@@ -44,15 +48,19 @@ def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
     def physics(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         view, mm = GridView(scene.tissue, scene.scale_mm_per_px, GRID), np.float32(scene.scale_mm_per_px)
         moved, sure = view.mean(mm * frame.flow.transpose(2, 0, 1)), view.mean(frame.confidence)
-        return ForceEstimate((scene.young_kpa or 1.0) * models.read_bare(moved, view.mask, sure))
+        spread = np.broadcast_to(0.12 * deviation(sure), moved.shape)  # mm
+        basis = posterior.load_basis(len(moved), TissueKind())
+        seen = physics_method.observe(moved, spread, view.mask)
+        mean = posterior.infer(basis, seen, np.zeros((len(moved), 6, 0))).force.mean
+        return ForceEstimate((scene.young_kpa or 1.0) * mean)
 
     size, name = 128, "physics, frame by frame"
-    contact = experiment.draw_contact(np.random.default_rng(3), 15.0, size)
+    contact = pulsating_tissue.draw_contact(np.random.default_rng(3), 15.0, size)
     runs = {}
     for what, pulses, remove in (("still", 0, True), ("off", 1, True), ("in", 1, False)):
         folder = tmp_path / what
-        experiment.record(folder, contact, pulses, size, remove, np.random.default_rng(4))
-        runs[what] = experiment.score(folder, {name: physics}, "dis")
+        pulsating_tissue.record(folder, contact, pulses, size, remove, np.random.default_rng(4))
+        runs[what] = pulsating_tissue.score(folder, {name: physics}, "dis")
     assert runs["still"].tracked.pulse == []
     rates = [rhythm["rate_hz"] for rhythm in runs["off"].tracked.pulse]
     assert rates == pytest.approx([1.2, 0.25], rel=0.03)
@@ -84,15 +92,33 @@ def test_neither_another_finding_nor_a_wide_interval_clears_a_wrong_force() -> N
 
 def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=24, meta={"membrane": "stripped"})
-    meta = stability.read_meta(folder)
+    meta = degradations.read_meta(folder)
     meta["sensor"]["free_s"] = [[0.0, 0.2]]
     writer.write_meta(folder, meta)
     case = {"given": 2, "cameras": 2}
     base = stability.degrade(folder, None, case, tmp_path)
-    assert "membrane" not in stability.read_meta(base)
+    assert "membrane" not in degradations.read_meta(base)
     before = [frame.rgb.copy() for frame in open_recording(base).frames()]
-    change, _ = stability.MONOCULAR["4 frames dropped"]
+    change, _ = degradations.MONOCULAR["4 frames dropped"]
     dropped = open_recording(stability.degrade(folder, change, case, tmp_path))
     after = [frame.rgb.copy() for frame in dropped.frames()]
     assert len(after) == 20
     assert (after[8] == before[12]).all()
+
+
+def test_each_degradation_changes_a_recording(tmp_path: Path) -> None:
+    source = Maker(tmp_path)(frames=degradations.FRAMES, meta={"membrane": "stripped"})
+    (source / "right").mkdir()
+    for file in (source / "frames").iterdir():
+        cv2.imwrite(str(source / "right" / file.name), cv2.imread(str(file))[:, ::-1])
+    meta = degradations.read_meta(source)
+    writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
+
+    def read(folder: Path) -> dict[str, bytes]:
+        files = (file for file in sorted(folder.rglob("*")) if file.is_file())
+        return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+    case = {"given": 3, "cameras": 2}
+    before = read(stability.degrade(source, None, case, tmp_path))
+    for name, (change, _) in (degradations.MONOCULAR | degradations.STEREO).items():
+        assert read(stability.degrade(source, change, case, tmp_path)) != before, name

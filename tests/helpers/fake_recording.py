@@ -20,7 +20,7 @@ GAIN_MN_PER_PX = 40.0
 SENSOR_HZ = 100.0
 
 
-def texture(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+def texture(height: int, width: int, seed: int | np.random.Generator = 0) -> NDArray[np.uint8]:
     """Band-pass filtered noise in the colours of tissue, (H, W, 3)."""
     noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
     fine = cv2.GaussianBlur(noise, (0, 0), 1.5) - cv2.GaussianBlur(noise, (0, 0), 6)

@@ -192,6 +192,40 @@ def test_code_blocks_of_a_page_run(name: str, out: Path, tmp_path: Path) -> None
         run(["-c", f"import importlib.metadata; {found}"], "site")
 
 
+GAP = """
+import json, sys
+from learn.cli import app as learn
+from synth.cli import app as synth
+for program, *words in json.loads(sys.argv[1]):
+    assert not {"synth": synth, "learn": learn}[program](words, standalone_mode=False), words
+"""
+SMALL = {
+    "render": "sequences=8 frames=3 anatomy.vertices=2500 fem.tets=400 render.size=[96,72] render.spp=1",
+    "train": "epochs=1",
+    "eval": "--json",
+}
+
+
+@pytest.mark.slow
+def test_the_commands_that_measure_the_gap_run_in_small(tmp_path: Path) -> None:
+    """Both networks are scored on both displacements of the same held-out sequences."""
+    lines = re.findall(
+        r"^    ((?:synth|learn) (\w+) .*\bdata\b.*)", (DOCS / "howto/gap.md").read_text("utf-8"), re.M
+    )
+    commands = [[*shlex.split(line), *SMALL[name].split()] for line, name in lines]
+    assert [name for _, name in lines] == ["render", *2 * ["train"], *4 * ["eval"]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    words = [sys.executable, "-c", GAP, json.dumps(commands)]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr[-2000:]
+    scores = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"model"')]
+    assert [(Path(score["model"]).name, score["input"]) for score in scores] == [
+        (network, tested) for network in ("ideal", "recovered") for tested in ("ideal", "recovered")
+    ]
+    assert len({json.dumps([one["name"] for one in score["sequences"]]) for score in scores}) == 1
+    assert all(one["force_mae"] > 0 for score in scores for one in score["sequences"])
+
+
 @pytest.mark.trial
 def test_the_site_is_whole_and_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     """Beyond `--strict`, which ignores pictures and data files."""

@@ -1,10 +1,10 @@
-"""Force estimators: rules fitted on flow, physics alone, a network.
+"""Force estimators: ridge regression on flow, a network.
 
-Force rotates with the image, so rules are fitted on every sequence in its eight rotations and reflections,
+Force rotates with the image, so ridge is fitted on every sequence in its eight rotations and reflections,
 which the network draws at random.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,48 +14,15 @@ import torch
 from numpy.typing import NDArray
 from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import PredefinedSplit
-from sklearn.neighbors import KNeighborsRegressor
 
-from bench.methods import physics, posterior
-from bench.methods.compliance import TissueKind
-from bench.methods.protocol import Field
 from learn.data.clips import Clip
+from learn.data.grid import settled
 from learn.inference.predict import Predictor, total_force
 from learn.network.channels import turned as turned_tensors
-from synth.arrays import Array, Floats
-from synth.flow.confidence import deviation
+from synth.arrays import Array, Floats, Map
 
-Estimate = Callable[[Clip], Floats]  # clip with `recovered` displacement → force (T, 3) mN, camera axes
-
-RIDGE, NEAREST, PHYSICS = "ridge on flow", "k-NN on flow", "physics"
 _FOLDS = 4
-_MM_PER_PX = 0.12  # of the bench's scenes; flow's deviations are in pixels
 _STRENGTHS = np.geomspace(1e-8, 1e2, 21)
-
-
-def build(model: str, fit: Sequence[Clip]) -> Estimate:
-    """An estimator by its name, fitted on sequences unless it is physics alone."""
-    if model == PHYSICS:
-        return _by_physics
-    x, force, group = samples(fit)
-    live = np.abs(x).max(axis=0) > 0
-    x = x[:, live]
-    nearest = KNeighborsRegressor(min(5, len(x)), algorithm="brute")
-    regressor = nearest.fit(x, force) if model == NEAREST else fit_ridge(x, force, group)
-    return lambda clip: clip.young_kpa * np.asarray(regressor.predict(rows(clip)[:, live]))
-
-
-def _by_physics(clip: Clip) -> Floats:
-    frames = zip(clip.displacement["recovered"], clip.confidence, strict=True)
-    return clip.young_kpa * np.stack([read_bare(moved, clip.mask, sure) for moved, sure in frames])
-
-
-def read_bare(moved: Field, mask: Field, sure: Field) -> Floats:
-    """Force of one frame, the posterior mean for still tissue without a membrane, as a baseline's rule."""
-    spread = np.broadcast_to(_MM_PER_PX * deviation(sure), moved.shape)
-    basis = posterior.load_basis(len(moved), TissueKind())
-    still = np.zeros((len(moved), 6, 0))
-    return posterior.infer(basis, physics.observe(moved, spread, mask), still).force.mean
 
 
 def fit_ridge(x: Floats, force: Floats, group: NDArray[np.intp]) -> Any:
@@ -101,6 +68,29 @@ def samples(fit: Sequence[Clip], source: str = "recovered") -> tuple[Floats, Flo
     force = np.concatenate([t.force / t.young_kpa for turns in clips for t in turns])
     group = np.repeat(np.arange(len(fit)), [sum(t.frames for t in turns) for turns in clips])
     return x, force, group
+
+
+def coarser(clip: Clip, times: int = 2) -> Clip:
+    """The clip on a grid of `times` wider cells: mean displacement of a cell's tissue, all of its force."""
+
+    def blocks(values: Map) -> Map:
+        n = values.shape[-1] // times
+        pooled: Map = values.reshape(*values.shape[:-2], n, times, n, times).mean((-3, -1))
+        return pooled
+
+    def mean(values: Map) -> Map:
+        return (blocks(values * clip.mask) / share * mask).astype(np.float32)
+
+    cover = blocks(np.asarray(clip.mask))
+    mask = (cover > 0.5).astype(np.float32)
+    share = np.where(mask > 0, cover, np.float32(1))
+    return replace(
+        clip,
+        mask=mask,
+        displacement={name: mean(np.asarray(moved)) for name, moved in clip.displacement.items()},
+        confidence=mean(np.asarray(clip.confidence)),
+        density=np.stack([settled(d, mask) for d in blocks(np.asarray(clip.density))]),
+    )
 
 
 def read_force(predictor: Predictor, clip: Clip, source: str, membrane_known: bool = False) -> Floats:

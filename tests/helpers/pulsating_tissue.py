@@ -1,55 +1,26 @@
-"""Error of each method on pulsating tissue, with and without removal of the pulse."""
+"""Recordings of contacts on pulsating tissue, from a mesh that no method uses."""
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from fake_recording import texture
+from warped_cortex import inverse
 
-from bench.methods.comparison import PHYSICS
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
-from bench.methods.physics import Physics
 from bench.methods.protocol import Method
 from bench.recording import pixel_scale, writer
 from bench.recording.folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
-from evidence import report
-from evidence.flow.scenes import inverse
-from evidence.scoring.cost import texture
-from evidence.study import Study
 from synth.arrays import Floats
 from synth.recording_flow.decode import RecordingFlowSettings
 
 YOUNG_KPA, _FPS = 3.0, 10.0
 _CONTACT_MM, _RADIUS_MM = 4.0, 12.0
-_TARGET = 1.3  # error after removal relative to that on still tissue
 _HEART, _BREATH = (0.4, 1.2), (0.25, 0.25)  # mm, Hz
-
-
-def measure(seconds: float = 20.0, count: int = 2, size: int = 160, seed: int = 1) -> dict[str, Any]:
-    """Error of every method on FEM contacts: on still tissue, with a pulse, and with the pulse removed.
-
-    `seconds`: length of each of `count` recordings, at least 14; `size`: side of the images [px].
-    """
-    rows = []
-    for k in range(count):
-        contact = draw_contact(np.random.default_rng([seed, k]), seconds, size)
-        with tempfile.TemporaryDirectory() as scratch:
-            runs: dict[str, Result] = {}
-            for name, pulse, remove in (("still", 0, True), ("pulse", 1, False), ("removed", 1, True)):
-                folder = Path(scratch, name)
-                record(folder, contact, pulse, size, remove, np.random.default_rng([seed, k, 1]))
-                runs[name] = score(folder, {PHYSICS: Physics()}, "tvl1")
-        for method in runs["still"].methods:
-            row: dict[str, Any] = {"recording": k, "method": method}
-            row |= {f"{name}_mn": run.methods[method].scores["mae_mn"] for name, run in runs.items()}
-            rows.append(row)
-        rows[-1]["found"] = runs["removed"].tracked.pulse
-        rows[-1]["found_on_still"] = runs["still"].tracked.pulse
-    return {"seconds": seconds, "count": count, "size": size, "seed": seed, "rows": rows}
 
 
 def draw_contact(rng: np.random.Generator, seconds: float, size: int) -> dict[str, Any]:
@@ -133,41 +104,3 @@ def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     scale = pixel_scale.find_scale(opened.meta, folder)
     settings = RecordingFlowSettings(backend, shrink=1, rate_hz=None)
     return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})
-
-
-def page(tree: Mapping[str, Any]) -> report.Page:
-    """Error of each method after removal relative to that on still tissue, and a table."""
-    rows, bars, worst = [], {}, 0.0
-    for (name,), own in report.grouped(tree["rows"], "method").items():
-        mae = {w: np.array([row[f"{w}_mn"] for row in own]) for w in ("still", "pulse", "removed")}
-        left, off = (mae[what] / mae["still"] for what in ("pulse", "removed"))
-        row = {"method": name} | {f"{what} [mN]": f"{values.mean():.2f}" for what, values in mae.items()}
-        rows.append(row | {"pulse / still": f"{left.max():.2f}", "removed / still": f"{off.max():.2f}"})
-        worst = max(worst, float(off.max()))
-        bars[name] = float(np.median(off)), float(off.min()), float(off.max())
-    waves = [one for row in tree["rows"] for one in row.get("found", ())]
-    shown = ", ".join(f"{one['amplitude_mm']:.2f} mm at {one['rate_hz']:.3f} Hz" for one in waves)
-    on_still = sum(len(row.get("found_on_still", ())) for row in tree["rows"])
-    title = "Error with the pulse removed, relative to still tissue"
-    return report.Page(
-        "Pulse removal",
-        tree,
-        (
-            f"**With the pulse removed, the error of a method is at most {worst:.2f} times its error on "
-            f"still tissue (target: {_TARGET:g}).** Detected, by recording: {shown}; on still "
-            f"tissue {on_still or 'nothing'}.",
-            f"{tree['count']} recordings of {tree['seconds']:g} s, {tree['size']} px: FEM contacts of 15 to "
-            f"40 mN on linear tissue. Heart {_HEART[0]:g} mm at {_HEART[1]:g} Hz, breath {_BREATH[0]:g} mm "
-            f"at {_BREATH[1]:g} Hz. Mean absolute error; ratios of the worst recording.",
-        ),
-        (report.Section("", rows),),
-        report.intervals(title, "error / error on still tissue", bars),
-    )
-
-
-STUDY = Study(
-    measure,
-    "pulse/results.json",
-    page,
-    needs=("mesh", "mechanics", "picture", "truth", "flow", "score", "score-stereo"),
-)

@@ -1,1 +1,0 @@
-"""Whole pipelines: error of the force against cost."""

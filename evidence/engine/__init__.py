@@ -1,1 +1,0 @@
-"""The engine measured: what it costs over the bare stages."""
