@@ -10,7 +10,12 @@ import numpy as np
 from scipy import ndimage
 
 SHEAR_KPA, SUCTION_KPA, RIM_MM, STATES = 10.0, 0.12, 17.0, 7
-JOB = {"sequences": 1, "frames": STATES, "fps": 10, "fem": {"young_kpa": 2.9 * SHEAR_KPA}}
+JOB = {
+    "sequences": 1,
+    "frames": STATES,
+    "fps": 10,
+    "fem": {"young_kpa": 2.9 * SHEAR_KPA, "instrument": "suction"},
+}
 JOB["anatomy"] = {"craniotomy": {"point": (0, 0, 0), "direction": (0, 0, 1), "radius_mm": RIM_MM + 1}}
 
 

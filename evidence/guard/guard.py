@@ -142,7 +142,12 @@ def main(
         kept = {
             name: {**now.get(name, {}), **({} if name in moved else before.get(name, {}))} for name in PROBES
         }
-        _write({name: sketches for name, sketches in kept.items() if sketches})
+        # A version counts as stored only once all probes that may vouch for it have run.
+        waiting = {version for name in set(PROBES) - set(now) for version in PROBES[name].versions}
+        raised = {
+            key: known.get(key, value) if key in waiting else value for key, value in versions().items()
+        }
+        _write({name: sketches for name, sketches in kept.items() if sketches}, raised)
         from evidence import status  # which compares results with the guard
 
         status.write_states()
@@ -150,12 +155,12 @@ def main(
     raise typer.Exit(int(bool(unraised) or any(change.moved for change in changes)))
 
 
-def _write(sketches: Mapping[str, Any]) -> None:
+def _write(sketches: Mapping[str, Any], known: Mapping[str, int]) -> None:
     lines = []
     for name, arrays in sketches.items():
         rows = ",\n".join(
             f"  {json.dumps(array)}: {json.dumps(numbers)}" for array, numbers in arrays.items()
         )
         lines.append(f" {json.dumps(name)}: {{\n{rows}\n }}")
-    text = f'{{"versions": {json.dumps(versions())},\n"probes": {{\n' + ",\n".join(lines) + "\n}}\n"
+    text = f'{{"versions": {json.dumps(dict(known))},\n"probes": {{\n' + ",\n".join(lines) + "\n}}\n"
     write_whole(FILE, text, durable=False)

@@ -1,4 +1,4 @@
-"""Nine small runs of the product, each returning arrays whose change would move stored results.
+"""Ten small runs of the product, each returning arrays whose change would move stored results.
 
 Flow, stereo and the scores read recordings that are stored beside this file, and the network reads fields of
 closed form, so that a change upstream doesn't move what follows it: a probe that moves names the stage.
@@ -20,6 +20,8 @@ import numpy as np
 
 import synth
 from bench.cli import app as bench_app
+from bench.methods import posterior
+from bench.methods.compliance import TissueKind
 from learn.data.clips import Clip, read_clip
 from learn.data.grid import Grid
 from learn.settings import preset
@@ -194,6 +196,16 @@ def probe_network() -> Arrays:
     return arrays
 
 
+def probe_compliance() -> Arrays:
+    """The reduced compliance of a covered tissue, for two components of motion."""
+    with tempfile.TemporaryDirectory() as folder, _environment(SULCUS_CACHE=folder):
+        basis = posterior.load_basis(2, TissueKind(edge="bonded", membrane=15.0, poisson=0.45, stretch=1.02))
+    directions = basis.motion[:, : len(basis.size)]
+    spread = directions * basis.size
+    # The sign of a direction is arbitrary; covariance of motion, and force by motion, don't depend on it.
+    return {"covariance": spread @ spread.T, "force": basis.force @ directions.T}
+
+
 def probe_score() -> Arrays:
     """The score of a stored recording with one camera of which scale and stiffness are stated."""
     return _score("mono")
@@ -212,6 +224,7 @@ PROBES: Mapping[str, Probe] = {
     "flow": Probe(probe_flow, 1e-2, ("MOTION",), ("synth/flow",)),
     "stereo": Probe(probe_stereo, 1e-2, ("MOTION",), ("synth/flow/stereo",)),
     "network": Probe(probe_network, 1e-2, ("TRAINING", "CLIPS"), ("learn",)),
+    "compliance": Probe(probe_compliance, 1e-3, ("COMPLIANCE", "MESH"), ("bench/methods",)),
     "score": Probe(
         probe_score,
         3e-2,

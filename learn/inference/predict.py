@@ -19,6 +19,7 @@ from synth.arrays import Array, Floats, Map, Mask
 from synth.errors import Caution, UserError, as_positive, as_user_error
 from synth.flow import onnx_network
 from synth.flow.stereo.track import Moved
+from synth.formats import TRAINING
 from synth.job import identity
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
@@ -56,8 +57,9 @@ def _convert(folder: Path, card: ModelCard) -> bytes:
         warnings.warn(f"{folder}: {why}", Caution, stacklevel=2)
         return convert(folder)
 
+    # The file holds the networks' code too, whose version is TRAINING.
     inputs = {"settings": card.settings.model_dump(mode="json"), "scales": asdict(card.scales)}
-    key = identity.digest({"weights": card.weights_hash, **inputs}).encode()
+    key = identity.digest({"weights": card.weights_hash, "code": TRAINING, **inputs}).encode()
     return cache.cached("networks/onnx", key, make, bytes, bytes, (), _KEPT)
 
 

@@ -224,7 +224,8 @@ def claim(root: Path, job: Job, *, mix_versions: bool = False, part: Part | None
             with folder.gate():
                 if part is None and folder.running():
                     raise file_lock.Locked
-                if (folder.state / "progress.json") in folder.running():
+                others = {file.stem.partition("-of-")[2] for file in folder.running()}
+                if part is not None and others - {f"{part.count:05d}"}:  # a whole run, or another division
                     raise file_lock.Locked
                 folder.lock_fd = held.enter_context(file_lock.hold(folder.lock_file))
                 _refuse_foreign(folder, job, name)

@@ -31,12 +31,12 @@ def compile_once(environment: Mapping[str, str], processes: int, tell: Callable[
             return
         parts = min(processes, _MOST)
         tell(f"compiling the program's loops once, about {round(_ALL_S / parts + 3)} s")
-        call, own = [sys.executable, "-m", "synth.engine.compilation"], {**os.environ, **environment}
-        running = [
-            subprocess.Popen([*call, str(part), str(parts)], env=own, stdout=subprocess.DEVNULL)
-            for part in range(parts)
-        ]
+        call, variables = [sys.executable, "-m", "synth.engine.compilation"], {**os.environ, **environment}
+        running: list[subprocess.Popen[bytes]] = []
         try:
+            for part in range(parts):
+                words = [*call, str(part), str(parts)]
+                running.append(subprocess.Popen(words, env=variables, stdout=subprocess.DEVNULL))
             codes = [process.wait() for process in running]
         finally:
             for process in running:
