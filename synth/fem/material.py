@@ -7,6 +7,10 @@ from dataclasses import dataclass
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
+from synth.system.recent import Recent
+
+# One brain loaded again, by another gesture, costs no factorisation; a fine mesh's is too large to keep.
+_SYSTEMS = Recent[System](2, lambda system: 16 * system.factor.nnz)
 
 
 @dataclass(frozen=True)
@@ -34,4 +38,5 @@ class Tissue:
         pia, sheet = self.membrane, None
         if pia is not None:
             sheet = MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
-        return assemble(tets, self.law, self.poisson, sheet)
+        given = self.law, self.poisson, sheet
+        return _SYSTEMS.get(lambda: assemble(tets, *given), tets, given)
