@@ -8,6 +8,10 @@ from synth.fem import ogden
 from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
+from synth.system.recent import Recent
+
+# One brain loaded again, by another gesture, costs no factorisation; a fine mesh's is too large to keep.
+_SYSTEMS = Recent[System](2, lambda system: 16 * system.factor.nnz)
 
 
 @dataclass(frozen=True)
@@ -36,4 +40,5 @@ class Tissue:
         pia, sheet = self.membrane, None
         if pia is not None:
             sheet = MembraneSheet(pia.young_kpa * pia.thickness_mm / self.young_kpa, pia.stretch)
-        return assemble(tets, self.law, self.poisson, sheet, self.alpha)
+        given = self.law, self.poisson, sheet, self.alpha
+        return _SYSTEMS.get(lambda: assemble(tets, *given), tets, given)

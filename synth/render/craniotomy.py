@@ -26,11 +26,15 @@ from synth.render.idle import IdleInstrument
 from synth.render.materials import Body, Coat, Metal, Wet
 from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
+from synth.system.recent import Recent
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
 _DULL = Finish((0.15, 0.145, 0.14), 0.4, scattered=0.25)  # a retractor's, darkened against glare
 _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wider than the picture
+
+# An anatomy that is shown again, as by other gestures on it, keeps the paint of its cortex and its rim.
+_COATS = Recent[Coat](2, lambda coat: coat.albedo.nbytes + coat.normal.nbytes + coat.dry.nbytes)
 
 
 def craniotomy(
@@ -59,7 +63,9 @@ def craniotomy(
     )
     if how.pattern is None:
         shade = rim.shade(around, patch) if how.surroundings is None else None
-        coat = texture.cortex(patch, appearance, pixels, job.appearance.photo, shade)
+        photo = job.appearance.photo
+        paint = partial(texture.cortex, patch, appearance, pixels, photo, shade)
+        coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade)
         wet = appearance.roughness, appearance.dry_roughness
         if how.tinted:
             coat = replace(coat, albedo=pattern.tinted(coat.albedo, how.tint, how.tinted))
@@ -68,7 +74,8 @@ def craniotomy(
         wet = how.pattern.roughness, appearance.dry_roughness
     cortex = Wet(coat, *wet, ambient, appearance.fluid_index)
     # Where only the truth at rest is needed, the rim stays unpainted, which saves a second.
-    painted = partial(rim.paint, around, appearance, texels)
+    paint_rim = partial(rim.paint, around, appearance, texels)
+    painted = partial(_COATS.get, paint_rim, around, appearance, texels)
     rim_coat = Wet(painted, _RIM_ROUGHNESS, _RIM_DRY, ambient)
     static = [Body(how.scale * around.shape.vertices, around.shape.faces, around.uv, rim_coat)]
     lamps = light.lamps(camera, appearance.light)

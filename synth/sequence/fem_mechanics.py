@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from synth.fem import solver
 from synth.fem.deformation import Deformation
@@ -12,7 +13,11 @@ from synth.fem.mesh.relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.tool_gesture import ToolMotion, check_motions
 from synth.sequence.scene import RestScene
+from synth.system.recent import Recent
 from synth.system.stopwatch import StageCallback, Stopwatch
+
+# A brain that is loaded again in the same places keeps its mesh.
+_VOLUMES = Recent[Tets](2, lambda tets: tets.points.nbytes + tets.cells.nbytes)
 
 
 @dataclass(frozen=True)
@@ -44,9 +49,11 @@ def build_volume(rest: RestScene) -> Tets:
     anatomy, surface = rest.job.anatomy, rest.surface
     focus = [place for gesture in rest.scenario.gestures for place in gesture.focus]
     mesh, slips = (rest.job.fem.tets, focus), rest.scenario.tissue.skull == "slip"
-    if rest.brain is not None:
-        return tetrahedra.from_brain(rest.brain, anatomy, *mesh, slips=slips)
+    if (brain := rest.brain) is not None:
+        make = partial(tetrahedra.from_brain, brain, anatomy, *mesh, slips=slips)
+        return _VOLUMES.get(make, brain, anatomy, mesh, slips)
     height = HeightMap(surface.pia, surface.extent_mm)
     how = rest.scenario.randomized
     width, length, depth = (side * (1.0 if how is None else how.scale) for side in tetrahedra.BLOCK_MM)
-    return tetrahedra.block(anatomy, *mesh, height, slips=slips, size_mm=(width, length, depth))
+    make = partial(tetrahedra.block, anatomy, *mesh, height, slips=slips, size_mm=(width, length, depth))
+    return _VOLUMES.get(make, anatomy, mesh, height, slips, (width, length, depth))
