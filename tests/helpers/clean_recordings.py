@@ -76,7 +76,8 @@ def all_cases() -> list[Case]:
 def load_mn(time_s: Floats) -> Floats:
     """Force (T, 3) mN on the tissue, camera axes: a press that drags to the right, one that drags upwards."""
     first, second = _hold(time_s, 1.2, 2.4), _hold(time_s, 2.9, 4.1)
-    return np.outer(first, [25.0, 8.0, 45.0]) + np.outer(second, [-6.0, -30.0, 30.0])
+    both = np.outer(first, [25.0, 8.0, 45.0]) + np.outer(second, [-6.0, -30.0, 30.0])
+    return np.asarray(both, np.float64)
 
 
 def _hold(time_s: Floats, start: float, stop: float) -> Floats:
@@ -138,8 +139,8 @@ class Scene:
         shade, wide = rod.copy(), max(5, width // 20)
         far = tip + 2.0 * width * np.array([0.9, -0.42])
         for canvas, shift in ((shade, wide // 3), (rod, 0)):
-            ends = [tuple(int(v) for v in np.rint(16 * (end + shift))) for end in (tip, far)]
-            cv2.line(canvas, *ends, 255, wide, cv2.LINE_AA, 4)
+            start, stop = ([int(v) for v in np.rint(16 * (end + shift))] for end in (tip, far))
+            cv2.line(canvas, start, stop, 255, wide, cv2.LINE_AA, 4)
         picture = picture * (1 - 0.3 * cv2.GaussianBlur(shade, (0, 0), 2)[..., None] / 255.0)
         steel = np.array([150.0, 155.0, 160.0]) + 25 * np.sin(places[..., :1] / 7)
         alpha = rod[..., None] / 255.0
@@ -193,8 +194,8 @@ def write_pictures(folder: Path, case: Case, pictures: list[Floats], time_s: Flo
         video = cv2.VideoWriter(
             str(folder / "video.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (width, height)
         )
-        for picture in rounded:
-            video.write(np.ascontiguousarray(picture[..., ::-1]))
+        for coloured in rounded:
+            video.write(np.ascontiguousarray(coloured[..., ::-1]))
         video.release()
     else:
         h264 = case.codec == "h264"

@@ -1,4 +1,4 @@
-"""A drift of the sensor's zero is found against the video, and removed; noise, creep and a held load are none."""
+"""A drift of the sensor's zero is found against the video, and removed; noise and a held load are none."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_drift_after_release_is_found_with_its_size_and_removed() -> None:
 def test_noise_is_no_drift(noise_mn: float) -> None:
     for seed in range(8):
         noise = np.random.default_rng(seed).normal(0, noise_mn, LOAD.shape)
-        drift = find_drift(TIME, LOAD + [14.0, -12.0, 13.0] + noise, MOVED)
+        drift = find_drift(TIME, LOAD + np.array([14.0, -12.0, 13.0]) + noise, MOVED)
         assert drift is not None
         assert not drift.is_clear
 
