@@ -24,6 +24,9 @@ from synth.recording_flow.finding import Finding
 _HELD = 0.6  # coverage of the interval from which it isn't reported; by hand
 _CHANCE = 0.05  # largest probability of such a coverage by chance
 _SHAPE = 0.05  # mean error of a right estimate's curve over its peak, gain aside
+# Mean error of components over the force that axes must leave at most, and that the stated ones must have: a
+# right estimate's direction is off by 20 to 45 degrees, exchanged or reversed axes by 60 to 180.
+_STRAIGHT, _ASKEW = 0.5, 0.9
 _TURNED = 0.4  # mean error of a right estimate's components over its force
 _BEYOND = 2.0  # factor between sensor and force that no method errs by; the worst scenes of ours reach 1.7
 _SURE = np.log(20.0)  # log odds from which a hypothesis is named
@@ -61,6 +64,7 @@ class Hypothesis:
     axes_mn: Floats  # (T, 3) what a sensor would measure without it; NaN where unknown
     tried: int = 1  # number of hypotheses of its kind
     any_gain: bool = False  # whether the gain is beyond the stated interval
+    turns: bool = False  # whether it exchanges or reverses axes
 
 
 @dataclass(frozen=True)
@@ -176,11 +180,24 @@ def _judge(sensor: SensorMotion, force: Floats, gains: tuple[float, float]) -> I
         before, after = misfits(sensor.axes_mn, now, inside), misfits(one.axes_mn, gain, inside)
         spread = float(np.abs(size[inside] - np.median(size[inside])).mean())
         explains = after[0] < np.hypot(_LEFT * spread, floor)
+        if one.turns:
+            shares = [
+                _direction_error(force[inside, :n], axes[inside, :n])
+                for axes in (sensor.axes_mn, one.axes_mn)
+            ]
+            explains &= shares[0] > _ASKEW and shares[1] < _STRAIGHT
         odds = count * inside.mean() * float(np.log(before / after).sum()) - np.log(one.tried)
         if one.any_gain:
             explains &= not 1 / _BEYOND < free / now < _BEYOND or bool(gains[0] > free or free > gains[1])
             one = _named_gain(one, gain)
         yield _Judged(one, odds, bool(explains), gain)
+
+
+def _direction_error(force: Floats, sensor_mn: Floats) -> float:
+    """Mean error of the observed components (T, n) over the force, gain aside: 0 to 2."""
+    sizes = [np.linalg.norm(axes, axis=1) for axes in (force, sensor_mn)]
+    gain = sizes[0].sum() / max(float(sizes[1].sum()), 1e-12)
+    return float(np.linalg.norm(force - gain * sensor_mn, axis=1).sum() / max(float(sizes[0].sum()), 1e-12))
 
 
 def _gain(size: Floats, sensor_mn: Floats) -> float:
@@ -224,7 +241,9 @@ def hypotheses(sensor: SensorMotion, axes: int) -> Iterator[Hypothesis]:
             what = "the sign: force.csv holds the force on the tool (sensor.acts_on)"
         turned = force.copy()
         turned[:, :axes] = force[:, list(order)] * signs
-        yield Hypothesis("sensor", what, turned, 1 if tool else len(turns) * (1 + signs.count(-1)))
+        yield Hypothesis(
+            "sensor", what, turned, 1 if tool else len(turns) * (1 + signs.count(-1)), turns=True
+        )
     if not sensor.pulsates:
         for what, at, tried in _clocks(sensor):
             outside = (at < t[0]) | (at > t[-1])

@@ -38,6 +38,7 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
 SENSOR_CHECKS: tuple[Callable[[SensorMotion], list[Finding]], ...] = (
     contradiction.check_contradiction,
     sensor.check_constant,
+    sensor.check_drift,
 )
 
 

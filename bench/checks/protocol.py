@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+from scipy.signal import find_peaks
+
 from bench.recording.folder import Recording
 from synth.recording_flow.finding import Finding
 from synth.system.checked_file import read_yaml
@@ -20,13 +23,34 @@ _IS_IN: Mapping[str, Callable[[Recording], bool]] = {
     "stiffness": lambda recording: recording.meta.young_kpa is not None,
     "membrane": lambda recording: recording.meta.membrane != "unknown" or recording.meta.tissue == "phantom",
     "rest": lambda recording: bool(recording.meta.sensor.free_s or recording.meta.pulse.free_s),
-    "taps": lambda recording: (
-        recording.force is not None
-        and (recording.meta.sync.method != "clock" or recording.times_s is not None)
-    ),
+    "taps": lambda recording: _has_common_clock(recording),
     "press": lambda recording: recording.meta.press_s is not None,
     "outline": lambda recording: recording.tissue is not None,
 }
+
+
+_TAPS, _TAP_SHARE, _TAP_S = 3, 0.3, 1.0  # taps; least share of the largest change; longest; by hand
+
+
+def _has_common_clock(recording: Recording) -> bool:
+    """Whether both clocks were recorded, their offset is stated, or the sensor shows taps that give it."""
+    force, sync = recording.force, recording.meta.sync
+    if force is None:
+        return False
+    if sync.method != "correlate" or sync.calibration_s is None:
+        return sync.method == "offset" or recording.times_s is not None
+    start, stop = (edge - sync.offset_s for edge in sync.calibration_s)
+    t = sync.rate * force.time_s
+    inside = (
+        (t >= start - sync.search_s) & (t <= stop + sync.search_s) & np.isfinite(force.force_mn).all(axis=1)
+    )
+    if inside.sum() < 2 * _TAPS:
+        return False
+    off = force.force_mn[inside] - np.median(force.force_mn[inside], axis=0)
+    size = np.pad(np.linalg.norm(off, axis=1), 1)
+    step_s = float(np.median(np.diff(t[inside])))
+    limits = {"prominence": _TAP_SHARE * float(size.max()), "width": (None, _TAP_S / max(step_s, 1e-9))}
+    return len(find_peaks(size, **limits)[0]) >= _TAPS
 
 
 def read_steps() -> list[dict[str, str]]:

@@ -13,8 +13,11 @@ from bench.methods.protocol import Method
 from bench.recording.folder import Recording
 from bench.recording.sensor_table import find_bias
 from bench.sensor.alignment import AlignedSensor
+from bench.sensor.drift import Drift
+from bench.sensor.force_sensor import process_force
 from bench.tracking.tracking import TrackedRecording
 from synth.arrays import Floats, Mask
+from synth.errors import UserError
 from synth.recording_flow.finding import Finding
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
@@ -23,6 +26,8 @@ _LOADED = 0.25  # share of the range of force above which the tissue is not at r
 # By hand: step of the motion of tissue at rest over the largest motion; how long it rests after a load [s];
 # least time in the rest frame's state that is a rest [s].
 _CALM, _RESTS_S, _LEFT_S = 0.06, 0.6, 0.4
+_SIGMAS = 4.0  # of noise beyond which a force is no noise
+_PARTS, _SAMPLES = 8, 8  # of a span whose medians are compared: most parts, samples of each; by hand
 LEAST_FRAMES = 8  # for a judgement on the sensor; by hand
 _CONSTANT = 3  # frames of constant force that are no saturation
 _MOVES = 0.25  # share of the largest motion during constant force, from which it is one
@@ -53,7 +58,8 @@ def check_free_spans(recording: Recording) -> list[Finding]:
     if force is None:
         return found
     known = np.isfinite(force.force_mn).all(axis=1)
-    most = float(np.linalg.norm(np.ptp(force.force_mn[known], axis=0)))
+    whole = np.percentile(force.force_mn[known], (0.5, 99.5), axis=0) if known.any() else np.zeros((2, 3))
+    most = float(np.linalg.norm(np.ptp(whole, axis=0)))
     for start, stop in recording.meta.sensor.free_s:
         inside = (force.time_s >= start) & (force.time_s <= stop)
         free = force.force_mn[inside & known]
@@ -61,12 +67,27 @@ def check_free_spans(recording: Recording) -> list[Finding]:
             message = f"sensor.free_s: no samples between {start:g} and {stop:g} s"
             found.append(Finding("error", "sensor", message))
         elif len(free) > 2:
-            low, high = np.percentile(free, (5, 95), axis=0)
-            change = float(np.linalg.norm(high - low))
-            if change > _LOADED * most:
-                message = f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s"
+            change, noise = find_change(free)
+            if change > max(_LOADED * most, _SIGMAS * noise):
+                message = (
+                    f"sensor.free_s: force changes by {change:.3g} mN between {start:g} and {stop:g} s: "
+                )
+                message += "there is a contact in it; end the span before, or begin it after"
                 found.append(Finding("warning", "sensor", message))
     return found
+
+
+def find_change(force_mn: Floats) -> tuple[float, float]:
+    """The change of a force (N, 3) mN between parts of a span, by their medians, and what noise adds to it.
+
+    The noise is that from sample to sample, whose neighbours are taken for independent.
+    """
+    parts = np.array_split(force_mn, min(_PARTS, max(len(force_mn) // _SAMPLES, 2)))
+    medians = np.array([np.median(part, axis=0) for part in parts])
+    steps = np.diff(force_mn, axis=0)
+    deviation = 1.4826 * np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) / np.sqrt(2)
+    noise = 1.25 * float(np.linalg.norm(deviation)) / np.sqrt(len(parts[-1]))
+    return float(np.linalg.norm(np.ptp(medians, axis=0))), noise
 
 
 def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
@@ -74,16 +95,25 @@ def check_rest_frame(recording: Recording, tracked: TrackedRecording) -> list[Fi
     force, sync, rest_s = recording.force, recording.meta.sync, tracked.rest_s
     if force is None or rest_s is None or sync.method == "correlate":
         return []
-    known = np.isfinite(force.force_mn).all(axis=1)
-    t = sync.rate * force.time_s[known] + (sync.offset_s if sync.method == "offset" else 0.0)
-    size = np.linalg.norm(force.force_mn[known], axis=1)
+    offset_s = sync.offset_s if sync.method == "offset" else 0.0
+    try:
+        tared = process_force(force, recording.meta.sensor, offset_s, sync.rate)
+    except UserError:  # `check_free_spans` and the scores report it
+        return []
+    known = np.isfinite(tared.force_mn).all(axis=1)
+    if not known.any() or (not recording.meta.sensor.free_s and find_bias(tared.force_mn)):
+        return []  # `check_samples` reports the constant part, which is no load
+    t, size = tared.time_s[known], np.linalg.norm(tared.force_mn[known], axis=1)
     least, most = float(size.min()), float(size.max())
     there = float(np.interp(rest_s, t, size))
     near_s = float(np.median(np.diff(t))) if len(t) > 1 else 0.0  # the sensor may start a sample later
-    if not t[0] - near_s <= rest_s <= t[-1] + near_s or there - least <= _LOADED * (most - least):
+    limit = max(_LOADED * (most - least), _SIGMAS * tared.noise_floor_mn)
+    if not t[0] - near_s <= rest_s <= t[-1] + near_s or there - least <= limit:
         return []
     lowest = f"the minimum is {least:.3g} mN at {t[size.argmin()]:.3g} s"
-    message = f"the sensor measures {there:.3g} mN at the rest frame; {lowest}"
+    message = (
+        f"the sensor measures {there:.3g} mN at the rest frame; {lowest}: set rest_frame to a frame there"
+    )
     return [Finding("warning", "rest frame", message)]
 
 
@@ -139,6 +169,7 @@ class SensorMotion:
     noise_mn: float = 0.0  # of the sensor without contact; 0 if unknown
     pulsates: bool = False  # the tissue moves by itself
     calibrated: bool = True  # the interval has the level that it states
+    drift: Drift | None = None  # of its zero, against the video; None: unknown, or removed
 
     @property
     def size_mn(self) -> Floats:
@@ -195,7 +226,23 @@ def find_sensor_motion(
         sensor.noise_floor_mn,
         bool(tracked.pulse),
         main not in tracked.uncalibrated,
+        sensor.drift,
     )
+
+
+def check_drift(sensor: SensorMotion) -> list[Finding]:
+    """Findings on a zero that drifts: the sensor's force changes between spans with the tissue at rest."""
+    drift = sensor.drift
+    if drift is None or not drift.is_clear:
+        return []
+    first_s, last_s = drift.time_s[0], drift.time_s[-1]
+    message = (
+        f"the sensor's zero drifts by {drift.change_mn:.2g} mN from {first_s:.3g} to {last_s:.3g} s: the "
+    )
+    message += (
+        "video shows the tissue at rest there. Set sensor.drift to remove, or add a span after release to "
+    )
+    return [Finding("warning", "sensor", message + "sensor.free_s")]
 
 
 def check_constant(sensor: SensorMotion) -> list[Finding]:

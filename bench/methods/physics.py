@@ -128,7 +128,7 @@ class Physics:
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
         sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
-        own = f"the tissue's own motion is {sizes} mm along x, y, z"
+        own = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
         if self._weights.assumed or not self._contact_free:
             known = "only part of a breath" if self._contact_free else "no span"
             own = f"{'at most, ' * self._weights.assumed}{own}"

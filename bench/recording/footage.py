@@ -40,6 +40,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
         recording.meta.rest_frame,
         depth=depth,
         findings=() if recording.tissue or not recording.region else (_REGION,),
+        may_pulsate=recording.meta.may_pulsate,
     )
 
 

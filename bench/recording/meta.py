@@ -94,6 +94,9 @@ class SensorMeta(Section):
     """Cut-off of the sensor's low-pass filter (zero-phase, 4th-order Butterworth) [Hz]; null: no filter."""
     free_s: tuple[Span, ...] = ()
     """Spans without contact, (from, to) on the sensor's clock [s], for tare, drift and noise floor."""
+    drift: Literal["keep", "remove"] = "keep"
+    """`remove`: the drift of the sensor's zero is removed, linearly between the spans in which the video
+    shows the tissue at rest, and its size reported. `keep`: it is only reported."""
     mass_g: Annotated[FiniteFloat, Field(ge=0, le=1e6)] = 0.0
     """Mass on the tool's side of a tool-mounted sensor [g], to remove its weight; needs columns gx, gy, gz in
     force.csv: the unit vector along gravity in the sensor's axes."""

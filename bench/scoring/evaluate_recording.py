@@ -18,7 +18,7 @@ from bench.recording.meta import Meta, Span
 from bench.recording.pixel_scale import PixelScale
 from bench.scoring import metrics
 from bench.scoring.result import Gain, Result, Scored
-from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span
+from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span, judge_drift
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from synth.arrays import Array, Floats, Mask
@@ -56,6 +56,8 @@ def evaluate_recording(
     # Since the frame before, which may be lost too.
     speed = np.where(lost | np.append(False, lost[:-1]), np.nan, tracked.speed)
     sensor = align_sensor(recording, time_s, speed, tracked.turning)
+    moved = np.array(next(tracked.force_mn[name] for name in flow_sizes()))[:, 0]
+    sensor = judge_drift(sensor, meta.sensor, time_s, np.where(lost, np.nan, moved))
     scored, unscored = _select_frames(meta, tracked, sensor)
     compared = find_sensor_motion(recording, tracked, methods, main, sensor, scored)
     findings = by_severity([*tracked.doubt, *judge(recording, tracked, compared), *sensor.findings])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from bench.recording.folder import Force, Recording
 from bench.recording.meta import SensorMeta, Span, Sync
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
+from bench.sensor.drift import Drift, find_drift, remove_drift
 from bench.sensor.rotation import SensorRotation, find_rotation
 from synth.arrays import Floats
 from synth.recording_flow.finding import Finding
@@ -29,6 +30,7 @@ class AlignedSensor:
     in_camera_axes: bool = False
     notes: tuple[str, ...] = ()  # for the user
     findings: tuple[Finding, ...] = ()
+    drift: Drift | None = None  # of the zero, against the video; None: unknown, or removed
 
     @property
     def size_mn(self) -> Floats | None:
@@ -71,6 +73,21 @@ def align_sensor(
         refused = [Finding("warning", "clocks", why)]
     about = processed.noise_floor_mn, processed.steps, found, rotation, sensor.in_camera_axes, tuple(notes)
     return AlignedSensor(axes if covered else None, *about, tuple(refused))
+
+
+def judge_drift(sensor: AlignedSensor, meta: SensorMeta, time_s: Floats, moved: Floats) -> AlignedSensor:
+    """The sensor with the drift of its zero against the video, or without that drift if `meta` says so.
+
+    `time_s`: (T,) of the frames [s]; `moved`: (T,) mean motion of the tissue since the rest frame, any unit,
+    NaN where unknown.
+    """
+    if sensor.axes_mn is None or (drift := find_drift(time_s, sensor.axes_mn, moved)) is None:
+        return sensor
+    if meta.drift == "keep":
+        return replace(sensor, drift=drift)
+    step = f"drift of {drift.change_mn:.2g} mN removed, from {len(drift.time_s)} spans at rest in the video"
+    steady = remove_drift(time_s, sensor.axes_mn, drift)
+    return replace(sensor, axes_mn=steady, steps=(*sensor.steps, step))
 
 
 def describe_span(span: Span) -> str:

@@ -66,6 +66,7 @@ class Footage:
     only: Container[int] | None = None  # numbers of the frames to track, with the rest frame; None: all
     depth: RightVideo | DepthVideo | None = None  # right camera or depth camera, if any
     findings: tuple[Finding, ...] = ()  # on the tissue mask, if it was found
+    may_pulsate: bool = True  # False: no heart or breath moves the tissue, none is searched
 
 
 class Decoder:

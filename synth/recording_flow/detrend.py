@@ -36,14 +36,16 @@ class GatherMotion:
         self._surface.add(frame.time_s, np.dstack(parts), frame.confidence)
         return frame
 
-    def search(self, free_s: Sequence[Span], fills_picture: bool) -> PulseSearch:
-        """Pulsation of the tissue, and the camera's motion if tissue `fills_picture`; see `find_pulse`."""
+    def search(self, free_s: Sequence[Span], fills_picture: bool, may_pulsate: bool = True) -> PulseSearch:
+        """Pulsation of the tissue if it `may_pulsate`, see `find_pulse`, and the camera's motion if tissue
+        `fills_picture`."""
         surface = self._surface
         if self._depth_weights:
             surface.depth_weight = min(1.0, float(np.median(self._depth_weights)))
         first_s = surface.time_s[0] if surface.time_s else 0.0
         rest_s = first_s if self._rest.time_s is None else self._rest.time_s
-        found = find_pulse(surface, rest_s, free_s)
+        none = PulseSearch(None, np.zeros(0), None, is_living=False)
+        found = find_pulse(surface, rest_s, free_s) if may_pulsate else none
         return replace(found, camera=find_path(surface, found.pulse)) if fills_picture else found
 
 

@@ -101,9 +101,12 @@ class PulseSearch:
     rates_hz: Span | None  # searched rates; None: no search was possible
     reason: str = ""  # why no search was possible
     camera: CameraPath | None = None  # camera motion found on the tissue; None: none, or on surroundings
+    is_living: bool = True  # False: tissue that doesn't pulsate, so that no rhythm was searched
 
     def describe(self) -> str:
         """A sentence on pulsation that the search may have missed; empty if it covers heart and breath."""
+        if not self.is_living:
+            return ""
         if self.rates_hz is None:
             missed = "Pulsation of the tissue, if any, is not removed"
             return f"heart and breath were not searched: {self.reason}. {missed}"
@@ -149,8 +152,8 @@ def _too_few(free_s: Floats) -> PulseSearch:
 
 
 def _count(free_s: Floats) -> str:
-    span = float(np.ptp(free_s)) if len(free_s) else 0.0
-    return f"the {len(free_s)} tracked frames without contact over {span:.3g} s"
+    span = f" from {free_s.min():.3g} to {free_s.max():.3g} s" if len(free_s) else ""
+    return f"the {len(free_s)} smoothest tracked frames{span}"
 
 
 class _Cells:

@@ -100,7 +100,7 @@ class VideoPass:
             stated, masks = bool(footage.tissue and not footage.findings), footage.tool is not None
             self._foreground = ForegroundSearch(rest.tissue, rest.shrink, is_stated=stated, has_masks=masks)
         self.mm_per_px = 1.0 if footage.depth is None else footage.depth.mm_per_px * rest.shrink
-        is_searched = settings.pulse and path is None
+        is_searched, self._may_pulsate = settings.pulse and path is None, footage.may_pulsate
         self._gather = GatherMotion(rest, self.mm_per_px) if is_searched else None
         is_stream = not settings.pulse and path is None
         self._on_tissue = RegisterOnTissue(rest) if self._fills_picture and is_stream else None
@@ -213,7 +213,7 @@ class VideoPass:
         if self._gather is None:
             return None
         with self.watch.stage("pulse"):
-            return self._gather.search(free_s, self._fills_picture)
+            return self._gather.search(free_s, self._fills_picture, self._may_pulsate)
 
     @property
     def findings(self) -> list[Finding]:

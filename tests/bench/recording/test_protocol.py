@@ -16,7 +16,8 @@ from bench.recording.meta import Meta
 def lacking(tissue: Path | None = None, sensor_file: bool = True, **stated: Any) -> set[str]:
     """Steps that a recording lacks with these statements."""
     meta = Meta.model_validate({"scale_mm_per_px": "unknown", **stated})
-    force = Force(np.zeros(2), np.zeros((2, 3))) if sensor_file else None
+    time_s = np.arange(40) / 200  # three taps
+    force = Force(time_s, np.outer(np.sin(15 * np.pi * time_s) ** 8, [1.0, 0, 0])) if sensor_file else None
     recording = Recording(Path(), meta, {}, None, force, None, tissue, ())  # type: ignore[arg-type]
     found = check_protocol(recording)
     return {one.message.split(":")[0] for one in found if one.severity == "missing"}
@@ -38,6 +39,8 @@ def test_each_statement_ticks_its_step(tmp_path: Path) -> None:
     for title, meta in given.items():
         assert lacking(**meta) == {*protocol._IS_IN} - {title}
     assert lacking(sensor_file=False, **given["sensor"], **given["taps"]) == {*protocol._IS_IN}
+    one_tap = {"sync": {"method": "correlate", "calibration_s": [0, 0.05], "search_s": 0.01}}
+    assert "taps" in lacking(**one_tap), "a request to correlate is no tap"
     run(app, "init", "--protocol", tmp_path / "new")
     listed = tmp_path / "new/protocol.md"
     assert listed.read_text().count("- [ ] ") == len(read_steps())

@@ -1,0 +1,110 @@
+"""Findings both ways: clean recordings of several codecs and sensors have none, faulty ones the fault's."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from clean_recordings import TURN, Case, Fit, all_cases, load_mn, make, write_sensor
+from fake_recording import texture
+from ruamel.yaml import YAML
+
+import bench
+from bench.checks import sensor as sensor_checks
+from bench.checks.contradiction import check_contradiction
+from bench.checks.sensor import SensorMotion
+from bench.recording import writer
+from synth.recording_flow.picture_faults import VideoFaults
+
+QUICK = Case("h264", (96, 128), "offset"), Case("mp4v", (96, 128), "ati", masks=False)
+
+
+def found(folder: Path) -> list[tuple[str, str]]:
+    result = bench.score(folder, methods={"fit": Fit()}, baselines=False)
+    return [(one.cause, one.message) for one in result.findings]
+
+
+@pytest.mark.parametrize("case", QUICK, ids=lambda case: case.name)
+def test_a_clean_recording_has_no_finding(tmp_path: Path, case: Case) -> None:
+    assert found(make(tmp_path, case)) == []
+
+
+@pytest.mark.trial
+@pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
+def test_none_of_24_clean_recordings_has_a_finding(tmp_path: Path, case: Case) -> None:
+    assert found(make(tmp_path, case)) == []
+
+
+def edit(folder: Path, **sensor: object) -> None:
+    meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
+    meta["sensor"] |= sensor
+    writer.write_meta(folder, meta)
+
+
+def test_faults_of_the_sensor_are_found(tmp_path: Path) -> None:
+    """Drift, a contact in a span without, and a rest frame under load, each on a recording that is clean."""
+    case = Case("png", (96, 128), "offset")
+    folder = make(tmp_path, case)
+    write_sensor(folder, case, drift_mn_per_s=1.2)
+    (drift,) = found(folder)
+    assert drift[0] == "sensor"
+    edit(folder, drift="remove")
+    assert found(folder) == []
+    write_sensor(folder, case)
+    edit(folder, free_s=[[0.0, 2.0]])
+    assert "sensor" in {cause for cause, _ in found(folder)}
+    edit(folder, free_s=[[0.0, 0.8]])
+    meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
+    writer.write_meta(folder, meta | {"rest_frame": 45})
+    assert "rest frame" in {cause for cause, _ in found(folder)}
+
+
+def test_a_span_with_white_noise_does_not_change_and_one_with_a_step_does() -> None:
+    rng = np.random.default_rng(0)
+    for count in (20, 120, 1200):
+        noise = rng.normal(0, 1.0, (count, 3))
+        change, deviation = sensor_checks.find_change(noise)
+        assert change < sensor_checks._SIGMAS * deviation * 1.6
+        step = noise + 8.0 * (np.arange(count) > 0.6 * count)[:, None]
+        change, deviation = sensor_checks.find_change(step)
+        assert change == pytest.approx(8 * np.sqrt(3), rel=0.2)
+        assert change > sensor_checks._SIGMAS * deviation
+
+
+def _turned(estimate: np.ndarray, axes: np.ndarray) -> set[str]:
+    """Causes found where the video's force is the true one turned by `estimate` (3, 3) and the sensor's
+    by `axes` (3, 3)."""
+    t = np.arange(0, 5.2, 0.1)
+    force = load_mn(t)
+    leading = force @ estimate.T
+    bounds = np.linalg.norm(leading, axis=1)[:, None] * [0.5, 1.5] + [-3.0, 3.0]
+    moved = np.linalg.norm(force, axis=1)
+    sensor = SensorMotion(t, force @ axes.T, moved, (leading,), 3, leading, bounds, np.zeros(3))
+    return {one.cause for one in check_contradiction(sensor)}
+
+
+def test_an_estimate_off_by_40_degrees_is_no_exchange_of_axes_but_exchanged_axes_are() -> None:
+    for degrees in (-40, -25, 25, 40):
+        for axis in np.eye(3):
+            turn = cv2.Rodrigues(np.radians(degrees) * axis)[0]
+            assert _turned(turn, np.eye(3)) == set()
+    assert _turned(np.eye(3), -np.eye(3)) == {"sensor"}
+    assert _turned(np.eye(3), np.eye(3)[[1, 2, 0]]) == {"sensor"}
+    assert np.linalg.det(TURN) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("every", [12, 250])
+def test_a_key_frame_is_no_cut_and_a_bump_is(every: int) -> None:
+    """Pictures without change, whose detail is coded anew in key frames; the camera is bumped in the 31st."""
+    rest, rng = texture(96, 136).astype(np.float32), np.random.default_rng(0)
+    for bumped in (False, True):
+        pictures, detail = [], np.zeros((96, 128, 3))
+        for k in range(60):
+            if k % every == 0:
+                detail = rng.normal(0, 4, (96, 128, 3))
+            view = rest[:, 2:130] if bumped and k > 30 else rest[:, :128]
+            pictures.append(np.clip(view + detail, 0, 255).astype(np.uint8))
+        faults = VideoFaults(pictures[0], pictures[0], np.ones((96, 128), bool))
+        for k, picture in enumerate(pictures[1:], 1):
+            faults.add_decoded(k, k / 25, picture)
+        assert faults._leaps() == ([30] if bumped else [])

@@ -1,0 +1,39 @@
+"""A drift of the sensor's zero is found against the video, and removed; noise and a held load are none."""
+
+import numpy as np
+import pytest
+
+from bench.sensor.drift import find_drift, find_rest_spans, remove_drift
+
+TIME = np.arange(80) / 10
+LOAD = np.clip(np.minimum(TIME - 2, 5.5 - TIME), 0, 0.5)[:, None] * [30.0, 0.0, 80.0]
+RNG = np.random.default_rng(0)
+MOVED = np.linalg.norm(LOAD, axis=1) / 200 + 0.004 + 0.001 * RNG.random(80)
+
+
+def test_drift_after_release_is_found_with_its_size_and_removed() -> None:
+    noise = RNG.normal(0, 0.4, LOAD.shape)
+    drifting = LOAD + noise + np.outer(TIME / TIME[-1], [1.5, 0.0, 2.0])
+    drift = find_drift(TIME, drifting, MOVED)
+    assert drift is not None
+    assert drift.is_clear
+    assert drift.change_mn == pytest.approx(2.5 * np.diff(drift.time_s[[0, -1]])[0] / TIME[-1], abs=0.4)
+    steady = remove_drift(TIME, drifting, drift) - LOAD
+    assert np.abs(steady[60:].mean(axis=0) - steady[:15].mean(axis=0)).max() < 0.4
+    again = find_drift(TIME, remove_drift(TIME, drifting, drift), MOVED)
+    assert again is not None
+    assert not again.is_clear
+
+
+@pytest.mark.parametrize("noise_mn", [0.01, 0.4, 3.0])
+def test_noise_is_no_drift(noise_mn: float) -> None:
+    for seed in range(8):
+        noise = np.random.default_rng(seed).normal(0, noise_mn, LOAD.shape)
+        drift = find_drift(TIME, LOAD + np.array([14.0, -12.0, 13.0]) + noise, MOVED)
+        assert drift is not None
+        assert not drift.is_clear
+
+
+def test_a_load_that_lasts_or_a_video_without_motion_shows_no_zero() -> None:
+    assert find_drift(TIME, LOAD, np.maximum.accumulate(MOVED)) is None
+    assert find_rest_spans(TIME, 0.004 + 0.001 * RNG.random(80)) == []
