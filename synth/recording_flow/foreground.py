@@ -24,11 +24,6 @@ class Limits:
     long: float = 0.12  # least extent of a jump over the width of the picture: more than the rim of a contact
     lost: float = 0.02  # least share of the tissue that an occluder covers
     near_px: int = 8  # margin around masks that is not searched
-    # Margin around instruments over the width of the picture: it holds their shadow and the contact's rim.
-    beside: float = 0.06
-    # Likewise where the tissue moves by this share of the largest motion: the flow fails at strong contacts.
-    dragged: float = 0.2
-    drags: float = 0.4
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
     wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
@@ -50,26 +45,18 @@ class ForegroundSearch:
         self._masked = ~tissue  # in any frame
         self._width_px = 0.0  # of the widest tool at rest
         self._hidden = np.zeros_like(tissue)  # in the rest frame
-        self._tool_at_rest = np.zeros_like(tissue)
         # Where the tissue is not stated, what is in front of it from the start may be its surroundings.
         self._surroundings = np.zeros_like(tissue)
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
         """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
         if frame.is_rest:
-            self._hidden, self._tool_at_rest = frame.hidden, frame.instruments
-        # Motion is on the rest frame's pixels, masks are on the frame's own: what is hidden there is both.
-        moved = frame.hidden if frame.is_rest else _at_rest(frame.hidden, frame.flow)
-        masked = ~self._tissue | frame.hidden | moved | self._hidden
+            self._hidden = frame.hidden
+        masked = ~self._tissue | frame.hidden | self._hidden
         self._masked |= masked
         if not self._has_masks:
             self._find_wide(frame.instruments, frame)
         free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
-        tool = frame.instruments | self._tool_at_rest
-        tool = tool if frame.is_rest else tool | _at_rest(frame.instruments, frame.flow)
-        margin_px = max(Limits.near_px, round(Limits.beside * tool.shape[1]))
-        clear = free & ~(cv2.dilate(tool.astype(np.uint8), _square(margin_px)) > 0)
-        dragged = self._find_dragged(tool, frame.flow)
         if depth_mm is not None:
             self._surface = self._surface or fit_surface(depth_mm, free)
             surface, deviation = self._surface
@@ -77,14 +64,13 @@ class ForegroundSearch:
                 high = surface - depth_mm > max(Limits.front_mm, Limits.sigmas * deviation)
             if frame.is_rest and not self._is_stated:
                 self._surroundings = cv2.dilate(high.astype(np.uint8), _square(Limits.near_px)) > 0
-            high &= clear & ~self._surroundings
+            high &= free & ~self._surroundings
             self._note("stands in front of the tissue", high, frame, Limits.front)
         if frame.is_rest or not frame.trusted:
             return
-        clear &= ~dragged
-        lost = (clear & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
+        lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
         # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
-        lost = (cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0) & clear
+        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0
         self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > Limits.least_px and self._has_masks:  # else it would be that of an instrument
@@ -103,16 +89,6 @@ class ForegroundSearch:
             if len(unmasked) > 1:
                 found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
-
-    def _find_dragged(self, tool: Mask, flow: Map) -> Mask:
-        """Tissue (h, w) around instruments that moves much."""
-        length = np.linalg.norm(flow, axis=-1).astype(np.float32)
-        strong = cv2.dilate(length, _square(Limits.near_px)) > Limits.drags * float(
-            length[self._tissue].max()
-        )
-        reach_px = Limits.dragged * tool.shape[1]
-        near = cv2.distanceTransform((~tool).astype(np.uint8), cv2.DIST_L2, 5) < reach_px
-        return np.asarray(strong & near & bool(tool.any()))
 
     def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
         """Notes a detected tool that is wider than tools are and than those at rest."""
@@ -141,13 +117,6 @@ class ForegroundSearch:
             x, y = self._shrink * (centres[k] + 0.5) - 0.5
             text = f"an object at x {x:.0f}, y {y:.0f} in frame {frame.index} {why}: mask it in masks/?"
             self._found.setdefault(why, []).append((found, text, label == k))
-
-
-def _at_rest(mask: Mask, flow: Map) -> Mask:
-    """Pixels (h, w) of the rest frame that a flow (h, w, 2) px takes under a mask (h, w) of another frame."""
-    y, x = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float32)
-    places = x + flow[..., 0].astype(np.float32), y + flow[..., 1].astype(np.float32)
-    return np.asarray(cv2.remap(mask.astype(np.uint8), *places, cv2.INTER_NEAREST) > 0)
 
 
 def fit_surface(depth_mm: Map, tissue: Mask) -> tuple[Map, float]:
