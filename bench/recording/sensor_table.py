@@ -54,8 +54,12 @@ _TIME = (
 )
 _STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
 _HEAD_UNIT = re.compile(r"force[ _]units?\W+([\w-]+)|y_unit_label\W+([\w-]+)", re.IGNORECASE)
-_HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)[^\d\n]*?([\d.]+)\s*(k?hz)?", re.IGNORECASE)
-_HEAD_STEP = re.compile(r"delta_x\W+([\d.eE+-]+)", re.IGNORECASE)
+_HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)", re.IGNORECASE)
+_HEAD_STEP = re.compile(r"delta_x", re.IGNORECASE)
+_HEAD_NUMBER = re.compile(r"[-+]?(?:\d[\d.,'’\u00a0\u2009\u202f]*|\.\d+)(?:[eEdD][-+]?\d+)?")
+_PER_SECOND = re.compile(r"\b1 ?/ ?s(?:ec\w*)?\b|\bs ?\^? ?[-−] ?1\b", re.IGNORECASE)
+_OF_TIME = re.compile(r"\b(?:[mnuµμ]s|m?sec|min)\b", re.IGNORECASE)
+_BRACKETS = re.compile(r"\([^)]*\)|\[[^\]]*\]")
 SINCE_1970_S, _LATEST_S = 0.9e9, 5e9  # of the years 1998 to 2128
 _DAYS = 30_000.0, 70_000.0  # of spreadsheets, from 1899-12-30, in the years 1982 to 2091
 _DAYS_TO_1970 = 25_569.0
@@ -286,19 +290,55 @@ def _scaled(values: Floats, unit: str) -> Floats:
 
 
 def _even_times(table: SensorTable, notes: list[str]) -> Floats:
-    """Times by the rate that the head states. UserError: no column of times, and no rate."""
-    head = "\n".join(table.head)
-    rate = _HEAD_RATE.search(head)
-    hertz = float(rate[1]) * (1000 if (rate[2] or "").lower() == "khz" else 1) if rate else 0.0
-    if step := _HEAD_STEP.search(head):
-        hertz = 1 / float(step[1]) if float(step[1]) > 0 else 0.0
-    if not hertz > 0:
+    """Times by the rate that the head states. UserError: no column of times, and no rate, or several."""
+    hertz = _head_number(table, _HEAD_RATE)
+    if step_s := _head_number(table, _HEAD_STEP):
+        hertz = 1 / step_s
+    if not 0 < hertz < np.inf:
         raise table.error(
             f"no column of times; the columns are {_shown(table.names)}: name it by --use "
             "columns=t_s,fx_n,..."
         )
     notes.append(f"{table.path}: no column of times: {hertz:g} samples per second, as its head states")
     return np.arange(len(table.rows)) / hertz
+
+
+def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
+    """The number that the head states after a label, a thousand times it if in kHz; 0: none.
+
+    UserError: several numbers that differ, or one that can't be read.
+    """
+    values, lines = set[float](), list[str]()
+    for line in table.head:
+        if (match := label.search(line)) is None:
+            continue
+        text = _PER_SECOND.sub(" Hz ", line[match.end() :])
+        name, *rest = re.split("[:=]", text, maxsplit=1)
+        value = (rest[0] if rest else _BRACKETS.sub(" ", name)).lstrip(' "')
+        # The comma of "rate,500,500" parts cells, that of "rate: 1,500 Hz" thousands.
+        cells = next(csv.reader([value]), []) if value.startswith(",") else [value]
+        numbers = [word.rstrip(".,'’") for cell in cells for word in _HEAD_NUMBER.findall(cell)]
+        if not numbers:
+            continue
+        lines.append(line.strip()[:80])
+        if label is _HEAD_RATE and _OF_TIME.search(text):
+            raise table.error(f"a rate in a unit of time: {lines[-1]!r}: write it as 'Sampling rate: 500 Hz'")
+        factor = 1000.0 if "khz" in text.lower() else 1.0
+        try:
+            values |= {factor * _stated_number(number) for number in numbers}
+        except ValueError:
+            raise table.error(f"{lines[-1]!r} states no number that can be read") from None
+    if len(values) > 1:
+        raise table.error(f"which number is meant can't be told: {' | '.join(lines)}: leave one")
+    return values.pop() if values else 0.0
+
+
+def _stated_number(text: str) -> float:
+    """A number of a head, where commas are thousands if they can be. ValueError: it is none."""
+    try:
+        return csv_table.parse_number(text, ".")
+    except ValueError:
+        return csv_table.parse_number(text, ",")
 
 
 def _newtons(table: SensorTable, k: int) -> float | None:

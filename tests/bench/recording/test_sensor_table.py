@@ -173,6 +173,47 @@ def test_columns_can_be_named(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.force[:, 0], F[:, 1] / 1000, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("head", "hertz"),
+    [
+        ("Sampling rate: 1,000 Hz", 1000),
+        ("Sample rate 1e3 Hz", 1000),
+        ("Sampling rate [1/s]: 500", 500),
+        ("Sampling rate (approx.) 1000 Hz", 1000),
+        ("Sample Rate (kHz): 0.5", 500),
+        ("Sample rate of FT300 = 0,5 kHz", 500),
+        ('"Sample rate","1,000",,', 1000),
+        ("Sample rate,500,500", 500),
+        ("Sampling rate mode: auto\nSampling rate: 500.", 500),
+        ("Delta_X\t0.002\t0.002", 500),
+        ("Delta_X: 2e-3", 500),
+    ],
+)
+def test_the_rate_in_a_head(head: str, hertz: float, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"{head}\nFx;Fy;Fz\n" + rows(F, ";"))
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, np.arange(200) / hertz)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "Delta_X: e",
+        "Delta_X: -0.002",
+        "Sampling rate: 500 Hz, filter 100 Hz",
+        "Sampling rate: 1 000 Hz",
+        "Sample rate,500,250",
+        "Sampling rate: 500\nSampling rate: 250",
+        "Sampling rate: 2 ms",
+        "Sampling rate: 1e999",
+        "Sampling rate: 1,00 0,00.5",
+    ],
+)
+def test_a_rate_that_cannot_be_told_is_refused(head: str, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"{head}\nFx;Fy;Fz\n" + rows(F, ";"))
+    with pytest.raises(UserError):
+        read_forces(tmp_path / "f.csv")
+
+
 REFUSED = {
     "no header": plain(),
     "counts": "t,Fx (counts),Fy (counts),Fz (counts)\n" + plain(),
