@@ -52,6 +52,7 @@ _TIME = (
     "_]?stamp|stamp|elapsed|clock)"
     r"|x_value|date[ _.]?time|time of day"
 )
+_CLOCKS = ("", "-", "utc", "gmt", "local", "unix", "epoch", "posix")  # in a unit's place: the size tells
 _STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
 _HEAD_UNIT = re.compile(r"force[ _]units?\W+([\w-]+)|y_unit_label\W+([\w-]+)", re.IGNORECASE)
 _HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)", re.IGNORECASE)
@@ -210,14 +211,20 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
             more = 1e-9 * table.numbers(rest[0])[0] if rest else 0.0
             candidates[table.names[stamps[0]]] = (values if rest else _scaled(values, "")) + more
     columns = [k for k, name in enumerate(table.names) if re.fullmatch(_TIME, name)]
-    counters = list[str]()
+    counters, unknown = list[str](), list[str]()
     for k in columns if not candidates else ():
+        unit = table.units[k].lower()
+        if unit not in (*_CLOCKS, *_SECONDS) and not clock_text.is_clock(*table.columns(k)):
+            unknown.append(f"{table.names[k]} is in {table.units[k]!r}, which is no unit of time")
+            continue
         values = _clock(table, k, notes)
         is_whole = bool((np.diff(values) == 1).all() and (values == np.round(values)).all())
         (counters.append(table.names[k]) if is_whole and not table.units[k] else None)
         candidates[table.names[k]] = values
     for name in counters[: len(candidates) - 1]:
         del candidates[name]  # the number of a row, next to a clock
+    if unknown and not candidates:
+        raise table.error(f"{unknown[0]}: name the columns by --use columns=t_s,fx_n,... or convert it")
     if not candidates:
         return _even_times(table, notes)
     right_kind = [
@@ -480,7 +487,7 @@ def _name(cell: str) -> tuple[str, str]:
     name = match[1].strip(" _.")
     is_time = re.fullmatch(_TIME, name)
     if is_time and unit not in _SECONDS:
-        return name, ""  # a format, as hh:mm:ss
+        return name, match[2] or ""  # perhaps a format, as hh:mm:ss
     if not name or (match[3] and (unit in _SECONDS) != bool(is_time)):
         return plain, ""  # a name that ends as a unit does
     return name, unit

@@ -91,6 +91,18 @@ def test_clocks_of_every_kind(form: str, start: float, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.time_s, start + T, atol=2e-6, rtol=0)
 
 
+@pytest.mark.parametrize("unit", ["hh:mm:ss.fff", "UTC"])
+def test_the_format_of_a_clock_is_no_unit(unit: str, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"Time [{unit}],Fx,Fy,Fz\n" + clock("{h}:{m:02d}:{s:06.3f}"))
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, 36_120 + T, atol=2e-6, rtol=0)
+
+
+def test_a_clock_in_an_unknown_unit_gives_way_to_another(tmp_path: Path) -> None:
+    cells = rows([10 * t, t, *f] for t, f in zip(T, F, strict=True))
+    (tmp_path / "f.csv").write_text("time [0.1 s],elapsed [s],fx,fy,fz\n" + cells)
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, T)
+
+
 def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
     file = tmp_path / "f.csv"
     file.write_text("time,fx,fy,fz\n23:59:59.9,1,2,3\n00:00:00.1,1,2,3\n")
@@ -227,6 +239,8 @@ REFUSED = {
     "a frame's time code": "t,fx,fy,fz\n10:02:00:12,1,2,3\n10:02:00:13,1,2,3\n",
     "dates in either order": "t,fx,fy,fz\n01/02/2026 10:00:00,1,2,3\n01/04/2026 10:00:00,1,2,3\n",
     "minutes beyond": "t,fx,fy,fz\n10:72:00,1,2,3\n",
+    "tenths of a second": "time [0.1 s],fx,fy,fz\n" + plain(),
+    "ticks in a row of units": "time,fx,fy,fz\nticks,N,N,N\n" + plain(),
     "a spreadsheet": "PK\x03\x04\0\0\0",
 }
 
