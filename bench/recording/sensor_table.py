@@ -221,8 +221,8 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
         is_whole = bool((np.diff(values) == 1).all() and (values == np.round(values)).all())
         (counters.append(table.names[k]) if is_whole and not table.units[k] else None)
         candidates[table.names[k]] = values
-    for name in counters[: len(candidates) - 1]:
-        del candidates[name]  # the number of a row, next to a clock
+    for name in [*dict.fromkeys(counters)][: len(candidates) - 1]:
+        candidates.pop(name)  # the number of a row, next to a clock
     if unknown and not candidates:
         raise table.error(f"{unknown[0]}: name the columns by --use columns=t_s,fx_n,... or convert it")
     if not candidates:

@@ -45,6 +45,8 @@ WRITTEN = {
     "Fortran": "t_s,fx_n,fy_n,fz_n\n" + plain(form="{:.9e}").replace("e", "D"),
     "torques first": "time,mx,my,mz,fx,fy,fz\n" + rows([t, 9, 9, 9, *f] for t, f in zip(T, F, strict=True)),
     "a counter": "t,timestamp,Fx,Fy,Fz\n" + rows([k, t, *F[k]] for k, t in enumerate(T)),
+    "counters of one name": "time,time,t,timestamp,Fx,Fy,Fz\n"
+    + rows([k, k, k, t, *F[k]] for k, t in enumerate(T)),
     "bars": "t_s|fx_n|fy_n|fz_n\n" + plain("|"),
     "commas at the ends": "t_s,fx_n,fy_n,fz_n,\n" + plain().replace("\n", ",\n"),
     "a comment at the end": "t_s,fx_n,fy_n,fz_n\r\n" + plain().replace("\n", "\r\n") + "# end\n",
