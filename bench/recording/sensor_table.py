@@ -95,11 +95,17 @@ class SensorTable:
     head: list[str] = field(default_factory=list)  # lines before the header
 
     def columns(self, *chosen: int) -> list[list[str]]:
-        """The cells of columns."""
-        return [[row[k] if k < len(row) else "" for row in self.rows] for k in chosen]
+        """The cells of columns. UserError: a row ends before one of them."""
+        least = max(chosen, default=-1) + 1
+        for line, row in zip(self.lines, self.rows, strict=True):
+            if len(row) < least:
+                raise UserError(
+                    f"{self.path}:{line}: {len(row)} cells, {len(self.names)} expected (cut off?)"
+                )
+        return [[row[k] for row in self.rows] for k in chosen]
 
     def numbers(self, *chosen: int) -> list[Floats]:
-        """The numbers of columns. UserError as `csv_table.parse_columns`."""
+        """The numbers of columns. UserError as `columns` and `csv_table.parse_columns`."""
         return csv_table.parse_columns(self.path, self.columns(*chosen), self.lines)
 
     def error(self, fault: str) -> UserError:
@@ -394,7 +400,7 @@ def _with_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTab
     _, at, split = best
     pairs = [_name(cell) for cell in _header_cells(lines[at], split)]
     names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
-    rows, numbers = _rows(path, lines, at + 1, split)
+    rows, numbers = _rows(lines, at + 1, split)
     if rows and (below := _units_row(rows[0])) is not None:
         units = [there or unit for unit, there in zip(units, [*below, *[""] * len(units)], strict=False)]
         rows, numbers = rows[1:], numbers[1:]
@@ -411,7 +417,7 @@ def _with_names(path: Path, columns: str) -> SensorTable:
         for split in _splitters(line):
             cells = split(line)
             if len(cells) >= len(pairs) and all(_is_value(cells[k]) for k in named):
-                rows, numbers = _rows(path, lines, at, split)
+                rows, numbers = _rows(lines, at, split)
                 names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
                 return _checked(SensorTable(path, names, units, rows, numbers, lines[:at]))
     raise UserError(
@@ -420,20 +426,20 @@ def _with_names(path: Path, columns: str) -> SensorTable:
 
 
 def _checked(table: SensorTable) -> SensorTable:
-    """The table. UserError: no rows, or one with more or fewer cells than columns that are used."""
+    """The table. UserError: no rows, or one with more cells than names; `columns` refuses too few."""
     if not table.rows:
         raise table.error("a header but no rows")
     width = len(table.names)
     for line, row in zip(table.lines, table.rows, strict=True):
         over = "." not in "".join(row) and "".join(row[width:]).strip()
-        if over or len(row) < 2 <= width:
-            why = "decimal commas? use points" if over else "cut off?"
-            raise UserError(f"{table.path}:{line}: {len(row)} cells, {width} expected ({why})")
+        if over:
+            fault = f"{len(row)} cells, {width} expected (decimal commas? use points)"
+            raise UserError(f"{table.path}:{line}: {fault}")
     return table
 
 
 def _rows(
-    path: Path, lines: Sequence[str], first: int, split: Callable[[str], list[str]]
+    lines: Sequence[str], first: int, split: Callable[[str], list[str]]
 ) -> tuple[list[list[str]], list[int]]:
     """Cells and line numbers of the rows from a line on, without blank ones and comments."""
     rows, numbers = list[list[str]](), list[int]()

@@ -237,6 +237,8 @@ REFUSED = {
     "a row of text": "t,fx,fy,fz\n" + plain() + "mean,1,2,3\n",
     "no times": "fx,fy,fz\n" + rows(F),
     "cells too many": "t,fx,fy,fz\n0,5,1,2,3,4,5,6\n",
+    "a row that is cut off": "t,fx,fy,fz,other\n0,1,2,3,4\n1,1,2\n",
+    "a row of one cell": "t,fx,fy,fz,other\n0,1,2,3,4\n1\n",
     "a thousand or not": "t;fx;fy;fz\n1,482;2,111;3,222;4,333\n",
     "a frame's time code": "t,fx,fy,fz\n10:02:00:12,1,2,3\n10:02:00:13,1,2,3\n",
     "dates in either order": "t,fx,fy,fz\n01/02/2026 10:00:00,1,2,3\n01/04/2026 10:00:00,1,2,3\n",
@@ -245,6 +247,11 @@ REFUSED = {
     "ticks in a row of units": "time,fx,fy,fz\nticks,N,N,N\n" + plain(),
     "a spreadsheet": "PK\x03\x04\0\0\0",
 }
+
+
+def test_a_row_may_lack_what_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text("t,fx,fy,fz,other\n0,1,2,3,4\n1,1,2,3\n")
+    assert read_forces(tmp_path / "f.csv").force.tolist() == [[1, 2, 3], [1, 2, 3]]
 
 
 @pytest.mark.parametrize("name", REFUSED)
