@@ -105,6 +105,17 @@ def test_a_clock_in_an_unknown_unit_gives_way_to_another(tmp_path: Path) -> None
     np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, T)
 
 
+@pytest.mark.parametrize(("day", "ambiguous"), [("05/06/2026", 1), ("05/28/2026", 0), ("05/05/2026", 0)])
+def test_ambiguous_dates_with_am_and_pm_are_said(day: str, ambiguous: int, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text("Time,Fx,Fy,Fz\n" + clock(day + " {h}:{m:02d}:{s:06.3f} AM"))
+    found = read_forces(tmp_path / "f.csv")
+    month_first = np.datetime64(f"2026-{day[:2]}-{day[3:5]}", "s").astype(int) + 36_120
+    np.testing.assert_allclose(found.time_s, month_first + T, atol=2e-6, rtol=0)
+    clear = tmp_path / "clear.csv"
+    clear.write_text("Time,Fx,Fy,Fz\n" + clock("2026-05-06 {h}:{m:02d}:{s:06.3f} AM"))
+    assert len(found.notes) - len(read_forces(clear).notes) == ambiguous
+
+
 def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
     file = tmp_path / "f.csv"
     file.write_text("time,fx,fy,fz\n23:59:59.9,1,2,3\n00:00:00.1,1,2,3\n")
