@@ -45,9 +45,22 @@ def open_dicom(source: Path, notes: list[str]) -> tuple[Callable[[], Iterator[Ar
     def pictures() -> Iterator[Array]:
         from pydicom.pixels import iter_pixels
 
-        return iter(iter_pixels(source))
+        return (_shown(picture, about) for picture in iter_pixels(source))
 
     return pictures, count, _times(about, count, notes)
+
+
+def _shown(picture: Array, about: Any) -> Array:
+    """Stored values (H, W) or (H, W, 3) as grey that rises with brightness, or as RGB; uint8 or uint16."""
+    kind = str(about.PhotometricInterpretation)
+    if kind == "PALETTE COLOR":
+        from pydicom.pixels import apply_color_lut
+
+        return np.asarray(apply_color_lut(picture, about))
+    if kind == "MONOCHROME1":  # 0 is white; bits above those stored may hold something else
+        white = picture.dtype.type((1 << int(about.BitsStored)) - 1)
+        return np.asarray(white - (picture & white))
+    return picture
 
 
 class _Extracted:

@@ -60,9 +60,11 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         shown = _good(header, "Image")
         pictures: Callable[[], Iterator[Pixels]] = _Pixels(header, shown)
     else:
-        film = _find_film(header)
-        shown = _shown(header, film, notes)
-        pictures = _Film(film, len(shown))
+        path = _find_film(header)
+        count = video.count_frames(path) or 0
+        shown = _shown(header, path.name, count, notes)
+        pictures = _Film(path, len(shown))
+        film = path if count == header.count else None
     if len(shown) < header.count:
         notes.append(f"{header.count - len(shown)} of {header.count} frames have no picture and are left out")
     poses = {name: rows[shown] for name, rows in _poses(header).items()}
@@ -76,7 +78,7 @@ def read_source(source: Path, use: dict[str, str]) -> Intake:
         force[good],
         tuple(notes),
         axes=axes,
-        film=film if len(shown) == header.count else None,
+        film=film,
         poses=poses,
     )
 
@@ -186,19 +188,16 @@ def _find_film(header: Header) -> Path:
     return path
 
 
-def _shown(header: Header, film: Path, notes: list[str]) -> list[int]:
-    """The frames that a video has pictures of. UserError: it has many more, or fewer."""
-    pictures = video.count_frames(film) or 0
+def _shown(header: Header, film: str, pictures: int, notes: list[str]) -> list[int]:
+    """The frames that a video of so many pictures shows. UserError: it has many more, or fewer."""
     if abs(pictures - header.count) > _SPARE:
         raise header.error(
-            f"{header.count} frames, but {film.name} has {pictures} pictures: which is of which "
+            f"{header.count} frames, but {film} has {pictures} pictures: which is of which "
             "can't be told; "
-            f"import {film.name} with --use force={header.source.name} and --use frame_time=TABLE.csv"
+            f"import {film} with --use force={header.source.name} and --use frame_time=TABLE.csv"
         )
     if pictures != header.count:
-        notes.append(
-            f"{film.name} has {pictures} pictures for {header.count} frames: matched from the first on"
-        )
+        notes.append(f"{film} has {pictures} pictures for {header.count} frames: matched from the first on")
     return list(range(min(pictures, header.count)))
 
 

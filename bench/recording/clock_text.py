@@ -115,6 +115,10 @@ def _with_order(
         near = [found for found in choices if np.ptp(found) <= 1]
         if has_half:
             near = choices[:1]  # AM and PM are written where the month comes first
+            notes.append(
+                f"{path}: day or month may come first in its dates: the month is taken as first, as where AM "
+                "and PM are written; else write them as 2026-11-28"
+            )
         elif len({row[1:] for row in dated}) == 1:
             notes.append(
                 f"{path}: day or month may come first in its dates: times count from that day's start"

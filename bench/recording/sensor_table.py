@@ -52,10 +52,15 @@ _TIME = (
     "_]?stamp|stamp|elapsed|clock)"
     r"|x_value|date[ _.]?time|time of day"
 )
+_CLOCKS = ("", "-", "utc", "gmt", "local", "unix", "epoch", "posix")  # in a unit's place: the size tells
 _STAMP, _NANOSECONDS = r"(?:.*\.)?(?:header\.stamp|stamp\.secs?)", r"(?:.*\.)?stamp\.n(?:ano)?secs?"
 _HEAD_UNIT = re.compile(r"force[ _]units?\W+([\w-]+)|y_unit_label\W+([\w-]+)", re.IGNORECASE)
-_HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)[^\d\n]*?([\d.]+)\s*(k?hz)?", re.IGNORECASE)
-_HEAD_STEP = re.compile(r"delta_x\W+([\d.eE+-]+)", re.IGNORECASE)
+_HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)", re.IGNORECASE)
+_HEAD_STEP = re.compile(r"delta_x", re.IGNORECASE)
+_HEAD_NUMBER = re.compile(r"[-+]?(?:\d[\d.,'’\u00a0\u2009\u202f]*|\.\d+)(?:[eEdD][-+]?\d+)?")
+_PER_SECOND = re.compile(r"\b1 ?/ ?s(?:ec\w*)?\b|\bs ?\^? ?[-−] ?1\b", re.IGNORECASE)
+_OF_TIME = re.compile(r"\b(?:[mnuµμ]s|m?sec|min)\b", re.IGNORECASE)
+_BRACKETS = re.compile(r"\([^)]*\)|\[[^\]]*\]")
 SINCE_1970_S, _LATEST_S = 0.9e9, 5e9  # of the years 1998 to 2128
 _DAYS = 30_000.0, 70_000.0  # of spreadsheets, from 1899-12-30, in the years 1982 to 2091
 _DAYS_TO_1970 = 25_569.0
@@ -90,11 +95,17 @@ class SensorTable:
     head: list[str] = field(default_factory=list)  # lines before the header
 
     def columns(self, *chosen: int) -> list[list[str]]:
-        """The cells of columns."""
-        return [[row[k] if k < len(row) else "" for row in self.rows] for k in chosen]
+        """The cells of columns. UserError: a row ends before one of them."""
+        least = max(chosen, default=-1) + 1
+        for line, row in zip(self.lines, self.rows, strict=True):
+            if len(row) < least:
+                raise UserError(
+                    f"{self.path}:{line}: {len(row)} cells, {len(self.names)} expected (cut off?)"
+                )
+        return [[row[k] for row in self.rows] for k in chosen]
 
     def numbers(self, *chosen: int) -> list[Floats]:
-        """The numbers of columns. UserError as `csv_table.parse_columns`."""
+        """The numbers of columns. UserError as `columns` and `csv_table.parse_columns`."""
         return csv_table.parse_columns(self.path, self.columns(*chosen), self.lines)
 
     def error(self, fault: str) -> UserError:
@@ -206,14 +217,20 @@ def read_times(table: SensorTable, since_1970: bool, notes: list[str]) -> Floats
             more = 1e-9 * table.numbers(rest[0])[0] if rest else 0.0
             candidates[table.names[stamps[0]]] = (values if rest else _scaled(values, "")) + more
     columns = [k for k, name in enumerate(table.names) if re.fullmatch(_TIME, name)]
-    counters = list[str]()
+    counters, unknown = list[str](), list[str]()
     for k in columns if not candidates else ():
+        unit = table.units[k].lower()
+        if unit not in (*_CLOCKS, *_SECONDS) and not clock_text.is_clock(*table.columns(k)):
+            unknown.append(f"{table.names[k]} is in {table.units[k]!r}, which is no unit of time")
+            continue
         values = _clock(table, k, notes)
         is_whole = bool((np.diff(values) == 1).all() and (values == np.round(values)).all())
         (counters.append(table.names[k]) if is_whole and not table.units[k] else None)
         candidates[table.names[k]] = values
-    for name in counters[: len(candidates) - 1]:
-        del candidates[name]  # the number of a row, next to a clock
+    for name in [*dict.fromkeys(counters)][: len(candidates) - 1]:
+        candidates.pop(name)  # the number of a row, next to a clock
+    if unknown and not candidates:
+        raise table.error(f"{unknown[0]}: name the columns by --use columns=t_s,fx_n,... or convert it")
     if not candidates:
         return _even_times(table, notes)
     right_kind = [
@@ -286,19 +303,55 @@ def _scaled(values: Floats, unit: str) -> Floats:
 
 
 def _even_times(table: SensorTable, notes: list[str]) -> Floats:
-    """Times by the rate that the head states. UserError: no column of times, and no rate."""
-    head = "\n".join(table.head)
-    rate = _HEAD_RATE.search(head)
-    hertz = float(rate[1]) * (1000 if (rate[2] or "").lower() == "khz" else 1) if rate else 0.0
-    if step := _HEAD_STEP.search(head):
-        hertz = 1 / float(step[1]) if float(step[1]) > 0 else 0.0
-    if not hertz > 0:
+    """Times by the rate that the head states. UserError: no column of times, and no rate, or several."""
+    hertz = _head_number(table, _HEAD_RATE)
+    if step_s := _head_number(table, _HEAD_STEP):
+        hertz = 1 / step_s
+    if not 0 < hertz < np.inf:
         raise table.error(
             f"no column of times; the columns are {_shown(table.names)}: name it by --use "
             "columns=t_s,fx_n,..."
         )
     notes.append(f"{table.path}: no column of times: {hertz:g} samples per second, as its head states")
     return np.arange(len(table.rows)) / hertz
+
+
+def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
+    """The number that the head states after a label, a thousand times it if in kHz; 0: none.
+
+    UserError: several numbers that differ, or one that can't be read.
+    """
+    values, lines = set[float](), list[str]()
+    for line in table.head:
+        if (match := label.search(line)) is None:
+            continue
+        text = _PER_SECOND.sub(" Hz ", line[match.end() :])
+        name, *rest = re.split("[:=]", text, maxsplit=1)
+        value = (rest[0] if rest else _BRACKETS.sub(" ", name)).lstrip(' "')
+        # The comma of "rate,500,500" parts cells, that of "rate: 1,500 Hz" thousands.
+        cells = next(csv.reader([value]), []) if value.startswith(",") else [value]
+        numbers = [word.rstrip(".,'’") for cell in cells for word in _HEAD_NUMBER.findall(cell)]
+        if not numbers:
+            continue
+        lines.append(line.strip()[:80])
+        if label is _HEAD_RATE and _OF_TIME.search(text):
+            raise table.error(f"a rate in a unit of time: {lines[-1]!r}: write it as 'Sampling rate: 500 Hz'")
+        factor = 1000.0 if "khz" in text.lower() else 1.0
+        try:
+            values |= {factor * _stated_number(number) for number in numbers}
+        except ValueError:
+            raise table.error(f"{lines[-1]!r} states no number that can be read") from None
+    if len(values) > 1:
+        raise table.error(f"which number is meant can't be told: {' | '.join(lines)}: leave one")
+    return values.pop() if values else 0.0
+
+
+def _stated_number(text: str) -> float:
+    """A number of a head, where commas are thousands if they can be. ValueError: it is none."""
+    try:
+        return csv_table.parse_number(text, ".")
+    except ValueError:
+        return csv_table.parse_number(text, ",")
 
 
 def _newtons(table: SensorTable, k: int) -> float | None:
@@ -347,7 +400,7 @@ def _with_header(path: Path, count: Callable[[Sequence[str]], int]) -> SensorTab
     _, at, split = best
     pairs = [_name(cell) for cell in _header_cells(lines[at], split)]
     names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
-    rows, numbers = _rows(path, lines, at + 1, split)
+    rows, numbers = _rows(lines, at + 1, split)
     if rows and (below := _units_row(rows[0])) is not None:
         units = [there or unit for unit, there in zip(units, [*below, *[""] * len(units)], strict=False)]
         rows, numbers = rows[1:], numbers[1:]
@@ -364,7 +417,7 @@ def _with_names(path: Path, columns: str) -> SensorTable:
         for split in _splitters(line):
             cells = split(line)
             if len(cells) >= len(pairs) and all(_is_value(cells[k]) for k in named):
-                rows, numbers = _rows(path, lines, at, split)
+                rows, numbers = _rows(lines, at, split)
                 names, units = [name for name, _ in pairs], [unit for _, unit in pairs]
                 return _checked(SensorTable(path, names, units, rows, numbers, lines[:at]))
     raise UserError(
@@ -373,20 +426,20 @@ def _with_names(path: Path, columns: str) -> SensorTable:
 
 
 def _checked(table: SensorTable) -> SensorTable:
-    """The table. UserError: no rows, or one with more or fewer cells than columns that are used."""
+    """The table. UserError: no rows, or one with more cells than names; `columns` refuses too few."""
     if not table.rows:
         raise table.error("a header but no rows")
     width = len(table.names)
     for line, row in zip(table.lines, table.rows, strict=True):
         over = "." not in "".join(row) and "".join(row[width:]).strip()
-        if over or len(row) < 2 <= width:
-            why = "decimal commas? use points" if over else "cut off?"
-            raise UserError(f"{table.path}:{line}: {len(row)} cells, {width} expected ({why})")
+        if over:
+            fault = f"{len(row)} cells, {width} expected (decimal commas? use points)"
+            raise UserError(f"{table.path}:{line}: {fault}")
     return table
 
 
 def _rows(
-    path: Path, lines: Sequence[str], first: int, split: Callable[[str], list[str]]
+    lines: Sequence[str], first: int, split: Callable[[str], list[str]]
 ) -> tuple[list[list[str]], list[int]]:
     """Cells and line numbers of the rows from a line on, without blank ones and comments."""
     rows, numbers = list[list[str]](), list[int]()
@@ -440,7 +493,7 @@ def _name(cell: str) -> tuple[str, str]:
     name = match[1].strip(" _.")
     is_time = re.fullmatch(_TIME, name)
     if is_time and unit not in _SECONDS:
-        return name, ""  # a format, as hh:mm:ss
+        return name, match[2] or ""  # perhaps a format, as hh:mm:ss
     if not name or (match[3] and (unit in _SECONDS) != bool(is_time)):
         return plain, ""  # a name that ends as a unit does
     return name, unit

@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 
-from synth.errors import UserError
+from synth.errors import UserError, first_line
 from synth.system.checked_file import refuse_large
 from synth.video.read import Picture
 
@@ -40,6 +40,7 @@ class Camera:
         self.period_s = 1 / fps if 1 <= fps <= 1000 else 0.04
         """Stated time between two pictures [s]."""
         self._latest: Picture | None = None
+        self._error: Exception | None = None  # that ended the thread
         self._news, self._ends = threading.Condition(), False
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -63,7 +64,10 @@ class Camera:
         self._capture.release()
 
     def _after(self, number: int) -> Picture | None:
-        """The latest picture as soon as it is later than that of a number; None: the camera has ended."""
+        """The latest picture as soon as it is later than that of a number; None: the camera has ended.
+
+        UserError: it gives none in time, or reading failed.
+        """
 
         def latest() -> Picture | None:
             return self._latest if self._latest is not None and self._latest.index > number else None
@@ -71,9 +75,24 @@ class Camera:
         with self._news:
             if not self._news.wait_for(lambda: self._ends or latest(), _SLOWEST_S):
                 raise UserError(f"{self.name}: no picture for {_SLOWEST_S:g} s")
-            return latest()
+            picture = latest()
+        if picture is None and self._error is not None:
+            if isinstance(self._error, UserError):
+                raise self._error
+            raise UserError(f"{self.name}: reading failed ({first_line(self._error)})") from self._error
+        return picture
 
     def _read(self) -> None:
+        try:
+            self._keep_latest()
+        except Exception as error:  # raised where pictures are asked for
+            self._error = error
+        finally:
+            with self._news:
+                self._ends = True
+                self._news.notify()
+
+    def _keep_latest(self) -> None:
         number = failures = 0
         while not self._ends and failures < _FAILURES:
             good, bgr = self._capture.read()
@@ -86,6 +105,3 @@ class Camera:
                 with self._news:
                     self._latest = picture
                     self._news.notify()
-        with self._news:
-            self._ends = True
-            self._news.notify()

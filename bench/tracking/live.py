@@ -132,7 +132,7 @@ class _CameraClock(Pace):
     def spare_s(self, time_s: float) -> float:
         return 0.0
 
-    def free_s(self) -> float:
+    def wait_s(self) -> float:
         return max(0.0, self._last_s + self._camera.period_s - time.perf_counter())
 
 
@@ -160,5 +160,5 @@ class _VideoClock(Pace):
     def spare_s(self, time_s: float) -> float:
         return max(0.0, self.began_s + time_s - self.first_s - time.perf_counter()) if self.paced else 0.0
 
-    def free_s(self) -> float:
+    def wait_s(self) -> float:
         return 0.0

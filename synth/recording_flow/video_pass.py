@@ -48,7 +48,7 @@ class Pace(Protocol):
     def spare_s(self, time_s: float) -> float:
         """Time until a frame arrives [s]."""
 
-    def free_s(self) -> float:
+    def wait_s(self) -> float:
         """Time [s] for which results are waited for before the next picture is asked for: 0 of a file, which
         gives its pictures before they arrive."""
 
@@ -168,10 +168,10 @@ class VideoPass:
 
     def _is_done(self, flow: Future[FrameMotion]) -> bool:
         """Whether a flow is ready before the next picture of a stream is expected, until when it waits."""
-        if self._pace is None or (free_s := self._pace.free_s()) <= 0:
+        if self._pace is None or (wait_s := self._pace.wait_s()) <= 0:
             return False
         with suppress(TimeoutError):
-            flow.result(free_s)
+            flow.result(wait_s)
             return True
         return False
 

@@ -109,7 +109,7 @@ def parse_columns(path: Path, columns: Sequence[Sequence[str]], lines: Sequence[
             odd = sorted({*odd, *(k for k, cell in enumerate(cells) if "." in cell)})
         for k in odd:
             try:
-                values[k] = _number(cells[k], "," if mark == "," else ".")
+                values[k] = parse_number(cells[k], "," if mark == "," else ".")
             except ValueError as error:
                 raise UserError(f"{path}:{lines[k]}: {str(error)[:100]}") from None
     return [values for values, _ in found]
@@ -145,7 +145,11 @@ def _decimal_mark(path: Path, cells: Sequence[str], lines: Sequence[int]) -> str
     return ";" if whole and small else "?"
 
 
-def _number(cell: str, decimal: str) -> float:
+def parse_number(cell: str, decimal: str) -> float:
+    """The number in a cell, or the seconds since 1970 of a date; NaN if empty.
+
+    `decimal`: the decimal mark, "." or ","; the other one parts thousands. ValueError: it is neither.
+    """
     text = cell.strip()
     if text.lower() in _NOTHING:
         return np.nan

@@ -122,15 +122,6 @@ def _decode(
             broken, count = False, count + 1
 
 
-def find_films(path: Path) -> list[str]:
-    """The films in a video, in words: its video streams without covers. UserError: it is none."""
-    with _open_video(path) as container:
-        return [
-            f"{stream.width} x {stream.height} {stream.codec_context.name}"
-            for stream in _films(container, path)
-        ]
-
-
 def find_start(path: Path | VideoFile) -> float:
     """Time of a video's first picture from the start of its file [s], which sound or undecodable pictures may
     begin; 0 if its format has no times. UserError: it is no video."""

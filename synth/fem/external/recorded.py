@@ -58,8 +58,8 @@ def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bo
         raise UserError(f"{file}: {what}; it has {', '.join(sorted(held))}")
     fields = [name for name, shape in shapes.items() if shape == moved.shape]
     name, per_area = force_field(force, fields, file)
-    time = held["times"] if "times" in held else np.full(len(moved), np.nan)
-    same = moved.shape == (len(time), *rest.shape) and time.ndim == 1
+    time = held["times"] if "times" in held else np.full(moved.shape[:1], np.nan)
+    same = time.ndim == 1 and moved.shape == (*time.shape, *rest.shape)
     if not same or rest.shape[1:] != (3,) or len(time) < 2:
         given = f"points {rest.shape}, displacement {moved.shape}, times {time.shape}"
         raise UserError(f"{file}: shapes don't fit, or are of fewer than two states: {given}")

@@ -54,6 +54,16 @@ def test_pictures_come_from_the_video_beside_it(local: bool, tmp_path: Path) -> 
     assert table["tiptoworldtransform_x"][6] == pytest.approx(6)
 
 
+@pytest.mark.parametrize("spare", [-1, 2])
+def test_a_video_of_a_few_pictures_more_or_fewer_is_cut_to_the_frames(spare: int, tmp_path: Path) -> None:
+    film(tmp_path / "v.mp4", N + spare)
+    source = write_igs(tmp_path / "a.mha", TIMES, FORCE, "v.mp4")
+    run(app, "import", source, "-o", tmp_path / "rec", "--scale", 0.1)
+    frames = list(open_recording(tmp_path / "rec").frames())
+    assert [int(frame.rgb.mean()) // 8 for frame in frames] == [*range(min(N, N + spare))]
+    assert [frame.time_s for frame in frames] == pytest.approx(TIMES[: N + spare], abs=1e-6)
+
+
 def test_a_sequence_is_a_table_of_forces_too(tmp_path: Path) -> None:
     video, source = film(tmp_path / "v.mp4"), write_igs(tmp_path / "a.mha", TIMES, FORCE, "v.mp4")
     found = registry.read_source(video, {"force": str(source)})

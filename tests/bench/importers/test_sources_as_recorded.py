@@ -235,6 +235,33 @@ def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
     assert found.times_s == pytest.approx(np.arange(COUNT) / FPS, abs=1e-4)
 
 
+@pytest.mark.parametrize("stored", [8, 12])
+def test_dicom_of_inverted_grey(stored: int, tmp_path: Path) -> None:
+    pytest.importorskip("pydicom")
+    dark = np.stack([picture[..., 1] for picture in PICTURES]).astype("<u2" if stored > 8 else "u1")
+    about = {"SamplesPerPixel": 1, "BitsAllocated": 8 if stored == 8 else 16, "BitsStored": stored}
+    about |= {"HighBit": stored - 1, "FrameTime": "40", "PhotometricInterpretation": "MONOCHROME1"}
+    values = ((1 << stored) - 1) - (dark << (stored - 8))
+    source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", values.astype(dark.dtype), **about)
+    grey = np.stack(list(registry.read_source(source).pictures()))[..., 0].astype(int)
+    np.testing.assert_allclose(grey, dark, atol=1)
+
+
+def test_dicom_of_a_palette(tmp_path: Path) -> None:
+    pytest.importorskip("pydicom")
+    index = np.stack([picture[..., 1] for picture in PICTURES]).astype(np.uint8)
+    colours = np.random.default_rng(0).integers(0, 256, (256, 3))
+    colours[0] = 255
+    about: dict[str, object] = {"SamplesPerPixel": 1, "PhotometricInterpretation": "PALETTE COLOR"}
+    for name, column in zip(("Red", "Green", "Blue"), colours.T, strict=True):
+        about[f"{name}PaletteColorLookupTableDescriptor"] = [256, 0, 16]
+        about[f"{name}PaletteColorLookupTableData"] = (257 * column).astype("<u2").tobytes()
+    source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", index, FrameTime="40", **about)
+    np.testing.assert_allclose(
+        np.stack(list(registry.read_source(source).pictures())).astype(int), colours[index], atol=1
+    )
+
+
 def test_a_folder_of_neither_is_named_with_what_it_holds(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("x")
     with pytest.raises(UserError, match=r"notes\.md"):

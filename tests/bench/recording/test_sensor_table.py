@@ -45,6 +45,8 @@ WRITTEN = {
     "Fortran": "t_s,fx_n,fy_n,fz_n\n" + plain(form="{:.9e}").replace("e", "D"),
     "torques first": "time,mx,my,mz,fx,fy,fz\n" + rows([t, 9, 9, 9, *f] for t, f in zip(T, F, strict=True)),
     "a counter": "t,timestamp,Fx,Fy,Fz\n" + rows([k, t, *F[k]] for k, t in enumerate(T)),
+    "counters of one name": "time,time,t,timestamp,Fx,Fy,Fz\n"
+    + rows([k, k, k, t, *F[k]] for k, t in enumerate(T)),
     "bars": "t_s|fx_n|fy_n|fz_n\n" + plain("|"),
     "commas at the ends": "t_s,fx_n,fy_n,fz_n,\n" + plain().replace("\n", ",\n"),
     "a comment at the end": "t_s,fx_n,fy_n,fz_n\r\n" + plain().replace("\n", "\r\n") + "# end\n",
@@ -89,6 +91,29 @@ def test_clocks_of_every_kind(form: str, start: float, tmp_path: Path) -> None:
     (tmp_path / "f.csv").write_text("Time,Fx,Fy,Fz\n" + clock(form))
     found = read_forces(tmp_path / "f.csv")
     np.testing.assert_allclose(found.time_s, start + T, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("unit", ["hh:mm:ss.fff", "UTC"])
+def test_the_format_of_a_clock_is_no_unit(unit: str, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"Time [{unit}],Fx,Fy,Fz\n" + clock("{h}:{m:02d}:{s:06.3f}"))
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, 36_120 + T, atol=2e-6, rtol=0)
+
+
+def test_a_clock_in_an_unknown_unit_gives_way_to_another(tmp_path: Path) -> None:
+    cells = rows([10 * t, t, *f] for t, f in zip(T, F, strict=True))
+    (tmp_path / "f.csv").write_text("time [0.1 s],elapsed [s],fx,fy,fz\n" + cells)
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, T)
+
+
+@pytest.mark.parametrize(("day", "ambiguous"), [("05/06/2026", 1), ("05/28/2026", 0), ("05/05/2026", 0)])
+def test_ambiguous_dates_with_am_and_pm_are_said(day: str, ambiguous: int, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text("Time,Fx,Fy,Fz\n" + clock(day + " {h}:{m:02d}:{s:06.3f} AM"))
+    found = read_forces(tmp_path / "f.csv")
+    month_first = np.datetime64(f"2026-{day[:2]}-{day[3:5]}", "s").astype(int) + 36_120
+    np.testing.assert_allclose(found.time_s, month_first + T, atol=2e-6, rtol=0)
+    clear = tmp_path / "clear.csv"
+    clear.write_text("Time,Fx,Fy,Fz\n" + clock("2026-05-06 {h}:{m:02d}:{s:06.3f} AM"))
+    assert len(found.notes) - len(read_forces(clear).notes) == ambiguous
 
 
 def test_clocks_that_turn_dates_apart_days_and_blocks(tmp_path: Path) -> None:
@@ -173,6 +198,47 @@ def test_columns_can_be_named(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.force[:, 0], F[:, 1] / 1000, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("head", "hertz"),
+    [
+        ("Sampling rate: 1,000 Hz", 1000),
+        ("Sample rate 1e3 Hz", 1000),
+        ("Sampling rate [1/s]: 500", 500),
+        ("Sampling rate (approx.) 1000 Hz", 1000),
+        ("Sample Rate (kHz): 0.5", 500),
+        ("Sample rate of FT300 = 0,5 kHz", 500),
+        ('"Sample rate","1,000",,', 1000),
+        ("Sample rate,500,500", 500),
+        ("Sampling rate mode: auto\nSampling rate: 500.", 500),
+        ("Delta_X\t0.002\t0.002", 500),
+        ("Delta_X: 2e-3", 500),
+    ],
+)
+def test_the_rate_in_a_head(head: str, hertz: float, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"{head}\nFx;Fy;Fz\n" + rows(F, ";"))
+    np.testing.assert_allclose(read_forces(tmp_path / "f.csv").time_s, np.arange(200) / hertz)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "Delta_X: e",
+        "Delta_X: -0.002",
+        "Sampling rate: 500 Hz, filter 100 Hz",
+        "Sampling rate: 1 000 Hz",
+        "Sample rate,500,250",
+        "Sampling rate: 500\nSampling rate: 250",
+        "Sampling rate: 2 ms",
+        "Sampling rate: 1e999",
+        "Sampling rate: 1,00 0,00.5",
+    ],
+)
+def test_a_rate_that_cannot_be_told_is_refused(head: str, tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text(f"{head}\nFx;Fy;Fz\n" + rows(F, ";"))
+    with pytest.raises(UserError):
+        read_forces(tmp_path / "f.csv")
+
+
 REFUSED = {
     "no header": plain(),
     "counts": "t,Fx (counts),Fy (counts),Fz (counts)\n" + plain(),
@@ -182,12 +248,21 @@ REFUSED = {
     "a row of text": "t,fx,fy,fz\n" + plain() + "mean,1,2,3\n",
     "no times": "fx,fy,fz\n" + rows(F),
     "cells too many": "t,fx,fy,fz\n0,5,1,2,3,4,5,6\n",
+    "a row that is cut off": "t,fx,fy,fz,other\n0,1,2,3,4\n1,1,2\n",
+    "a row of one cell": "t,fx,fy,fz,other\n0,1,2,3,4\n1\n",
     "a thousand or not": "t;fx;fy;fz\n1,482;2,111;3,222;4,333\n",
     "a frame's time code": "t,fx,fy,fz\n10:02:00:12,1,2,3\n10:02:00:13,1,2,3\n",
     "dates in either order": "t,fx,fy,fz\n01/02/2026 10:00:00,1,2,3\n01/04/2026 10:00:00,1,2,3\n",
     "minutes beyond": "t,fx,fy,fz\n10:72:00,1,2,3\n",
+    "tenths of a second": "time [0.1 s],fx,fy,fz\n" + plain(),
+    "ticks in a row of units": "time,fx,fy,fz\nticks,N,N,N\n" + plain(),
     "a spreadsheet": "PK\x03\x04\0\0\0",
 }
+
+
+def test_a_row_may_lack_what_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "f.csv").write_text("t,fx,fy,fz,other\n0,1,2,3,4\n1,1,2,3\n")
+    assert read_forces(tmp_path / "f.csv").force.tolist() == [[1, 2, 3], [1, 2, 3]]
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -85,6 +85,21 @@ def test_a_camera_without_pictures_is_refused(camera: Camera, monkeypatch: pytes
         Camera(Path("/dev/video9"))
 
 
+@pytest.mark.parametrize(
+    "picture", [np.zeros((24, 32, 5), np.uint8), np.broadcast_to(np.uint8(0), (8000, 8000, 3))]
+)
+def test_a_fault_in_the_reader_ends_the_stream(
+    picture: np.ndarray[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeCapture, "read", lambda self: (True, picture))
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    broken = Camera(Path("2"))
+    broken._thread.join(5)
+    assert broken._ends
+    with pytest.raises(UserError):
+        next(broken.pictures())
+
+
 def test_names_of_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("1").touch()

@@ -80,7 +80,7 @@ def test_a_result_is_yielded_as_soon_as_it_is_ready(needs_s: float, expected: li
             slow.set_result(super().submit(rgb, masked).result())
             return slow
 
-    clock = Mock(spare_s=lambda time_s: 0.04, free_s=lambda: 0.0)
+    clock = Mock(spare_s=lambda time_s: 0.04, wait_s=lambda: 0.0)
     clock.is_due = lambda index, time_s: log.append(f"due {index}") is None
     settings = RecordingFlowSettings("dis", 1, rate_hz=None, pulse=False, masks="none")
     footage = Footage(lambda: pictures(4), "test")
