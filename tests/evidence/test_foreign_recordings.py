@@ -34,7 +34,7 @@ def test_the_surface_interpolates_levels_and_nodes() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pulse", "two"])
+@pytest.mark.parametrize("kind", ["pulse", pytest.param("two", marks=pytest.mark.trial)])
 def test_a_recording_contains_the_prescribed_force(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -43,7 +43,7 @@ def test_a_stereo_stand_in_fits_its_calibration(tmp_path: Path, monkeypatch: pyt
     assert apart > 4, "the cameras are in different places"
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_a_pulsating_recording_scores_like_a_still_one(tmp_path: Path) -> None:
     def physics(frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         view, mm = GridView(scene.tissue, scene.scale_mm_per_px, GRID), np.float32(scene.scale_mm_per_px)

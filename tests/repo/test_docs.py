@@ -206,7 +206,7 @@ SMALL = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.trial
 def test_the_commands_that_measure_the_gap_run_in_small(tmp_path: Path) -> None:
     """Both networks are scored on both displacements of the same held-out sequences."""
     lines = re.findall(
