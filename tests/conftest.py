@@ -1,4 +1,4 @@
-"""For every test: one thread a process; tests/slow is slow; modules with slow tests come first."""
+"""For every test: one thread a process; what is named below is slow; modules with slow tests come first."""
 
 import os
 from pathlib import Path
@@ -9,12 +9,32 @@ import pytest
 os.environ["OMP_NUM_THREADS"] = "1"
 pytest_plugins = ["clip_fixtures"]
 
-SLOW = Path(__file__).parent / "slow"
+HOME = Path(__file__).parent
+SLOW = (
+    "slow",
+    "bench/methods/test_plugins.py",
+    "bench/recording/test_videos_as_recorded.py",
+    "bench/scoring",
+    "bench/importers/test_files_as_they_come.py",
+    "learn/data/test_one_split.py",
+    "learn/inference",
+    "learn/network/test_registry.py",
+    "repo/test_scripting.py",
+    "synth/checks/test_verify.py",
+    "synth/engine",
+    "synth/fem/external",
+    "synth/fem/test_brain_mesh.py",
+    "synth/fem/test_driven_contact.py",
+    "synth/recording_flow",
+    "synth/sequence/test_series_mechanics.py",
+)
+"""Folders and files below this one whose tests take five seconds or more together."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
-        if SLOW in item.path.parents:
+        path = item.path
+        if any((place := HOME / name) == path or place in path.parents for name in SLOW):
             item.add_marker(pytest.mark.slow)
     # A module is one process's: if a long one were the last, the other process would wait for it.
     slow = {item.path for item in items if item.get_closest_marker("slow")}
