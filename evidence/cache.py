@@ -14,9 +14,9 @@ from typing import Any
 
 from evidence.guard import guard
 from synth import formats
-from synth.dataset.folder import write_whole
 from synth.job import identity
 from synth.system import packages
+from synth.system.checked_file import write_whole
 
 
 @cache

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from synth.dataset.folder import write_whole
 from synth.publish.svg import svg
+from synth.system.checked_file import write_whole
 from synth.system.packages import machine
 
 if TYPE_CHECKING:

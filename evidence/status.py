@@ -15,7 +15,7 @@ from typing import Any
 from evidence.guard import guard
 from evidence.guard.guard import Change, Sketches
 from evidence.report import CHECKOUT, RESULTS
-from synth.dataset.folder import write_whole
+from synth.system.checked_file import write_whole
 
 _STATE = re.compile(r"^\*State: .*\*\n\n", re.M)
 _TITLE = re.compile(r"\A# .*\n\n")

@@ -15,6 +15,7 @@ from PIL import Image
 from bench.importers import dicom, igsio
 from bench.importers.registry import Intake, SecondView
 from bench.recording import sensor_table
+from bench.recording.folder import LATE_START_S
 from bench.recording.sensor_table import SINCE_1970_S, Readings
 from synth.arrays import Array, Floats
 from synth.errors import UserError
@@ -23,7 +24,6 @@ from synth.video import file_numbers
 from synth.video import read as video
 from synth.video.read import VideoFile
 
-_LATE_START_S = 2e-3  # of a first picture, from which it is said
 _GAP_S = 1.5  # between chapters, from which it is one: dates are in whole seconds
 _AT_ONCE = 16  # pages of a stack
 _Pictures = Callable[[], Iterator[Array]]
@@ -97,7 +97,7 @@ def _open(
             notes.append(
                 f"{source}: {damaged} of {len(times)} pictures are damaged in the file: copy it again"
             )
-        if (late_s := video.find_start(film)) > _LATE_START_S:
+        if (late_s := video.find_start(film)) > LATE_START_S:
             notes.append(
                 f"{source}: its first picture is {late_s:.3f} s after the start of its file, as "
                 "after sound; times "

@@ -17,7 +17,7 @@ from scipy.spatial import Delaunay
 
 from synth.arrays import Floats, Ints
 from synth.fem import surface_embedding
-from synth.fem.condensation import condense
+from synth.fem.condensation import condense, degrees_of_freedom
 from synth.fem.membrane import MembraneSheet, lay
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import quadrature
@@ -130,8 +130,8 @@ class _Surface:
         if tissue.membrane:
             sheet = MembraneSheet(tissue.membrane, tissue.stretch)
             stiffness = stiffness + lay(volume, sheet, linear=tissue.stretch <= 1).rest_stiffness()
-        at = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        return np.asarray(stiffness.tocsr()[at][:, at].toarray(), np.float64)
+        rows = degrees_of_freedom(self.nodes)
+        return np.asarray(stiffness.tocsr()[rows][:, rows].toarray(), np.float64)
 
 
 Block = Literal["held", "free"]
@@ -168,7 +168,7 @@ def _motion(embedding: Embedding, window: Ints) -> Floats:
     """
     count = embedding.value.shape[0]
     moved = np.kron(embedding.value[:, window].toarray(), np.eye(3)).reshape(count, 3, -1)
-    spin = embedding.spin[:, (3 * window[:, None] + np.arange(3)).ravel()].toarray()
+    spin = embedding.spin[:, degrees_of_freedom(window)].toarray()
     turned = embedding.corner @ embedding.mean @ spin.reshape(len(embedding.mean), -1)
     moved += np.cross(turned.reshape(moved.shape), embedding.arm[:, :, None], axis=1)
     return np.asarray(np.einsum("ab,vbw->avw", TO_CAMERA, moved).reshape(3 * count, -1), np.float64)

@@ -40,7 +40,7 @@ S = TypeVar("S", bound=Section)
 Video = VideoFile | dict[int, Path]  # a file, or pictures by the numbers in their names, in order
 
 _LARGEST_FORCE_N = 50.0
-_LATE_START_S = 2e-3  # of a first picture, from which it is said
+LATE_START_S = 2e-3  # of a first picture, from which it is said
 _EPOCH_S = 1e8  # three years, longer than any recording: larger times count from 1970
 
 
@@ -189,7 +189,7 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
 def _describe_start(footage: VideoFile) -> list[str]:
     """A note on a video whose first picture is not at the start of its file."""
     late_s = video.find_start(footage)
-    if late_s < _LATE_START_S:
+    if late_s < LATE_START_S:
         return []
     what = "the start of its file" if footage.from_file else "that picture"
     return [

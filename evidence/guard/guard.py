@@ -22,7 +22,7 @@ from evidence import report
 from evidence.guard.probes import PROBES
 from evidence.guard.sketch import Sketch, compare_all, sketch_all
 from synth import formats
-from synth.dataset.folder import write_whole
+from synth.system.checked_file import write_whole
 
 FILE = report.RESULTS / "guard.json"
 _WORKERS = 2

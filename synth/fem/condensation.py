@@ -40,7 +40,7 @@ def condense(stiffness: sp.csr_array, points: Floats, cells: Ints, kept: Ints, f
     front = mesh.eliminate(np.arange(len(cells)), np.flatnonzero(inner))
     whole = mesh.entries(kept, kept)
     order = np.argsort(kept)
-    place = _degrees(order[np.searchsorted(kept, front.nodes, sorter=order)])
+    place = degrees_of_freedom(order[np.searchsorted(kept, front.nodes, sorter=order)])
     whole[np.ix_(place, place)] += front.update
     return whole
 
@@ -77,7 +77,7 @@ class _Mesh:
         front[own:, :own] = front[:own, own:].T
         order = np.argsort(every)
         for half in halves:
-            place = _degrees(order[np.searchsorted(every, half.nodes, sorter=order)])
+            place = degrees_of_freedom(order[np.searchsorted(every, half.nodes, sorter=order)])
             front[np.ix_(place, place)] += half.update
         root = cholesky(front[:own, :own], lower=True, check_finite=False)
         taken = solve_triangular(root, front[:own, own:], lower=True, check_finite=False)
@@ -85,9 +85,9 @@ class _Mesh:
 
     def entries(self, rows: Ints, columns: Ints) -> Floats:
         """The stiffness (3 R, 3 C) between nodes (R,) and (C,)."""
-        across = _degrees(columns)
+        across = degrees_of_freedom(columns)
         self.column[across] = np.arange(len(across))
-        part = sp.coo_array(self.stiffness[_degrees(rows)])
+        part = sp.coo_array(self.stiffness[degrees_of_freedom(rows)])
         place = self.column[part.col]
         self.column[across] = -1
         dense, used = np.zeros((3 * len(rows), len(across))), place >= 0
@@ -111,6 +111,6 @@ def _width(cut: _Cut) -> int:
     return len(cut[2])
 
 
-def _degrees(nodes: Ints) -> Ints:
+def degrees_of_freedom(nodes: Ints) -> Ints:
     """Degrees of freedom (3 n,) of nodes (n,)."""
     return np.asarray((3 * nodes[:, None] + np.arange(3)).ravel())
