@@ -1,9 +1,9 @@
-from .importers.registry import Intake as Intake
-from .importers.registry import SecondView as SecondView
-from .methods.protocol import ForceEstimate as ForceEstimate
-from .methods.protocol import FrameMotion as FrameMotion
-from .methods.protocol import Method as Method
-from .methods.protocol import MethodContext as MethodContext
+from .importers.importer_registry import Intake as Intake
+from .importers.importer_registry import SecondView as SecondView
+from .methods.method_interface import ForceEstimate as ForceEstimate
+from .methods.method_interface import FrameMotion as FrameMotion
+from .methods.method_interface import Method as Method
+from .methods.method_interface import MethodContext as MethodContext
 from .recording.from_sequence import export_recording as export_recording
 from .scoring.result import Result as Result
 from .scoring.score import Settings as Settings

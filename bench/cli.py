@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from bench.importers.formats import list_endings
+from bench.importers.import_formats import list_endings
 from synth.errors import UserError, as_user_error
 from synth.system.cli_errors import Commands, printable
 
@@ -62,10 +62,10 @@ def score(
     from threadpoolctl import threadpool_limits
 
     from bench.methods.network import Model
-    from bench.recording.folder import open_recording
+    from bench.recording.recording_folder import open_recording
     from bench.scoring import score as scoring
     from bench.scoring.result import as_json
-    from learn.inference.shipped import choose_model
+    from learn.inference.shipped_networks import choose_model
     from learn.training.threads import choose_threads
     from synth.video.mask_files import read_choice
 
@@ -98,7 +98,7 @@ def _print_result(result: Result, folder: Path) -> None:
     from rich.console import Console
 
     from bench.scoring.headline import headline
-    from bench.scoring.report import terminal_table
+    from bench.scoring.score_report import terminal_table
 
     console, first = Console(), headline(result)
     doubt = [one.message for one in result.tracked.doubt]
@@ -159,7 +159,7 @@ def check(
     from dataclasses import asdict
 
     from bench.checks.check_recording import check_recording
-    from synth.recording_flow.finding import first_fault
+    from synth.flow.recording.finding import first_fault
     from synth.system.checked_file import make_folder
     from synth.system.terminal import hang
 
@@ -211,16 +211,16 @@ def import_(
     json: Json = False,
 ) -> None:
     """Converts another system's recording into a recording folder."""
-    from bench.importers import registry
+    from bench.importers import importer_registry
     from synth.system.terminal import counting
     from synth.video.pixel_scale import read_scale
 
-    found = registry.read_source(source, _pairs("--use", use, "ROLE=NAME"), stereo_layout)
+    found = importer_registry.read_source(source, _pairs("--use", use, "ROLE=NAME"), stereo_layout)
     about: dict[str, object] = {"young_kpa": young if young is not None else "unknown"}
     if scale is not None:
         about["scale_mm_per_px"] = read_scale(scale)
     with counting(f"importing {source.name}", len(found.times_s)) as progress:
-        registry.write_recording(found, out, newtons, about, progress)
+        importer_registry.write_recording(found, out, newtons, about, progress)
     notes = list(found.notes)
     if scale is None:
         notes.append("meta.yaml still needs scale_mm_per_px or calibration")
@@ -248,7 +248,7 @@ def from_dataset(
     """Writes sealed sequences as recording folders, to be scored like real recordings."""
     from bench.recording.from_sequence import export_recording, force_of
     from learn.checkpoint import read_card
-    from learn.inference.shipped import find_model
+    from learn.inference.shipped_networks import find_model
     from synth.dataset.store import Dataset
 
     chosen = [s for s in Dataset(dataset) if sequence is None or s.index == sequence]
@@ -298,14 +298,14 @@ def live(
     from bench.methods.network import Model
     from bench.tracking import live
     from bench.tracking.capture import Camera, is_camera
-    from learn.inference.shipped import choose_model
+    from learn.inference.shipped_networks import choose_model
     from learn.training.threads import choose_threads
     from synth.flow.estimator import name_motion
-    from synth.recording_flow.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
-    from synth.recording_flow.flow import open_flow_process
+    from synth.flow.recording.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
+    from synth.flow.recording.flow import open_flow_process
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import UNKNOWN_NOTE, read_scale
-    from synth.video.read import FPS, read_mask, read_video
+    from synth.video.read_video import FPS, read_mask, read_video
 
     kind, files = read_choice(masks)
     filmed = is_camera(video)

@@ -14,7 +14,7 @@ from synth.publish.contact_sheet import poised
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence import scenario
-from synth.sequence.scene import RestScene, at_rest
+from synth.sequence.rest_scene import RestScene, at_rest
 from synth.tune.search import changed
 
 Settings = dict[str, Any]  # values of a job's dotted keys

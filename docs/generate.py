@@ -22,7 +22,7 @@ from bench.checks import protocol
 from bench.recording.meta import Meta
 from synth.dataset.size_forecast import amount, field_bytes
 from synth.fields import FIELDS, STORED_WHEN, TIME
-from synth.job import writer
+from synth.job import job_writer
 from synth.job.schema import Job
 from synth.system.config_file import section_of
 
@@ -194,10 +194,10 @@ def _keys(section: BaseModel, at: str) -> list[str]:
             inner += _keys(default, f"{at}{name}.")
             continue
         meaning = _sentence(field.description or (below.__doc__ if below else ""))
-        limits = writer.limits(type(section), name)
+        limits = job_writer.limits(type(section), name)
         if limits:
             meaning += f" {limits}"
-        value = "" if field.is_required() else writer.scalar(default)
+        value = "" if field.is_required() else job_writer.scalar(default)
         shown = "needed" if field.is_required() else f"`{value}`" if value else "–"
         rows.append(f"| `{name}` | {shown} | {_cell(meaning)} |")
         if below is not None:

@@ -7,7 +7,7 @@ from typer.core import TyperGroup
 
 from evidence import all as everything
 from evidence import report, study
-from evidence import status as states
+from evidence import result_status as states
 from evidence.guard import guard
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evidence import report, status, study
+from evidence import report, result_status, study
 
 Step = tuple[str, Sequence[str]]
 """Its name, and the arguments after `python`."""
@@ -61,7 +61,7 @@ def main(
 
 def standing() -> set[str]:
     """Names of the studies all of whose results stand."""
-    state = {str(one.file.relative_to(report.RESULTS)): one.stands for one in status.gather()}
+    state = {str(one.file.relative_to(report.RESULTS)): one.stands for one in result_status.gather()}
     results = {name: study.load(name).result for name in study.names()}
     files = {name: [file for file in state if fnmatch(file, result)] for name, result in results.items()}
     return {name for name, mine in files.items() if mine and all(state[file] for file in mine)}

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from bench.recording.folder import open_recording
-from bench.recording.pixel_scale import find_scale
+from bench.recording.recording_folder import open_recording
+from bench.recording.recording_scale import find_scale
 from bench.tracking.tracking import track_recording
-from evidence import cache, report, status, training
+from evidence import report, result_cache, result_status, training
+from evidence.bootstrap import difference
 from evidence.foreign.recordings import TRUTH
-from evidence.intervals import difference
 from evidence.pooled import FOLDERS
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
@@ -33,8 +33,8 @@ from learn.settings import replace as changed
 from learn.split import Split, groups
 from synth.arrays import Floats, Map
 from synth.errors import UserError
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.frame_motion import FrameMotion
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.frame_motion import FrameMotion
 
 Errors = Mapping[str, list[float | None]]  # by test, of each sequence [mN]
 Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
@@ -98,7 +98,7 @@ def measure(
     }
     sizes = (split.fit, split.select, *tested)
     return {
-        "data": status.data(dataset, unseen),
+        "data": result_status.data(dataset, unseen),
         "settings": settings.model_dump(),
         "held_out": unseen.name,
         "sequences": dict(zip(("fit", "select", "test", "unseen", "foreign"), map(len, sizes), strict=True)),
@@ -126,7 +126,7 @@ def foreign(folder: Path, grid: Grid) -> Clip:
     density[:, :, grid.size // 2, grid.size // 2] = force[at] / (young * grid.pitch_mm**2)
     return Clip(
         name=folder.name,
-        content_hash=status.content(folder / TRUTH),
+        content_hash=result_status.content(folder / TRUTH),
         group=folder.name,
         young_kpa=young,
         mask=view.mask,
@@ -187,8 +187,8 @@ def errors(
 
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
     tested = {test: [clip.content_hash for clip in part] for test, (part, _) in tests.items()}
-    key = cache.key(name, settings.model_dump(), used, tested)
-    done: Errors = cache.result(work / "runs", name, key, compute)
+    key = result_cache.key(name, settings.model_dump(), used, tested)
+    done: Errors = result_cache.result(work / "runs", name, key, compute)
     return done
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import typer
 
-from evidence import report, status
+from evidence import report, result_status
 from learn.training.threads import set_threads
 
 _HOME = Path(__file__).parent
@@ -72,9 +72,9 @@ def command(name: str) -> Any:
             study.measure(**options)
             return
         folder = options.pop("out")
-        data = dict(study.measure(**options) or {}) | status.stamp(study.needs, study.timed)
+        data = dict(study.measure(**options) or {}) | result_status.stamp(study.needs, study.timed)
         report.save(folder, result.name, data, study.page)
-        status.write_states(folder)
+        result_status.write_states(folder)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     app = typer.Typer(add_completion=False)

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from evidence import cache
+from evidence import result_cache
 from learn.data.clips import Clip
 from learn.inference.predict import Predictor, load_model
 from learn.settings import TrainingSettings
 from learn.split import Split, groups
 from learn.training.train import train
-from synth.dataset.split import draw_groups
+from synth.dataset.sequence_split import draw_groups
 from synth.formats import CLIPS
 
 
@@ -46,7 +46,7 @@ def fit(
     `name`: part of the key, next to settings and the clips' hashes.
     """
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
-    key = cache.key(settings.model_dump(), used, CLIPS, versions=("TRAINING",))
+    key = result_cache.key(settings.model_dump(), used, CLIPS, versions=("TRAINING",))
     model = folder / f"{name}-{key}"
     train(clips, split, settings, model, device=device)
     return load_model(model)

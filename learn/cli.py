@@ -69,7 +69,7 @@ def train_command(
     from learn.checkpoint import disk_needed, read_model
     from learn.evaluation.fit_intervals import add_intervals
     from learn.inference.predict import load_model
-    from learn.inference.shipped import find_model
+    from learn.inference.shipped_networks import find_model
     from learn.settings import change_preset
     from learn.training.threads import choose_device, set_threads
     from learn.training.train import train
@@ -228,10 +228,10 @@ def predict_command(
     Exit code 2 if no frame has a force.
     """
     from learn.inference.apply import open_source
-    from learn.inference.motion import VideoOptions
     from learn.inference.prediction_file import predict_files
+    from learn.inference.video_motion import VideoOptions
     from learn.training.threads import choose_threads
-    from synth.recording_flow.decode import RecordingFlowSettings
+    from synth.flow.recording.decode import RecordingFlowSettings
     from synth.video.mask_files import read_choice
     from synth.video.pixel_scale import read_scale
 
@@ -265,8 +265,8 @@ def calibrate_command(
 ) -> None:
     """Fit Young's modulus to presses of known force."""
     from learn.inference.apply import calibrate
-    from learn.inference.motion import motions
     from learn.inference.predict import load_model
+    from learn.inference.video_motion import motions
     from learn.training.threads import choose_threads
 
     if wrong := [one for one in data if one.suffix not in (".npz", ".zarr")]:
@@ -288,7 +288,7 @@ def export_command(
 ) -> None:
     """Write a model as ONNX for other programs, checked against PyTorch to 1e-4."""
     from learn.inference.export import export
-    from learn.inference.shipped import find_model
+    from learn.inference.shipped_networks import find_model
 
     worst = export(find_model(model), file)
     _console.print(f"{file}: differs from PyTorch by at most {worst:.1e} of full scale")
@@ -298,7 +298,7 @@ def export_command(
 def models_command(json: Json = False) -> None:
     """List the pretrained networks."""
     from learn.checkpoint import read_card
-    from learn.inference.shipped import LICENCE, MODELS, NAMES, describe, hash_data
+    from learn.inference.shipped_networks import LICENCE, MODELS, NAMES, describe, hash_data
     from synth.system.checked_file import folder_bytes
 
     found = {name: (MODELS / name, read_card(MODELS / name)) for name in NAMES}

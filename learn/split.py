@@ -14,7 +14,7 @@ from learn.data.clips import Clip
 from learn.uncertainty import conformal
 from learn.uncertainty.conformal import LEVELS
 from synth.dataset.index import read_split
-from synth.dataset.split import SIDES, DatasetSplit, find_crossings, join_groups
+from synth.dataset.sequence_split import SIDES, DatasetSplit, find_crossings, join_groups
 from synth.errors import UserError
 
 Note = Callable[[str], None]  # receives warnings about a split

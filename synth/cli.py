@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from synth.errors import UserError, as_user_error
-from synth.publish.export.registry import EXPORTERS
+from synth.publish.export.exporter_registry import EXPORTERS
 from synth.system.cli_errors import Commands
 
 if TYPE_CHECKING:
@@ -102,9 +102,9 @@ def new(
     series: Annotated[Path | None, Option("--from-series", help="For files as of mechanics.source.")] = None,
 ) -> None:
     """Writes a job file in which every key is explained, or one for another program's simulation."""
-    from synth.job import writer
+    from synth.job import job_writer
 
-    text = writer.commented()
+    text = job_writer.commented()
     if series is not None:
         from synth.publish.series_job import as_job  # here, as it imports the finite elements
 
@@ -117,9 +117,9 @@ def new(
 @app.command(epilog="Example: synth schema > job.schema.json")
 def schema() -> None:
     """Prints the JSON schema of job files, for editors."""
-    from synth.job import writer
+    from synth.job import job_writer
 
-    print(json_.dumps(writer.schema(), indent=2))
+    print(json_.dumps(job_writer.schema(), indent=2))
 
 
 @app.command(epilog="Example: synth preview demo --count 9 --out sheet.png")
@@ -141,7 +141,7 @@ def preview(
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
     from synth.dataset.size_forecast import amount, estimate
-    from synth.fem.external.read import read_job_series
+    from synth.fem.external.read_series import read_job_series
     from synth.job import reader
     from synth.publish import contact_sheet, openings
     from synth.system.checked_file import write_picture
@@ -179,7 +179,7 @@ def _read_series(job: Job) -> tuple[str, ...]:
     """Reads the first series of a job with `mechanics.source`, says what it is, and what is doubtful."""
     if job.mechanics.source is None:
         return ()
-    from synth.fem.external.read import forget, read_job_series
+    from synth.fem.external.read_series import forget, read_job_series
 
     series = read_job_series(job, 0)
     print(f"mechanics.source: {series.summary}", file=sys.stderr)
@@ -214,7 +214,7 @@ def render(
     json: Json = False,
 ) -> None:
     """Renders the dataset of a job. Exit code 1 if some of its sequences failed."""
-    from synth.dataset.folder import Folder, parse_part
+    from synth.dataset.dataset_folder import Folder, parse_part
     from synth.engine.journal import RunBars
     from synth.engine.run import Options, run_job
     from synth.job.reader import load_job
@@ -269,16 +269,18 @@ def split_command(
     json: Json = False,
 ) -> None:
     """Replaces the split of a dataset. No anatomy is on two sides, no held-out family in training."""
-    from synth.dataset import index, split
-    from synth.dataset.folder import Folder
+    from synth.dataset import index, sequence_split
+    from synth.dataset.dataset_folder import Folder
     from synth.publish.card import write_card
 
     folder = Folder(out)
     radius_mm = folder.job().anatomy.craniotomy.radius_mm
-    chosen = split.parse_rule(by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening"))
+    chosen = sequence_split.parse_rule(
+        by, shares, hold_out or [], share_anatomy, 2 * radius_mm * (by == "opening")
+    )
     rows = index.write_index(folder, chosen)
     write_card(folder)
-    counts = split.count(rows)
+    counts = sequence_split.count(rows)
     if chosen.share_anatomy:
         print("warning: sides may share a brain: test scores don't hold for other brains", file=sys.stderr)
     print(json_.dumps(counts) if json else ", ".join(f"{side} {n}" for side, n in counts.items()))
@@ -287,7 +289,7 @@ def split_command(
 @app.command(epilog="Example: synth report out")
 def report(out: Out) -> None:
     """Writes a dataset's description, README.md, again; new sequences get a side of the split."""
-    from synth.dataset.folder import Folder
+    from synth.dataset.dataset_folder import Folder
     from synth.dataset.index import write_index
     from synth.publish.card import write_card
 
@@ -313,7 +315,7 @@ def export(
     interval: Annotated[str | None, Option(help="Time range of a video: FIRST:LAST in seconds.")] = None,
 ) -> None:
     """Exports a dataset to the format of another library, or as videos."""
-    from synth.publish.export.registry import export_dataset
+    from synth.publish.export.exporter_registry import export_dataset
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # which removes what is half-written
     options = {}

@@ -25,7 +25,7 @@ SLOW = (
     "synth/fem/external",
     "synth/fem/test_brain_mesh.py",
     "synth/fem/test_driven_contact.py",
-    "synth/recording_flow",
+    "synth/flow/recording",
     "synth/sequence/test_series_mechanics.py",
 )
 """Folders and files below this one whose tests take five seconds or more together."""

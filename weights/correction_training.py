@@ -26,7 +26,7 @@ from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import depth_correction
 from synth.flow.stereo.depth_motion import Change
 from synth.flow.stereo.rig import Intrinsics, StereoRig
-from synth.flow.stereo.track import Moved, StereoTracker, still_frames
+from synth.flow.stereo.stereo_track import Moved, StereoTracker, still_frames
 from synth.flow.track import Tracker, track
 from synth.flow.tvl1 import Tvl1
 from weights.networks import CorrectionNet, follow

@@ -8,7 +8,7 @@ from evidence import report
 from evidence.learn.shipped import listed, measure
 from learn import checkpoint
 from learn.checkpoint import ModelCard
-from learn.inference import shipped
+from learn.inference import shipped_networks
 from learn.inference.convert import add_onnx
 from learn.inference.predict import load_model
 from synth.errors import UserError
@@ -33,11 +33,11 @@ def pack(models: Path, data: list[Path], cache: Path | None = None) -> None:
     `data`: the dataset that they were fitted on, then others; `cache`: folder for packed arrays.
     """
     rows = measure(data, models, cache)["rows"]
-    for name in shipped.NAMES:
+    for name in shipped_networks.NAMES:
         own = [row for row in rows if row["model"] == name]
         stereo = load_model(models / name).card.settings.arch.depth
         limits = _LIMITS if stereo else (*_LIMITS, *_MONOCULAR)
-        pack_model(models / name, shipped.MODELS / name, report.commit(), listed(own), limits)
+        pack_model(models / name, shipped_networks.MODELS / name, report.commit(), listed(own), limits)
 
 
 def pack_model(
@@ -53,9 +53,13 @@ def pack_model(
     shutil.rmtree(folder, ignore_errors=True)
     checkpoint.write_model(folder, card, net.state_dict())
     card = add_onnx(folder)
-    line = shipped.describe(card)
-    licence = f"{shipped.LICENCE}, as of the code: trained on this project's renders alone"
-    rows = {"data (hash of its sequences)": shipped.hash_data(card), "licence": licence, "commit": commit}
+    line = shipped_networks.describe(card)
+    licence = f"{shipped_networks.LICENCE}, as of the code: trained on this project's renders alone"
+    rows = {
+        "data (hash of its sequences)": shipped_networks.hash_data(card),
+        "licence": licence,
+        "commit": commit,
+    }
     rows |= metrics
     table = "\n".join(f"| {what} | {value} |" for what, value in rows.items())
     bullets = "\n".join(f"- {one}" for one in limits)

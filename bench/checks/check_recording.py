@@ -11,16 +11,16 @@ import numpy as np
 
 from bench.checks.judgement import judge
 from bench.checks.protocol import check_protocol
-from bench.recording import pixel_scale
-from bench.recording.folder import Recording, open_recording
+from bench.recording import recording_scale
+from bench.recording.recording_folder import Recording, open_recording
 from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.arrays import Mask
 from synth.errors import UserError
 from synth.flow.confidence import LOW_CONFIDENCE
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.finding import Finding, by_severity
+from synth.flow.recording.frame_motion import FrameMotion
 from synth.publish.picture import Rgb, arrow_gain, arrows, framed, legible, overlay, tile
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import Finding, by_severity
-from synth.recording_flow.frame_motion import FrameMotion
 from synth.system.checked_file import write_picture
 
 _TRIED = 12  # frames that are tracked to test whether tracking works
@@ -40,7 +40,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         return [Finding("error", "recording", str(error))]
     mm_per_px, failed = 0.0, list[Finding]()
     with suppress(UserError):  # `check_scale` reports it
-        mm_per_px = pixel_scale.find_scale(recording.meta, recording.folder).mm_per_px
+        mm_per_px = recording_scale.find_scale(recording.meta, recording.folder).mm_per_px
     try:
         tracked = _track_some(recording, mm_per_px or 1.0, picture)
     except UserError as error:

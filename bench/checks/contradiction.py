@@ -19,7 +19,7 @@ from scipy.special import betainc
 from bench.checks.sensor import LEAST_FRAMES, SensorMotion
 from learn.uncertainty.intervals import LEVEL
 from synth.arrays import Floats, Mask
-from synth.recording_flow.finding import Finding
+from synth.flow.recording.finding import Finding
 
 _HELD = 0.6  # coverage of the interval from which it isn't reported; by hand
 _CHANCE = 0.05  # largest probability of such a coverage by chance

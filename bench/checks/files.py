@@ -6,12 +6,12 @@ from contextlib import suppress
 
 import numpy as np
 
-from bench.recording import pixel_scale
-from bench.recording.folder import Recording
+from bench.recording import recording_scale
+from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.errors import UserError
-from synth.recording_flow.finding import Finding, judge_scale, judge_young
-from synth.video.read import VideoFile, find_length, find_start
+from synth.flow.recording.finding import Finding, judge_scale, judge_young
+from synth.video.read_video import VideoFile, find_length, find_start
 
 _FEW = 0.02  # share of the frames lost, from which it is a warning; by hand
 _MASKS_READ, _INVERTED = 5, 0.5  # masks looked at; median white share that no instrument has; by hand
@@ -83,7 +83,7 @@ def check_stiffness(recording: Recording) -> list[Finding]:
 def check_scale(recording: Recording) -> list[Finding]:
     """Findings on the stated or calibrated scale."""
     try:
-        found = pixel_scale.find_scale(recording.meta, recording.folder)
+        found = recording_scale.find_scale(recording.meta, recording.folder)
     except UserError as error:
         return [Finding("error", "scale", str(error))]
     message = f"{found.mm_per_px:.4g} mm/px ± {100 * found.uncertainty:.2g}% ({found.source})"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bench.checks import contradiction, files, sensor, stereo, times
+from bench.checks import camera_pair, contradiction, files, sensor, times
 from bench.checks.sensor import SensorMotion
-from bench.recording.folder import Recording
+from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
-from synth.recording_flow.finding import Finding, by_severity, first_fault
+from synth.flow.recording.finding import Finding, by_severity, first_fault
 
 # Of the files alone.
 RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
@@ -24,9 +24,9 @@ TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ..
     files.check_tool,
     files.check_tracking,
     files.check_field_of_view,
-    stereo.check_pairing,
-    stereo.check_quality,
-    stereo.check_scale,
+    camera_pair.check_pairing,
+    camera_pair.check_quality,
+    camera_pair.check_scale,
     times.check_times,
     times.check_spans,
     times.check_overlap,

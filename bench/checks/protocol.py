@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import find_peaks
 
-from bench.recording.folder import Recording
-from synth.recording_flow.finding import Finding
+from bench.recording.recording_folder import Recording
+from synth.flow.recording.finding import Finding
 from synth.system.checked_file import read_yaml
 
 # Whether a recording has a step of protocol.yaml; of the others its files don't tell.

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.fusion import Fusion
-from bench.methods.protocol import Method
-from bench.recording.folder import Recording
+from bench.methods.force_fusion import Fusion
+from bench.methods.method_interface import Method
+from bench.recording.recording_folder import Recording
 from bench.recording.sensor_table import find_bias
 from bench.sensor.alignment import AlignedSensor
 from bench.sensor.drift import Drift
@@ -18,7 +18,7 @@ from bench.sensor.force_sensor import process_force
 from bench.tracking.tracking import TrackedRecording
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
-from synth.recording_flow.finding import Finding
+from synth.flow.recording.finding import Finding
 
 _SURGICAL_MN = 5000.0  # force on a brain from which the unit is doubtful; by hand
 _MOVED_MM = 0.02  # least mean motion that is not noise of the flow; by hand

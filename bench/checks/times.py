@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from bench.recording.clocks import find_other_unit
-from bench.recording.folder import Recording
 from bench.recording.meta import LEAST_INTERVALS, LEAST_TURNING
+from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.arrays import Floats
-from synth.recording_flow.finding import Finding
+from synth.flow.recording.finding import Finding
 
 # Chosen by hand.
 _GAP = 3.0  # median intervals

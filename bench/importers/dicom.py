@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.importers.registry import LARGEST_BYTES, MOST_FRAMES
+from bench.importers.importer_registry import LARGEST_BYTES, MOST_FRAMES
 from synth.arrays import Array, Floats
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
-from synth.video.read import read_video
+from synth.video.read_video import read_video
 
 SUFFIXES = (".dcm", ".dicom")
 _VIDEO = "1.2.840.10008.1.2.4.10"  # what the transfer syntaxes of MPEG-2, H.264 and H.265 begin with

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.importers.registry import MOST_FRAMES, ROLES, Intake, one_of
+from bench.importers.importer_registry import MOST_FRAMES, ROLES, Intake, one_of
 from synth.errors import UserError
 from synth.system.checked_file import refuse_large
 

@@ -11,13 +11,13 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from bench.importers.registry import LARGEST_BYTES, MOST_FRAMES, Intake, one_of
+from bench.importers.importer_registry import LARGEST_BYTES, MOST_FRAMES, Intake, one_of
 from bench.recording.sensor_table import Readings
 from synth.arrays import Floats, Pixels
 from synth.errors import UserError, first_line
 from synth.system import checked_file
 from synth.system.checked_file import refuse_large
-from synth.video import read as video
+from synth.video import read_video as video
 
 SUFFIXES = (".mha",)
 _LONGEST_LINE = 65536

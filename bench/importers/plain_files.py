@@ -13,16 +13,16 @@ import numpy as np
 from PIL import Image
 
 from bench.importers import dicom, igsio
-from bench.importers.registry import Intake, SecondView
+from bench.importers.importer_registry import Intake, SecondView
 from bench.recording import sensor_table
-from bench.recording.folder import LATE_START_S
+from bench.recording.recording_folder import LATE_START_S
 from bench.recording.sensor_table import SINCE_1970_S, Readings
 from synth.arrays import Array, Floats
 from synth.errors import UserError
 from synth.system import checked_file
 from synth.video import file_numbers
-from synth.video import read as video
-from synth.video.read import VideoFile
+from synth.video import read_video as video
+from synth.video.read_video import VideoFile
 
 _GAP_S = 1.5  # between chapters, from which it is one: dates are in whole seconds
 _AT_ONCE = 16  # pages of a stack

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from bench.importers.registry import LARGEST_BYTES, Intake, SecondView, one_of
+from bench.importers.importer_registry import LARGEST_BYTES, Intake, SecondView, one_of
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file

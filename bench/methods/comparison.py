@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from bench.methods import plugins
+from bench.methods import method_plugins
+from bench.methods.method_interface import Method
 from bench.methods.physics import Physics
-from bench.methods.protocol import Method
 from synth.errors import UserError
 
 # Names of the methods in tables, reports and score.json.
@@ -16,7 +16,7 @@ FUSION = "network and physics"
 def simpler_methods() -> dict[str, Method]:
     """Physics and the plug-ins of installed packages. UserError if one has the name of a method of ours."""
     methods: dict[str, Method] = {PHYSICS: Physics()}
-    others = plugins.installed()
+    others = method_plugins.installed()
     if taken := {FUSION, MAIN, *methods} & set(others):
         raise UserError(f"method {min(taken)}: this name is reserved; rename the plug-in's method")
     return methods | others

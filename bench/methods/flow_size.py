@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from synth.arrays import Floats
 
 PEAK_PERCENTILE = 98.0  # for the largest displacement, without outliers of flow at edges; by hand

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from bench.methods.force_mixture import ForceMixture
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from learn import Predictor, load_model
 from learn.inference.force_estimator import ForceEstimator
-from learn.inference.shipped import find_name
+from learn.inference.shipped_networks import find_name
 from learn.uncertainty.intervals import LEVEL
 from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 

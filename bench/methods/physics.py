@@ -17,14 +17,20 @@ from scipy.special import softmax
 from bench.methods import compliance, posterior
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
+from bench.methods.method_interface import (
+    Field,
+    ForceEstimate,
+    FrameMotion,
+    MethodContext,
+    widen_small_forces,
+)
 from bench.methods.posterior import Observation, Posterior
-from bench.methods.protocol import Field, ForceEstimate, FrameMotion, MethodContext, widen_small_forces
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
 from synth.flow.confidence import deviation
+from synth.flow.recording.find_tissue import touches_border
 from synth.job.types import MembraneState
-from synth.recording_flow.find_tissue import touches_border
 
 GRID = Grid(48)
 

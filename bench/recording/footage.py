@@ -1,4 +1,4 @@
-"""A recording as the video that `synth.recording_flow` tracks, with its right or depth camera."""
+"""A recording as the video that `synth.flow.recording` tracks, with its right or depth camera."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from functools import partial
 import cv2
 import numpy as np
 
-from bench.recording.folder import Recording
 from bench.recording.meta import Depth
+from bench.recording.recording_folder import Recording
 from synth.arrays import Floats, Map
 from synth.errors import UserError, as_user_error
+from synth.flow.recording.decode import Footage
+from synth.flow.recording.finding import Finding
+from synth.flow.recording.frame_motion import FrameMotion, Size
+from synth.flow.recording.stereo_motion import DepthVideo, RightVideo
 from synth.flow.stereo import calibration
-from synth.recording_flow.decode import Footage
-from synth.recording_flow.finding import Finding
-from synth.recording_flow.frame_motion import FrameMotion, Size
-from synth.recording_flow.stereo import DepthVideo, RightVideo
 from synth.system import checked_file
 
 _REGION = Finding("missing", "tissue", "no tissue.png: the whole region is assumed to be tissue")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.recording import writer
+from bench.recording import recording_writer
 from synth.arguments import checked
 from synth.arrays import Floats
-from synth.checks import optics, stereo
+from synth.checks import optics, stereo_checks
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.system import checked_file
@@ -47,13 +47,15 @@ def export_recording(sequence: Sequence, folder: str | Path, instrument: int | N
                 checked_file.write_picture(part / "masks" / f"{t:06d}.png", tool.astype(np.uint8) * 255)
         tissue = np.asarray(sequence["tissue"][:], bool)
         checked_file.write_picture(part / "tissue.png", tissue.astype(np.uint8) * 255)
-        writer.write_force(part, time, force / 1000)
-        writer.write_frames(part, time)
+        recording_writer.write_force(part, time, force / 1000)
+        recording_writer.write_frames(part, time)
         if "rgb_right" in sequence:
             _write_pictures(sequence, "rgb_right", part / "right")
-            writer.write_pair(part / _PAIR, optics.camera_of(sequence), stereo.right_of(sequence))
+            recording_writer.write_pair(
+                part / _PAIR, optics.camera_of(sequence), stereo_checks.right_of(sequence)
+            )
             about["stereo"] = {"calibration": _PAIR}
-        writer.write_meta(part, about)
+        recording_writer.write_meta(part, about)
     return Path(folder)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from synth.errors import UserError
+from synth.job.job_writer import section_lines
 from synth.job.types import MembraneState, Section
-from synth.job.writer import section_lines
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Mistake
 

@@ -12,12 +12,12 @@ from bench.recording.stereo_timing import StereoTiming
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow import image
+from synth.flow.recording import stereo_motion
+from synth.flow.recording.frame_motion import FrameMotion
+from synth.flow.recording.stereo_motion import RightCamera
+from synth.flow.recording.video_pass import VideoPass
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
-from synth.recording_flow import stereo
-from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.stereo import RightCamera
-from synth.recording_flow.video_pass import VideoPass
 
 _SAME = 0.2  # share of the left picture's change below which the right picture is frozen
 _COPY = 0.03  # share of the picture's detail: the noise of two cameras differs by more
@@ -26,7 +26,7 @@ _NEAR = np.ones((25, 25), np.uint8)
 
 
 @dataclass(frozen=True)
-class StereoQuality(stereo.StereoQuality):
+class StereoQuality(stereo_motion.StereoQuality):
     """Quality of the right or depth camera, and whether the pictures belong together."""
 
     copied: bool = False  # whether the right pictures are copies of the left ones

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.methods.comparison import FUSION, PHYSICS
-from bench.scoring import metrics
+from bench.scoring import force_metrics
 from bench.scoring.result import Result
 from synth.arrays import Floats
 from synth.publish.svg import svg
@@ -79,7 +79,9 @@ def scale_curves(result: Result) -> tuple[Floats | None, dict[str, Floats], str]
     if result.sensor_mn is None:
         return None, {name: size / _largest(size) for name, size in sizes.items()}, "force / largest"
     sensor, top = result.sensor_mn, _largest(result.sensor_mn)
-    fitted = {name: metrics.gain(sensor, size, result.scored) * size / top for name, size in sizes.items()}
+    fitted = {
+        name: force_metrics.gain(sensor, size, result.scored) * size / top for name, size in sizes.items()
+    }
     return sensor / top, fitted, "force / largest"
 
 

@@ -12,20 +12,20 @@ import numpy as np
 from bench.checks.judgement import judge
 from bench.checks.sensor import find_sensor_motion
 from bench.methods.flow_size import FlowSize, flow_sizes
-from bench.methods.protocol import Method
-from bench.recording.folder import Recording
+from bench.methods.method_interface import Method
 from bench.recording.meta import Meta, Span
-from bench.recording.pixel_scale import PixelScale
-from bench.scoring import metrics
+from bench.recording.recording_folder import Recording
+from bench.recording.recording_scale import PixelScale
+from bench.scoring import force_metrics
 from bench.scoring.result import Gain, Result, Scored
 from bench.sensor.alignment import AlignedSensor, align_sensor, describe_span, judge_drift
 from bench.tracking.tracking import Progress, TrackedRecording, track_recording
 from learn.uncertainty.intervals import LEVEL
 from synth.arrays import Array, Floats, Mask
 from synth.flow.estimator import name_backend
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import by_severity, first_fault, problems
-from synth.recording_flow.flow import LocalFlow
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.finding import by_severity, first_fault, problems
+from synth.flow.recording.flow import LocalFlow
 
 _MOVED = 0.1  # change of force, as a share of the peak, from which unchanged pictures are frozen ones
 _SEED = 0  # of the bootstrap, for reproducible intervals
@@ -154,10 +154,10 @@ def _fit_gain(size: Floats, first: Scored | None, against: Result, press: Mask |
     sensor = against.sensor_mn
     if sensor is None:
         target = size if first is None else first.size_mn
-        return Gain(metrics.gain(target, size, np.ones(len(size), bool)), against.main)
-    if press is not None and math.isfinite(pressed := metrics.gain(sensor, size, press)):
+        return Gain(force_metrics.gain(target, size, np.ones(len(size), bool)), against.main)
+    if press is not None and math.isfinite(pressed := force_metrics.gain(sensor, size, press)):
         return Gain(pressed, "press")
-    return Gain(metrics.gain(sensor, size, against.scored), "hindsight")
+    return Gain(force_metrics.gain(sensor, size, against.scored), "hindsight")
 
 
 def _score(
@@ -169,22 +169,24 @@ def _score(
     if sensor is None or axes is None:
         return Scored(force, size)
     x, y = sensor[used], size[used]
-    scores, events = metrics.compute_all(against.time_s, sensor, size, against.noise_floor_mn, used)
+    scores, events = force_metrics.compute_all(against.time_s, sensor, size, against.noise_floor_mn, used)
     components: dict[str, dict[str, float]] = {}
     if in_camera_axes and np.isfinite(force).any(axis=0).all():
-        components = {axis: metrics.agreement(axes[used, k], force[used, k]) for k, axis in enumerate("xyz")}
+        components = {
+            axis: force_metrics.agreement(axes[used, k], force[used, k]) for k, axis in enumerate("xyz")
+        }
     rng = np.random.default_rng(_SEED)
-    intervals = metrics.agreement_intervals(x, y, rng)
-    worse = None if first is None else metrics.difference_interval(x, first.size_mn[used], y, rng)
+    intervals = force_metrics.agreement_intervals(x, y, rng)
+    worse = None if first is None else force_metrics.difference_interval(x, first.size_mn[used], y, rng)
     if not against.absolute:
-        scores, events = metrics.without_newtons(scores), metrics.without_prediction(events)
-        components = {axis: metrics.without_newtons(values) for axis, values in components.items()}
-        intervals, worse = {key: intervals[key] for key in intervals if key in metrics.RELATIVE}, None
+        scores, events = force_metrics.without_newtons(scores), force_metrics.without_prediction(events)
+        components = {axis: force_metrics.without_newtons(values) for axis, values in components.items()}
+        intervals, worse = {key: intervals[key] for key in intervals if key in force_metrics.RELATIVE}, None
     calibrated: dict[str, float] = {}
     if press is not None:
-        gain = metrics.gain(sensor, size, press)
-        calibrated = {"gain": gain, **metrics.agreement(x, gain * y)}
-        calibrated["mae_of_peak"] = metrics.ratio(calibrated["mae_mn"], scores["event_peak_mn"])
+        gain = force_metrics.gain(sensor, size, press)
+        calibrated = {"gain": gain, **force_metrics.agreement(x, gain * y)}
+        calibrated["mae_of_peak"] = force_metrics.ratio(calibrated["mae_mn"], scores["event_peak_mn"])
     return Scored(force, size, scores, components, events, intervals, calibrated, worse)
 
 

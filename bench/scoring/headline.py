@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from bench.bootstrap import Interval
 from bench.methods.comparison import FUSION, MAIN
-from bench.scoring.metrics import METRICS
+from bench.scoring.force_metrics import METRICS
 from bench.scoring.result import Result
 from learn.uncertainty.out_of_distribution import OUT_OF_DISTRIBUTION
 

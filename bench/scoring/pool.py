@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.scoring.metrics import METRICS
+from bench.scoring.force_metrics import METRICS
 from bench.scoring.result import MOST_LOST
 from learn.evaluation.statistics import LEAST_GROUPS, as_plain, over_groups
 from synth.arrays import Floats

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench.bootstrap import Interval
-from bench.recording.pixel_scale import PixelScale
+from bench.recording.recording_scale import PixelScale
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
 from learn.evaluation.statistics import as_plain
 from synth.arrays import Floats, Mask
+from synth.flow.recording.finding import Finding, first_fault
 from synth.formats import SCORE
-from synth.recording_flow.finding import Finding, first_fault
 from synth.system import packages
 
 _METHOD_KEYS = (

@@ -1,4 +1,4 @@
-"""`bench.score` and `bench score`: from a recording to score.json and report.html."""
+"""`bench.score` and `bench score`: from a recording to score.json and score_report.html."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
-from bench.methods import comparison, plugins
+from bench.methods import comparison, method_plugins
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
-from bench.methods.fusion import Fusion
+from bench.methods.force_fusion import Fusion
+from bench.methods.method_interface import Method
 from bench.methods.network import Model
 from bench.methods.physics import Physics
-from bench.methods.protocol import Method
-from bench.recording import pixel_scale
-from bench.recording.folder import Recording, open_recording
-from bench.scoring import report
+from bench.recording import recording_scale
+from bench.recording.recording_folder import Recording, open_recording
+from bench.scoring import score_report
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result, as_json
 from bench.tracking.tracking import Progress
 from learn import Predictor
-from learn.inference.shipped import choose_model, find_model
+from learn.inference.shipped_networks import choose_model, find_model
 from synth.arguments import checked
 from synth.errors import UserError
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.flow import open_flow_process
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.flow import open_flow_process
 from synth.system import checked_file
 from synth.system.terminal import counting
 
 Settings = RecordingFlowSettings  # public name
-_OUTPUT_BYTES = 32 << 20  # for score.json and report.html
+_OUTPUT_BYTES = 32 << 20  # for score.json and score_report.html
 _LONG = 100  # frames from which a second process is worth the seconds that it takes to start
 
 
@@ -56,7 +56,7 @@ def score(
         methods: further methods by name; without a model the result is about the first.
         baselines: whether physics and the plug-ins' methods are scored too.
         settings: flow back end, rate, masks; None: the command's defaults.
-        out: folder for score.json and report.html, which are written together.
+        out: folder for score.json and score_report.html, which are written together.
         title: heading of the report.
         progress: whether a progress bar is shown, in a terminal or a notebook.
         own_process: whether the flow of a long recording is computed in another process, which imports the
@@ -83,7 +83,7 @@ def score(
             flow = stack.enter_context(open_flow_process())
         network = None if model is None else Model(model)
         chosen = _choose_methods(network, model, methods or {}, baselines)
-        scale, main = pixel_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
+        scale, main = recording_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
         about = _describe(chosen)
         with bar as done:
             result = evaluate_recording(recording, chosen, main, scale, used, about, done, flow)
@@ -109,7 +109,7 @@ def _choose_methods(
     """All methods by name, in the table's order; the result is about the first."""
     chosen: dict[str, Method] = {} if network is None else {MAIN: network}
     for name, one in own.items():
-        chosen[name] = one if isinstance(one, Model) else plugins.Plugged(one, f"method {name}")
+        chosen[name] = one if isinstance(one, Model) else method_plugins.Plugged(one, f"method {name}")
     if baselines:
         simple = comparison.simpler_methods()
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
@@ -127,16 +127,16 @@ def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
         about[FUSION] = {"hash": f"{main.identity} and physics", "origin": main.origin}
     described: dict[str, Any] = {} if main is None else {"model": main.described()}
     described["networks"] = about
-    if sources := {name: where for name, where in plugins.sources().items() if name in chosen}:
+    if sources := {name: where for name, where in method_plugins.sources().items() if name in chosen}:
         described["plug_ins"] = sources
     return described
 
 
 def write_result(result: Result, folder: Path, title: str) -> None:
-    """Writes score.json and report.html; neither has its name before both are complete."""
+    """Writes score.json and score_report.html; neither has its name before both are complete."""
     with (
         checked_file.part_of(folder / "score.json") as scores,
         checked_file.part_of(folder / "report.html") as page,
     ):
         scores.write_text(json.dumps(as_json(result), indent=1, allow_nan=False) + "\n", "utf-8")
-        page.write_text(report.render_report(result, title), "utf-8")
+        page.write_text(score_report.render_report(result, title), "utf-8")

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.recording import clocks
-from bench.recording.folder import Force, Recording
 from bench.recording.meta import SensorMeta, Span, Sync
+from bench.recording.recording_folder import Force, Recording
 from bench.sensor import clock_sync, force_sensor
 from bench.sensor.clock_sync import Offset
 from bench.sensor.drift import Drift, find_drift, remove_drift
 from bench.sensor.rotation import SensorRotation, find_rotation
 from synth.arrays import Floats
-from synth.recording_flow.finding import Finding
-from synth.recording_flow.pulse import SurfaceMotion
+from synth.flow.recording.find_pulse import SurfaceMotion
+from synth.flow.recording.finding import Finding
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from bench.recording.folder import Force
 from bench.recording.meta import SensorMeta
+from bench.recording.recording_folder import Force
 from synth.arrays import Floats
 from synth.errors import UserError
 

@@ -13,7 +13,7 @@ import cv2
 
 from synth.errors import UserError, first_line
 from synth.system.checked_file import refuse_large
-from synth.video.read import Picture
+from synth.video.read_video import Picture
 
 _FAILURES = 3  # pictures in a row that a camera fails to give before it counts as gone
 _SLOWEST_S = 10.0  # longest wait for a picture

@@ -7,8 +7,8 @@ from scipy.ndimage import binary_opening
 
 from bench.methods.posterior import polynomials
 from synth.arrays import Mask
-from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.harmonic_fit import Span
+from synth.flow.recording.frame_motion import FrameMotion
+from synth.flow.recording.harmonic_fit import Span
 
 
 class Limits:

@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bench.methods.protocol import Method, MethodContext
+from bench.methods.method_interface import Method, MethodContext
 from bench.tracking.capture import Camera
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
-from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.finding import Finding, problems
-from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.video_pass import Pace, VideoPass
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.finding import Finding, problems
+from synth.flow.recording.flow import LocalFlow
+from synth.flow.recording.video_pass import Pace, VideoPass
 from synth.video.pixel_scale import StatedScale, pixel_mm
 
 

@@ -10,24 +10,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.fusion import Fusion
-from bench.methods.protocol import ForceEstimate, Method, MethodContext, Revising
-from bench.recording.folder import Recording
+from bench.methods.force_fusion import Fusion
+from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.footage import as_footage
+from bench.recording.recording_folder import Recording
 from bench.recording.right_pictures import RightPictures, StereoQuality
 from bench.sensor.alignment import align_sensor
 from bench.tracking.contact_free import ContactFreeSearch
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import Finding
-from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.frame_motion import FrameMotion, RestFrame, TrackingSummary
-from synth.recording_flow.harmonic_fit import Span
-from synth.recording_flow.pulse import SurfaceMotion
-from synth.recording_flow.video_pass import VideoPass
-from synth.recording_flow.video_track import FrameWatcher, VideoTrack, track_video
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.find_pulse import SurfaceMotion
+from synth.flow.recording.finding import Finding
+from synth.flow.recording.flow import LocalFlow
+from synth.flow.recording.frame_motion import FrameMotion, RestFrame, TrackingSummary
+from synth.flow.recording.harmonic_fit import Span
+from synth.flow.recording.video_pass import VideoPass
+from synth.flow.recording.video_track import FrameWatcher, VideoTrack, track_video
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)

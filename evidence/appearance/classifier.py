@@ -17,9 +17,9 @@ from sklearn.metrics import roc_auc_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from evidence import report, status
+from evidence import report, result_status
 from evidence.flow.scenes import jpeg
-from evidence.render.case import case
+from evidence.render.render_case import case
 from evidence.study import Study
 from synth.arrays import Floats, Ints, Mask, Pixels
 from synth.errors import UserError
@@ -158,7 +158,7 @@ def measure(
             found.setdefault(f"fitted{name}", []).extend(scores.values())
     rows += [{"crops": name, "count": len(theirs), **summary(scores)} for name, scores in found.items()]
     add("control: photograph, itself", theirs, patch_labels(places, rng), region, near)
-    return {"data": status.data(photo), "fitted": fitted, "rows": rows}
+    return {"data": result_status.data(photo), "fitted": fitted, "rows": rows}
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

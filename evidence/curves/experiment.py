@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from sklearn.decomposition import TruncatedSVD
 
-from evidence import cache, report, status, training
+from evidence import report, result_cache, result_status, training
+from evidence.bootstrap import mean_of
 from evidence.curves import models
-from evidence.intervals import mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid
@@ -169,7 +169,7 @@ def measure(
         one = Estimator(model, cameras, size)
         rows += measure_estimator(one, clips[test:], select, tests, steps, spent, work)
     return {
-        "data": status.data(*datasets),
+        "data": result_status.data(*datasets),
         "generation_cpu_s": spent,
         "tested": {name: len(part) for name, (part, _) in tests.items()},
         "rows": rows,
@@ -192,7 +192,7 @@ def measure_estimator(
     """
     chosen, fit = clips[: min(select, max(4, one.size // 5))], clips[select : select + one.size]
     parts = (fit, chosen, *(part for part, _ in tests.values()))
-    key = cache.key(asdict(one), steps, [clip.content_hash for part in parts for clip in part])
+    key = result_cache.key(asdict(one), steps, [clip.content_hash for part in parts for clip in part])
 
     def compute() -> list[dict[str, Any]]:
         began = time.process_time()
@@ -206,7 +206,7 @@ def measure_estimator(
             for name, (part, bare) in tests.items()
         ]
 
-    found: list[dict[str, Any]] = cache.result(work / "rows", one.slug, key, compute)
+    found: list[dict[str, Any]] = result_cache.result(work / "rows", one.slug, key, compute)
     return found
 
 

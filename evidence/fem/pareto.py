@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from evidence import report
-from evidence.fem import case as fem_case
+from evidence.fem import fem_case as fem_case
 from evidence.study import Study
 from synth.arrays import Floats
 from synth.fem import solver

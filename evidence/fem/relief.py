@@ -12,9 +12,9 @@ from evidence.study import Study
 from synth.errors import UserError
 from synth.fem import equilibrium, surface_embedding, tool_gesture
 from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.mesh_relief import HeightMap
 from synth.job.schema import Job
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 
 Row = dict[str, Any]
 _JOB = Job(sequences=1000)

@@ -10,9 +10,9 @@ from evidence.flow.measure import epe
 from evidence.flow.scenes import Frame, Recipe, recipes, video
 from evidence.study import Study
 from synth.arrays import Array, Mask
-from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.video_pass import VideoPass
-from synth.video.read import Picture
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.video_pass import VideoPass
+from synth.video.read_video import Picture
 
 _MASKS = ("auto", "none")
 _CORRUPTED = ("black", "covered", "defocus", "jump")  # faults whose frames count for the flags alone

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from evidence import report, status
+from evidence import report, result_status
 from evidence.study import Study
 from synth.arrays import Array, Mask
 from synth.dataset.store import Dataset, Sequence
@@ -33,7 +33,7 @@ def measure(data: list[Path], count: int = 100) -> dict[str, Any]:
             | figures([sample for one in sequences for sample in _samples(one)])
             | {"cost_ratio": float((flow_s + stereo_s) / flow_s)}
         )
-    return {"data": status.data(*data), "rows": rows}
+    return {"data": result_status.data(*data), "rows": rows}
 
 
 def figures(samples: list[Sample]) -> dict[str, float]:

@@ -23,7 +23,7 @@ from scipy.interpolate import KroghInterpolator, LinearNDInterpolator, RectBivar
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import Delaunay
 
-from bench.recording import writer
+from bench.recording import recording_writer
 from bench.recording.meta import read_meta
 from evidence import report
 from evidence.pooled import FOLDERS, score_and_pool
@@ -76,7 +76,9 @@ def measure(
                 right = shutil.ignore_patterns("right.mp4", "pair.yaml")
                 shutil.copytree(both, part, ignore=right, dirs_exist_ok=True)
                 meta = read_meta(both / "meta.yaml")
-                writer.write_meta(part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"}))
+                recording_writer.write_meta(
+                    part, meta.model_dump(mode="json", exclude_unset=True, exclude={"stereo"})
+                )
         folders[2].append(both)
         folders[1].append(left)
     for cameras, of in folders.items():
@@ -132,14 +134,14 @@ def record(
         noise = np.random.default_rng(rng.integers(2**31))
         for prefix, file in _VIDEOS.items():
             pictures = (_sensed(folder / f"{prefix}{k:05d}.png", noise) for k in range(len(times)))
-            writer.write_video(part / file, pictures, times, crf=18)
+            recording_writer.write_video(part / file, pictures, times, crf=18)
     whole = level @ np.array([np.sum([tool["force_mn"] for tool in one], axis=0) for one in contacts])
     measured = whole @ camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     np.savez_compressed(part / TRUTH, flow_px=np.array(flow, np.float16), force_mn=measured[at])
     measured = measured + 0.02 * rng.normal(size=(len(sensor_s), 3))
-    writer.write_force(part, sensor_s, measured / 1000)
+    recording_writer.write_force(part, sensor_s, measured / 1000)
     write_pair(part / "pair.yaml", *pair, focal)
-    writer.write_meta(part, _about(name, young, focal))
+    recording_writer.write_meta(part, _about(name, young, focal))
 
 
 def _about(name: str, young: float, focal: float) -> dict[str, Any]:
@@ -355,7 +357,7 @@ def write_pair(file: Path, left: Floats, right: Floats, focal_px: float) -> None
     K = np.array([[focal_px, 0, _SIZE[0] / 2 - 0.5], [0, focal_px, _SIZE[1] / 2 - 0.5], [0, 0, 1]])
     values = {"K1": K, "D1": np.zeros((1, 5)), "K2": K, "D2": np.zeros((1, 5))}
     values |= {"R": second @ first.T, "T": (second @ (left[:3, 3] - right[:3, 3]))[:, None]}
-    writer.write_storage(file, values)
+    recording_writer.write_storage(file, values)
 
 
 def _sensed(picture: Path, rng: np.random.Generator) -> Pixels:

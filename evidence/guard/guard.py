@@ -148,9 +148,9 @@ def main(
             key: known.get(key, value) if key in waiting else value for key, value in versions().items()
         }
         _write({name: sketches for name, sketches in kept.items() if sketches}, raised)
-        from evidence import status  # which compares results with the guard
+        from evidence import result_status  # which compares results with the guard
 
-        status.write_states()
+        result_status.write_states()
         return
     raise typer.Exit(int(bool(unraised) or any(change.moved for change in changes)))
 

@@ -29,7 +29,7 @@ from learn.split import Split
 from synth.arrays import Mask, Pixels
 from synth.fem import surface_embedding
 from synth.flow.segmentation import segment
-from synth.flow.stereo import track as stereo_track
+from synth.flow.stereo import stereo_track as stereo_track
 from synth.flow.stereo.calibration import read_rig
 from synth.sequence.fem_mechanics import build_volume
 
@@ -229,13 +229,13 @@ PROBES: Mapping[str, Probe] = {
         probe_score,
         3e-2,
         ("SCORING", "COMPLIANCE", "MOTION"),
-        ("bench", "synth/recording_flow", "synth/video", "learn/inference"),
+        ("bench", "synth/flow/recording", "synth/video", "learn/inference"),
     ),
     "score-stereo": Probe(
         probe_score_stereo,
         3e-2,
         ("SCORING", "COMPLIANCE", "MOTION"),
-        ("bench", "synth/recording_flow", "synth/video", "learn/inference"),
+        ("bench", "synth/flow/recording", "synth/video", "learn/inference"),
     ),
 }
 """By name; the order is that of the pipeline."""

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 
-from evidence import report, status
-from evidence.intervals import difference, mean_of
+from evidence import report, result_status
+from evidence.bootstrap import difference, mean_of
 from evidence.learn.runs import base_settings, by_sequence, carry_out
 from evidence.study import Study
 from learn.checkpoint import ModelCard
@@ -50,7 +50,7 @@ def measure(
     rows = time_networks([*shapes, *HEAVY], repeats)
     return {
         "torch": torch.__version__,
-        "data": status.data(*filter(None, [dataset])),
+        "data": result_status.data(*filter(None, [dataset])),
         "trained": {name: PRESETS[name].loss for name in OTHERS if known},
         "rows": [row | known.get(key(row), {}) for row in rows],
     }

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import typer
 
-from evidence import cache as stored
-from evidence import report, status, training
-from evidence.intervals import difference, mean_of
+from evidence import report, result_status, training
+from evidence import result_cache as stored
+from evidence.bootstrap import difference, mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.evaluation.evaluate import evaluate
@@ -47,7 +47,10 @@ def measure(
     for loss, seed in product(LOSSES, range(seeds)):
         settings = replace(base_settings(), loss=loss, seed=seed, epochs=epochs)
         runs.setdefault(loss, []).append(carry_out(f"{loss}-seed{seed}", settings, clips, cache))
-    return {"data": status.data(dataset), "rows": [row(name, own, runs["mse"]) for name, own in runs.items()]}
+    return {
+        "data": result_status.data(dataset),
+        "rows": [row(name, own, runs["mse"]) for name, own in runs.items()],
+    }
 
 
 def page(found: Mapping[str, Any]) -> report.Page:

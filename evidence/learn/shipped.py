@@ -5,14 +5,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from evidence import report, status
+from evidence import report, result_status
 from evidence.curves import models
 from evidence.curves.experiment import figures
 from evidence.study import Study
 from learn.data.clips import load_clips, scored_source
 from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
-from learn.inference import shipped
+from learn.inference import shipped_networks
 from learn.inference.predict import Predictor, load_model
 from learn.split import unseen as held_out
 from synth.errors import UserError
@@ -20,16 +20,18 @@ from synth.errors import UserError
 _LEVEL = 0.9
 
 
-def measure(data: list[Path], models: Path = shipped.MODELS, cache: Path | None = None) -> dict[str, Any]:
+def measure(
+    data: list[Path], models: Path = shipped_networks.MODELS, cache: Path | None = None
+) -> dict[str, Any]:
     """Errors and coverage of networks on the first dataset, which they were fitted on, and on others.
 
     `models`: folder of mono and stereo; `cache`: folder for packed arrays.
     """
     rows = []
-    for name in shipped.NAMES:
+    for name in shipped_networks.NAMES:
         predictor = load_model(models / name)
         rows += [{"model": name} | _row(predictor, root, cache) for root in data]
-    return {"data": status.data(*data), "rows": rows}
+    return {"data": result_status.data(*data), "rows": rows}
 
 
 def _row(predictor: Predictor, root: Path, cache: Path | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from evidence import report
-from evidence.render.case import Case, case
+from evidence.render.render_case import Case, case
 from evidence.study import Study
 from synth.arrays import Map, Mask
 from synth.flow.opencv import Dis

@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from bench.recording import writer
-from evidence import report, status
+from bench.recording import recording_writer
+from evidence import report, result_status
 from evidence.study import Study
 from synth.arrays import Floats, Pixels
 from synth.errors import UserError
@@ -35,7 +35,7 @@ def measure(model: Path, seconds: float = 60.0) -> dict[str, Any]:
             raise UserError(f"the scoring failed: {done.stderr or done.stdout}")
         scored = json.loads(Path(scratch, "score.json").read_text())
     about = {"seconds": seconds, "fps": _FPS, "size": list(_SIZE), "frames": scored["frames"]}
-    return {"data": status.data(model), **about, "wall_s": wall, "timings": scored["timings"]}
+    return {"data": result_status.data(model), **about, "wall_s": wall, "timings": scored["timings"]}
 
 
 def record(folder: Path, seconds: float) -> None:
@@ -44,11 +44,13 @@ def record(folder: Path, seconds: float) -> None:
     times = np.arange(round(seconds * _FPS)) / _FPS
     rest = texture(_SIZE[1], _SIZE[0], np.random.default_rng(0))
     pictures = (pushed(rest, move) for move in _motion(times))
-    writer.write_video(folder / "video.mp4", pictures, times, crf=12)
+    recording_writer.write_video(folder / "video.mp4", pictures, times, crf=12)
     clock = np.arange(0, seconds, 1 / _SENSOR_HZ)
-    writer.write_force(folder, clock, np.outer(_motion(clock) / _PX_A_MN / 1000, [1.0, 0.0, 0.0]))
+    recording_writer.write_force(folder, clock, np.outer(_motion(clock) / _PX_A_MN / 1000, [1.0, 0.0, 0.0]))
     sensor = {"axes": "camera", "low_pass_hz": None}
-    writer.write_meta(folder, {"scale_mm_per_px": 35.0 / _SIZE[0], "young_kpa": 2.0, "sensor": sensor})
+    recording_writer.write_meta(
+        folder, {"scale_mm_per_px": 35.0 / _SIZE[0], "young_kpa": 2.0, "sensor": sensor}
+    )
 
 
 def _motion(time_s: Floats) -> Floats:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from ruamel.yaml import YAML
 
-from bench.recording import writer
+from bench.recording import recording_writer
 from synth.arrays import Floats, Pixels
 from synth.system.checked_file import read_picture
 
@@ -70,7 +70,7 @@ def _ordered(order: Callable[[Any], Any], *parts: str) -> Change:
                     shutil.copy(files[k], part / f"{new:06d}.png")
             shutil.rmtree(old)
         if "right" not in parts[:1]:
-            writer.write_frames(folder, time_s[: len(numbers)])
+            recording_writer.write_frames(folder, time_s[: len(numbers)])
 
     return apply
 
@@ -93,7 +93,7 @@ def _stated(**changes: Any) -> Change:
     def apply(folder: Path) -> None:
         meta = read_meta(folder)
         new = {key: meta[key] * by if isinstance(by, float) else by for key, by in changes.items()}
-        writer.write_meta(folder, meta | new)
+        recording_writer.write_meta(folder, meta | new)
 
     return apply
 
@@ -103,7 +103,7 @@ def _sensor(change: Callable[[Floats, Floats], tuple[Any, Any]]) -> Change:
 
     def apply(folder: Path) -> None:
         rows = read_table(folder / "force.csv")
-        writer.write_force(folder, *change(rows[:, 0], rows[:, 1:]))
+        recording_writer.write_force(folder, *change(rows[:, 0], rows[:, 1:]))
 
     return apply
 
@@ -127,7 +127,7 @@ def _compress(folder: Path) -> None:
     for name, video in (("frames", "video.mp4"), ("right", "right.mp4")):
         if (folder / name).is_dir():
             pictures = (_read(file) for file in sorted((folder / name).iterdir()))
-            writer.write_video(folder / video, pictures, time_s, crf=51)
+            recording_writer.write_video(folder / video, pictures, time_s, crf=51)
             shutil.rmtree(folder / name)
 
 

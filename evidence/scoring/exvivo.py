@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from bench.recording import writer
+from bench.recording import recording_writer
 from evidence import report
 from evidence.pooled import FOLDERS, score_and_pool
 from evidence.study import Study
@@ -23,13 +23,13 @@ from synth.errors import UserError
 from synth.fem import solver, tool_gesture
 from synth.fem.deformation import Deformation
 from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.mesh_relief import HeightMap
 from synth.geometry.triangles import Shape
 from synth.job import schema as jobs
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.scene import SceneState
 from synth.sequence import scenario
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 from synth.system import checked_file
 from synth.system.terminal import counting
 from synth.tune.search import changed
@@ -150,11 +150,11 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
         cv2.imwrite(str(part / "masks" / f"{k:06d}.png"), shot.tool.astype(np.uint8) * 255)
         progress(k + 1)
     crf = int(rng.integers(18, 25))
-    writer.write_video(part / "video.mp4", (left for left, _ in pictures), times, crf=crf)
+    recording_writer.write_video(part / "video.mp4", (left for left, _ in pictures), times, crf=crf)
     if renderer.right is not None:
         right = (one for _, one in pictures if one is not None)
-        writer.write_video(part / "right.mp4", right, times, crf=crf)
-        writer.write_pair(part / _PAIR, scene.view, renderer.right)
+        recording_writer.write_video(part / "right.mp4", right, times, crf=crf)
+        recording_writer.write_pair(part / _PAIR, scene.view, renderer.right)
     cv2.imwrite(str(part / "tissue.png"), scene.tissue.astype(np.uint8) * 255)
     force = np.stack([g.force_mn * np.asarray(g.direction) for g in gestures])[course.gesture]
     lag = _write_sensor(part, course, force * course.level[:, None], rng)
@@ -171,7 +171,7 @@ def make(plan: Plan, index: int, part: Path, progress: Callable[[int], None] = l
     }
     if renderer.right is not None:
         about["stereo"] = {"calibration": _PAIR}
-    writer.write_meta(part, about)
+    recording_writer.write_meta(part, about)
 
 
 def _moved(
@@ -243,7 +243,7 @@ def _write_sensor(part: Path, course: _Course, force: Floats, rng: np.random.Gen
     drift = size * rng.normal(size=3) * 0.002 * course.time_s[:, None]
     noise = 0.005 * size
     measured = force @ turn.T + size * rng.normal(0, 0.3, 3) + drift + noise * rng.normal(size=force.shape)
-    writer.write_force(part, course.time_s - lag, measured / 1000)
+    recording_writer.write_force(part, course.time_s - lag, measured / 1000)
     return lag
 
 

@@ -1,8 +1,8 @@
 """Errors of network, physics and their fusion, on sequences out of distribution.
 
 Force is estimated from every sequence's stored motion as from a recording's, monocular and in stereo, with
-the membrane unknown and stated. The constants of `bench.methods.fusion`, and the factor on physics' interval
-under a membrane, were set on sequences with even numbers; odd ones are reported.
+the membrane unknown and stated. The constants of `bench.methods.force_fusion`, and the factor on physics'
+interval under a membrane, were set on sequences with even numbers; odd ones are reported.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
-from bench.methods.fusion import Fusion
+from bench.methods.force_fusion import Fusion
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from bench.methods.network import Model
 from bench.methods.physics import Physics
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
-from evidence import cache, report, status
-from evidence.intervals import mean_of
+from evidence import report, result_cache, result_status
+from evidence.bootstrap import mean_of
 from evidence.pooled import PRETRAINED
 from evidence.study import Study
-from learn.inference.shipped import find_model
+from learn.inference.shipped_networks import find_model
 from synth.dataset.store import Dataset
 from synth.dataset.store import Sequence as Stored
-from synth.flow.stereo.track import Moved
+from synth.flow.stereo.stereo_track import Moved
 from synth.job.types import MembraneState
 
 Case = dict[str, Any]  # input of the methods: `cameras`, and whether the membrane is stated
@@ -44,9 +44,9 @@ def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, 
         case = {"cameras": cameras, "membrane_stated": stated}
         found = []
         for one in (one for one in Dataset(data) if one.index % 2 == every):
-            key = cache.key(one.attrs["content_hash"], case, model.identity)
+            key = result_cache.key(one.attrs["content_hash"], case, model.identity)
             compute = partial(_estimated, one, case, model)
-            found.append(cache.result(work, f"fusion-{one.index}", key, compute))
+            found.append(result_cache.result(work, f"fusion-{one.index}", key, compute))
         for tissue in ("all", "stripped", "intact"):
             some = [one for one in found if tissue in ("all", one["membrane"])]
             rows += [case | _row(tissue, name, some) for name in (MAIN, PHYSICS, FUSION)]
@@ -54,7 +54,7 @@ def measure(data: Path, work: Path = Path("work"), every: int = 1) -> dict[str, 
             one | {"true": other["true"]} for one, other in zip(found, found[1:] + found[:1], strict=True)
         ]
         rows.append(case | _row("all", FUSION, others) | {"method": _CONTROL})
-    return {"data": status.data(data), "rows": rows}
+    return {"data": result_status.data(data), "rows": rows}
 
 
 def _estimated(sequence: Stored, case: Case, model: Model) -> dict[str, Any]:

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.recording import writer
+from bench.recording import recording_writer
 from bench.recording.from_sequence import export_recording
 from bench.scoring.score import score
-from evidence import cache as stored
 from evidence import report
+from evidence import result_cache as stored
 from evidence.scoring.degradations import FPS, FRAMES, MONOCULAR, STEREO, Change, read_meta, read_table
 from evidence.study import Study
 from learn import load_model
-from learn.inference.shipped import choose_model
+from learn.inference.shipped_networks import choose_model
 from synth.dataset.store import Dataset
 from synth.engine.run import render_job
 from synth.errors import UserError
@@ -92,11 +92,11 @@ def _rendered(work: Path, kind: str, seed: int) -> list[Path]:
         clock, size = np.arange(0, force[-1, 0] + 0.5, 1 / _SENSOR_HZ), np.linalg.norm(force[:, 1:], axis=1)
         values = np.stack([np.interp(clock, force[:, 0], f) for f in force[:, 1:].T], axis=1)
         noise = np.random.default_rng(0).normal(size=values.shape)
-        writer.write_force(folder, clock, values + _SENSOR_NOISE * size.max() * noise)
+        recording_writer.write_force(folder, clock, values + _SENSOR_NOISE * size.max() * noise)
         meta = read_meta(folder) | {"tissue": "brain"}
         meta["membrane"] = "intact" if kind == "membrane" else "stripped"
         meta["sensor"]["free_s"] = [[0.0, max(float(force[np.flatnonzero(size > 0)[0] - 1, 0]), 0.1)]]
-        writer.write_meta(folder, meta)
+        recording_writer.write_meta(folder, meta)
     return folders
 
 
@@ -116,7 +116,7 @@ def degrade(source: Path, change: Change | None, case: Mapping[str, Any], work: 
     if case["cameras"] == 1:
         shutil.rmtree(folder / "right")
         (folder / meta.pop("stereo")["calibration"]).unlink()
-    writer.write_meta(folder, meta)
+    recording_writer.write_meta(folder, meta)
     if change is not None:
         change(folder)
     return folder

@@ -15,7 +15,7 @@ from safetensors.numpy import save_file
 
 from learn.data.grid import Grid, GridView, certainty, settled
 from synth.arrays import Array, Floats, Map
-from synth.dataset.split import name_anatomy
+from synth.dataset.sequence_split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError, as_user_error
 from synth.formats import CLIPS

@@ -11,19 +11,19 @@ import numpy as np
 
 from learn.data.grid import GridView
 from learn.inference.force_estimator import ForceEstimator, FrameForce
-from learn.inference.motion import Motion, VideoOptions, has_right_camera, motions
 from learn.inference.predict import Predictor, force_size, load_model, net_force
-from learn.inference.shipped import choose_model
+from learn.inference.shipped_networks import choose_model
+from learn.inference.video_motion import Motion, VideoOptions, has_right_camera, motions
 from learn.uncertainty.conformal import LEVELS
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
 from synth.errors import UserError, as_positive
 from synth.flow.estimator import Estimator
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.finding import first_fault, judge_young, problems
 from synth.job.types import MembraneState
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.recording_flow.finding import first_fault, judge_young, problems
 from synth.video.mask_files import read_choice
-from synth.video.read import FPS
+from synth.video.read_video import FPS
 
 
 @checked

@@ -18,10 +18,10 @@ from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
 from synth.errors import UserError
 from synth.flow.confidence import LOW_CONFIDENCE
-from synth.flow.stereo.track import Moved
+from synth.flow.recording.frame_motion import FrameMotion
+from synth.flow.stereo.stereo_track import Moved
 from synth.job.types import MembraneState
 from synth.plugins import check_answer
-from synth.recording_flow.frame_motion import FrameMotion
 
 
 @checked

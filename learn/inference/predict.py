@@ -12,13 +12,13 @@ from learn import checkpoint
 from learn.checkpoint import ModelCard
 from learn.data.clips import FIELDS, has_depth
 from learn.data.grid import Grid, GridView, certainty, membrane_code
-from learn.inference.shipped import find_model
+from learn.inference.shipped_networks import find_model
 from learn.uncertainty.features import motion_features
 from synth.arguments import checked
 from synth.arrays import Array, Floats, Map, Mask
 from synth.errors import Caution, UserError, as_positive, as_user_error
 from synth.flow import onnx_network
-from synth.flow.stereo.track import Moved
+from synth.flow.stereo.stereo_track import Moved
 from synth.formats import TRAINING
 from synth.job import identity
 from synth.job.types import MembraneState

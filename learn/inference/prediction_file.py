@@ -13,8 +13,8 @@ import numpy as np
 
 from learn.data.grid import to_image
 from learn.inference.apply import apply
-from learn.inference.motion import Motion
 from learn.inference.predict import Predictor, length
+from learn.inference.video_motion import Motion
 from synth.arrays import Floats, Pixels
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
@@ -22,8 +22,8 @@ from synth.job.types import MembraneState
 from synth.publish import picture, sequence_video
 from synth.system import checked_file
 from synth.system.checked_file import write_whole
-from synth.video import read as video
-from synth.video.write import encode_video
+from synth.video import read_video as video
+from synth.video.write_video import encode_video
 
 _WIDEST_PX = 1280
 

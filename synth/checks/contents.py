@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.checks.measure import Measure, truth
+from synth.checks.measurements import Measure, truth
 from synth.dataset import store
 from synth.dataset.store import Sequence
 from synth.fields import FIELDS

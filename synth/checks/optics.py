@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Floats
-from synth.checks.measure import Measure, Nothing, inner, truth
+from synth.checks.measurements import Measure, Nothing, inner, truth
 from synth.dataset.store import Sequence
 from synth.errors import UserError
 from synth.render.camera import camera as cameras

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from synth.checks import contents, optics, physics, stereo
-from synth.checks.measure import Invariant, Measure, Nothing, truth
-from synth.dataset import index, location, provenance, split
-from synth.dataset.folder import Folder
+from synth.checks import contents, optics, physics_checks, stereo_checks
+from synth.checks.measurements import Invariant, Measure, Nothing, truth
+from synth.dataset import index, location, provenance, sequence_split
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job import identity
@@ -27,16 +27,16 @@ INVARIANTS: dict[str, Invariant] = {
     for function in (
         contents.seal,
         contents.schema,
-        physics.rest,
-        physics.force,
-        physics.compliance,
-        physics.visibility,
-        physics.warp,
-        physics.forward_backward,
+        physics_checks.rest,
+        physics_checks.force,
+        physics_checks.compliance,
+        physics_checks.visibility,
+        physics_checks.warp,
+        physics_checks.forward_backward,
         optics.picture,
         optics.camera,
         optics.contact,
-        stereo.stereo,
+        stereo_checks.stereo,
     )
 }
 """All invariants of a sequence by name, in the order of their checks; docstrings are their meanings."""
@@ -250,9 +250,11 @@ def _dataset(
     lost = sorted(key for key, row in rows.items() if row["status"] == "done" and key not in sealed)
     yield "dataset", index.NAME, not lost, f"rows without a sequence: {lost[:3]}"
     try:
-        stored = split.read_stored(folder.root)
+        stored = sequence_split.read_stored(folder.root)
     except UserError as error:
-        yield "splits", split.NAME, False, str(error)
+        yield "splits", sequence_split.NAME, False, str(error)
         return
-    leaking = split.leaks(list(rows.values()), stored) or split.misplaced(list(rows.values()), stored)
+    leaking = sequence_split.leaks(list(rows.values()), stored) or sequence_split.misplaced(
+        list(rows.values()), stored
+    )
     yield "splits", index.NAME, not leaking, "; ".join(leaking[:3]) or "none"

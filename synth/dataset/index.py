@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from synth.dataset import location, split
+from synth.dataset import location, sequence_split
 from synth.dataset.attributes import cautions_of, gestures_of, name_gestures
-from synth.dataset.folder import Folder, write_whole
-from synth.dataset.split import DatasetSplit, Side
+from synth.dataset.dataset_folder import Folder, write_whole
+from synth.dataset.sequence_split import DatasetSplit, Side
 from synth.dataset.store import Dataset, Sequence, open_sequence
 from synth.errors import UserError, first_line
 from synth.system import checked_file
@@ -62,7 +62,7 @@ COLUMNS = (
     IndexColumn("anatomy", _TEXT,
                 "the geometry: a user's brain or the seed of a procedural one, the same in every dataset; "
                 "sequences that share it belong on one side of a split",
-                source=lambda one: split.name_anatomy(one.attrs)),
+                source=lambda one: sequence_split.name_anatomy(one.attrs)),
     IndexColumn("opening", _TEXT, "place of the craniotomy on a user's brain, named alike in every dataset",
                 source="opening_id"),
     IndexColumn("family", _TEXT, "appearance family", source="scenario.family"),
@@ -128,12 +128,12 @@ def read_index(root: Path) -> pa.Table:
 
 def read_split(root: Path, *, required: bool = True) -> DatasetSplit:
     """The stored split, else as `write_index` would create it. UserError: `required` and too few groups."""
-    stored = split.read_stored(root)
+    stored = sequence_split.read_stored(root)
     if stored.sides:
         return stored
     rows = [row_of(open_sequence(location.store(root, key))) for key in Folder(root).sealed()]
     try:
-        assign = split.assign_sides if required else split.assign_if_possible
+        assign = sequence_split.assign_sides if required else sequence_split.assign_if_possible
         return _dealt(rows, assign(rows, stored), stored)
     except UserError as error:
         raise UserError(f"{root}: {error}") from None
@@ -143,7 +143,7 @@ def group_by_side(dataset: Dataset) -> dict[str, list[int]]:
     """Positions of sequences by side, without empty sides; all are "train" if there are too few to split."""
     names, chosen = [one.attrs["content_hash"] for one in dataset], read_split(dataset.root, required=False)
     found = chosen.find(names, dataset.root) if chosen.sides else ["train"] * len(names)
-    groups = {side: [k for k, one in enumerate(found) if one == side] for side in split.SIDES}
+    groups = {side: [k for k, one in enumerate(found) if one == side] for side in sequence_split.SIDES}
     return {side: positions for side, positions in groups.items() if positions}
 
 
@@ -160,12 +160,14 @@ def write_index(folder: Folder, rule: DatasetSplit | None = None) -> list[dict[s
     each = {k: {"index": k, "status": "failed", "reason": failure["reason"]} for k, failure in failures}
     stores = {key: location.store(folder.root, key) for key in folder.sealed()}
     each |= {key: known.get(key) or row_of(open_sequence(path)) for key, path in stores.items()}
-    rows, chosen = [each[key] for key in sorted(each)], rule or split.read_stored(folder.root)
-    sides = split.assign_sides(rows, rule) if rule else split.assign_if_possible(rows, chosen)
+    rows, chosen = [each[key] for key in sorted(each)], rule or sequence_split.read_stored(folder.root)
+    sides = (
+        sequence_split.assign_sides(rows, rule) if rule else sequence_split.assign_if_possible(rows, chosen)
+    )
     for row, side in zip(rows, sides, strict=True):
         row["split"] = side
     if any(sides):
-        split.store(folder.root, _dealt(rows, sides, chosen))
+        sequence_split.store(folder.root, _dealt(rows, sides, chosen))
     save_rows(folder.root, rows)
     return rows
 

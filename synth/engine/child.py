@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import synth
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.system import gpu, llvm, resources

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import provenance
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.engine.child import Attempt, Child, Setup, environment, share_of_memory
 from synth.errors import UserError
 from synth.job.schema import Job

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.progress import TaskID, TextColumn, TimeElapsedColumn
 
-from synth.dataset.folder import Folder, write_whole
+from synth.dataset.dataset_folder import Folder, write_whole
 from synth.engine.child import Attempt
 from synth.system.terminal import ProgressBars, clock
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from synth.arguments import checked
 from synth.dataset import index, size_forecast
-from synth.dataset.folder import Folder, Part, claim
+from synth.dataset.dataset_folder import Folder, Part, claim
 from synth.engine.child import Attempt, Child, Setup, choose_gpus, environment, share_of_memory
 from synth.engine.compilation import compile_once
 from synth.engine.journal import Journal, RunBars, Watcher
@@ -102,7 +102,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
     if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)
     if job.render.calibration is not None:
-        from synth.sequence.scene import refuse_unfit  # slow to import
+        from synth.sequence.rest_scene import refuse_unfit  # slow to import
 
         refuse_unfit(job.render)
     gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import location, size_forecast
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.size_forecast import Forecast
 from synth.dataset.store import open_sequence
 from synth.engine.journal import RunProgress

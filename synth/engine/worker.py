@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset import location
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.errors import UserError
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal sent to this process when the engine dies

@@ -36,7 +36,7 @@ from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, factorise
 from synth.fem.tangent import linearise
 from synth.fem.tool_gesture import Gesture, ToolMotion
-from synth.job.laws import LEAST_JACOBIAN
+from synth.job.law_choice import LEAST_JACOBIAN
 
 FIRMNESS = 40.0
 """k0 over E/a: tissue under a flat punch has 0.8 E/a, so that it lags by some 3% of the way."""

@@ -20,7 +20,7 @@ from synth.fem.system import System
 from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
 from synth.job import schema
-from synth.job.laws import check_load
+from synth.job.law_choice import check_load
 
 _STEP_S = 0.03  # longest time step of dynamics
 _TO_VTK = [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]  # order of a tetrahedron's nodes in VTK

@@ -18,7 +18,7 @@ from synth.render.camera import camera_sensor
 from synth.render.camera.camera_sensor import CameraSensor, balanced_light, processed
 from synth.render.camera.colour_processing import PLAIN, ColourProcessing
 from synth.render.scene import SceneState
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 
 _LARGEST_MM, _LARGEST_PX, _CHOOSING_PX = 60.0, 720, 320  # of frames; and of those that choose the family
 _PIXELS, _DIRECTIONS, _QUANTILES = 6000, 48, 100

@@ -10,10 +10,10 @@ from pydantic import AfterValidator, Field, FiniteFloat, ValidationInfo, model_v
 
 from synth.errors import did_you_mean
 from synth.fields import EXTRA, FIELDS, SPARED
-from synth.job.mechanics import CLEAR_MM
-from synth.job.mechanics import FemSection as FemSection
-from synth.job.mechanics import MembraneSection as MembraneSection
-from synth.job.mechanics import PulseSection as PulseSection
+from synth.job.mechanics_sections import CLEAR_MM
+from synth.job.mechanics_sections import FemSection as FemSection
+from synth.job.mechanics_sections import MembraneSection as MembraneSection
+from synth.job.mechanics_sections import PulseSection as PulseSection
 from synth.job.microscope import LightSection as LightSection
 from synth.job.microscope import RenderSection as RenderSection
 from synth.job.microscope import SensorSection as SensorSection

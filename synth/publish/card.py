@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Floats
-from synth.dataset import index, location, split
-from synth.dataset.folder import Folder, write_whole
+from synth.dataset import index, location, sequence_split
+from synth.dataset.dataset_folder import Folder, write_whole
 from synth.dataset.store import open_sequence
 from synth.fields import FIELDS
 from synth.publish import picture
@@ -51,7 +51,7 @@ def write_card(folder: Folder) -> Path:
 def facts(folder: Folder, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Values for the templates of all descriptions, from the dataset's job and the rows of an index."""
     job = folder.job()
-    described, stored = folder.described(), split.read_stored(folder.root)
+    described, stored = folder.described(), sequence_split.read_stored(folder.root)
     done = [row for row in rows if row["status"] == "done"]
     failed = [row for row in rows if row["status"] == "failed"]
     reasons = Counter(row["reason"] for row in failed)

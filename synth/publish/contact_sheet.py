@@ -17,7 +17,7 @@ from synth.render.camera.camera import resized
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence import scenario
-from synth.sequence.scene import RestScene, at_rest
+from synth.sequence.rest_scene import RestScene, at_rest
 from synth.sequence.simulation import simulate
 from synth.system.terminal import ProgressCallback
 

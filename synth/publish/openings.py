@@ -14,11 +14,11 @@ from scipy.spatial import ConvexHull, cKDTree
 from synth.arrays import Floats, Indices, Pixels
 from synth.errors import UserError
 from synth.geometry.brain_surface import axes, read_brain
-from synth.job import writer
+from synth.job import job_writer
 from synth.job.schema import AnatomySection, CraniotomySection, FemSection, Job
 from synth.render.anatomy.surface import LEAST_FILLED, MARGIN_MM
 from synth.sequence.fem_mechanics import build_volume
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 
 _PLACES = 250
 _PER_MM2, _MOST_SAMPLES = 1.5, 600_000  # samples on the surface: some in every pixel of the height map
@@ -76,7 +76,11 @@ def find_openings(mesh: Path, radius_mm: float, count: int, fill_holes: bool = F
 def as_job(mesh: Path, chosen: Sequence[Opening], radius_mm: float, fill_holes: bool = False) -> str:
     """Lines of a job with the first opening, and the others as a comment below `also`."""
     first, *others = (one.craniotomy(radius_mm).model_dump(mode="json") for one in chosen)
-    lines = ["anatomy:", f"  mesh: {writer.scalar(mesh)}", *(["  fill_holes: true"] if fill_holes else [])]
+    lines = [
+        "anatomy:",
+        f"  mesh: {job_writer.scalar(mesh)}",
+        *(["  fill_holes: true"] if fill_holes else []),
+    ]
     lines += ["  craniotomy:", f"    radius_mm: {radius_mm:g}"]
     lines += [f"    point: {first['point']}", f"    direction: {first['direction']}"]
     lines += ["    # also:  # the next best; sequences use them in turn"] if others else []

@@ -15,7 +15,7 @@ from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish import picture as drawing
 from synth.publish.picture import Rgb
-from synth.video.write import encode_video
+from synth.video.write_video import encode_video
 
 OVERLAYS = {"flow": "flow", "recovered": "flow_recovered", "force": "traction"}  # overlay -> its field
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import Floats
-from synth.fem.external.read import read_series
+from synth.fem.external.read_series import read_series
 from synth.fem.external.series import MeshSeries, Units
 from synth.fem.external.vtk_series import MOVED
 from synth.fem.surface_embedding import vertex_area
-from synth.job import writer
+from synth.job import job_writer
 
 _RADIUS_MM = 12.0
 _FLAT = 1e-3  # height of a point over the middle of a sheet, relative to the radius
@@ -33,7 +33,7 @@ def as_job(source: Path) -> str:
         f"frames: {frames}",
         f"fps: {(frames - 1) / series.time[-1]:.6g}  # frames are interpolated between the files' states",
         "mechanics:",
-        f"  source: {writer.scalar(source.resolve())}",
+        f"  source: {job_writer.scalar(source.resolve())}",
         f"  unit_mm: {series.unit_mm:g}  # from the size of the surface; is it right?",
         *([] if series.timed else [f"  dt_s: {_DT_S}  # PLEASE SET: the files state no time"]),
         "  # For a label, state the force on the surface from outside, its unit, and the tissue's stiffness:",

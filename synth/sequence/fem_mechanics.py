@@ -9,10 +9,10 @@ from functools import partial
 from synth.fem import solver
 from synth.fem.deformation import Deformation
 from synth.fem.mesh import tetrahedra
-from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.mesh_relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.tool_gesture import ToolMotion, check_motions
-from synth.sequence.scene import RestScene
+from synth.sequence.rest_scene import RestScene
 from synth.system.recent import Recent
 from synth.system.stopwatch import StageCallback, Stopwatch
 

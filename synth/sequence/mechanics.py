@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from synth.fem.deformation import Deformation
-from synth.sequence.scene import RestScene
+from synth.sequence.rest_scene import RestScene
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from synth.arguments import checked
 from synth.arrays import Mask, Pixels
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Writer
 from synth.errors import UserError
 from synth.fields import FIELDS, MOST_INSTRUMENTS
@@ -18,17 +18,17 @@ from synth.flow import track
 from synth.flow.estimator import create
 from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import rig
-from synth.flow.stereo import track as stereo
+from synth.flow.stereo import stereo_track as stereo
 from synth.flow.track import Track
 from synth.job import identity
-from synth.job.laws import LAWS
+from synth.job.law_choice import LAWS
 from synth.job.schema import Job
 from synth.render.camera import video_link
 from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
 from synth.sequence import scenario
 from synth.sequence.published_labels import Published
-from synth.sequence.scene import Scene
+from synth.sequence.rest_scene import Scene
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 

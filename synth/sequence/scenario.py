@@ -18,7 +18,7 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
+from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection

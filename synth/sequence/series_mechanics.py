@@ -10,7 +10,7 @@ import numpy as np
 from synth.errors import Caution, UserError
 from synth.fem.deformation import Deformation
 from synth.fem.external.transfer import attach
-from synth.sequence.scene import RestScene
+from synth.sequence.rest_scene import RestScene
 from synth.system.stopwatch import StageCallback, Stopwatch
 
 _LOST = 0.01  # share of the load outside the opening above which it is reported

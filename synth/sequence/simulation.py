@@ -16,8 +16,8 @@ from synth.job.schema import Job
 from synth.render.content import SceneContent
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
+from synth.sequence.rest_scene import RestScene, Scene, at_rest
 from synth.sequence.scenario import ATTEMPTS, DRIVEN_ATTEMPTS, Scenario, draw_scenario
-from synth.sequence.scene import RestScene, Scene, at_rest
 from synth.sequence.series_mechanics import SeriesMechanics
 from synth.system.stopwatch import StageCallback, Stopwatch
 

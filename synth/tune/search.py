@@ -26,7 +26,7 @@ from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
 from synth.job import identity, reader
-from synth.job.laws import CHEAPEST_FIRST, LARGEST_LOAD
+from synth.job.law_choice import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
 from synth.render.mitsuba import adapter
 from synth.system import cache, packages

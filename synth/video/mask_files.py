@@ -11,7 +11,7 @@ from pathlib import Path
 from synth.arrays import Mask
 from synth.errors import UserError
 from synth.video.file_numbers import find_stills, match_numbers, number_files
-from synth.video.read import read_mask
+from synth.video.read_video import read_mask
 
 MASKS = {
     "auto": "instruments and other objects, detected unless masks are given; detected highlights",

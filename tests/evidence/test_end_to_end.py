@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evidence import cache, gap, training
+from evidence import gap, result_cache, training
 from evidence.curves import experiment, models
 from evidence.curves.experiment import GRID, SAME, Estimator
 from learn.data.clips import Clip
@@ -85,8 +85,8 @@ def test_cached_results_depend_on_inputs_and_versions(
     computed: list[int] = []
 
     def count(*parts: object) -> int:
-        key = cache.key(*parts, versions=("MESH",))
-        cache.result(tmp_path, "x", key, lambda: computed.append(1) or len(computed))
+        key = result_cache.key(*parts, versions=("MESH",))
+        result_cache.result(tmp_path, "x", key, lambda: computed.append(1) or len(computed))
         return len(computed)
 
     assert [count("a", ["b"]), count("a", ["b"]), count("a", ["c"]), count("a", ["b"])] == [1, 1, 2, 2]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.recording.folder import open_recording
+from bench.recording.recording_folder import open_recording
 from evidence import gap
 from evidence.foreign import recordings
 from learn.data.clips import amount

@@ -15,7 +15,7 @@ import pytest
 from sources import ROOT
 
 import synth
-from evidence import status, study
+from evidence import result_status, study
 from evidence.guard import guard, probes
 from evidence.guard.guard import Change
 from evidence.guard.probes import PROBES
@@ -164,20 +164,20 @@ def test_a_result_says_what_has_moved_since(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "result.json").write_text(json.dumps(result))
         (tmp_path / name / "README.md").write_text("# Title\n\nText.\n")
-    states = {one.file.parent.name: one for one in status.gather(tmp_path)}
+    states = {one.file.parent.name: one for one in result_status.gather(tmp_path)}
     assert {name: one.stands for name, one in states.items()} == dict.fromkeys(results, False) | {
         "stands": True
     }
     assert [one.probe for one in states["moved"].moved] == ["flow"]
     for _ in range(2):  # the line is replaced, not repeated
-        status.write_states(tmp_path)
+        result_status.write_states(tmp_path)
         for name, one in states.items():
             text = (tmp_path / name / "README.md").read_text()
             assert text == f"# Title\n\n*State: {one.describe()}.*\n\nText.\n"
 
 
 def test_pages_state_whether_their_results_stand(tmp_path: Path) -> None:
-    for one in status.gather():
+    for one in result_status.gather():
         page = one.file.with_name("README.md")
         assert f"*State: {one.describe()}.*" in page.read_text("utf-8"), "python -m evidence status --write"
 

@@ -13,7 +13,7 @@ from evidence.all import run_steps
 from evidence.guard import guard
 from evidence.learn import shipped
 from evidence.report import Page
-from learn.inference.shipped import MODELS, NAMES
+from learn.inference.shipped_networks import MODELS, NAMES
 
 CHART = report.intervals("error", "mN", {"ours": (1.0, 0.5, 2.0), "<theirs>": (2.0,)})
 ROWS = [{"law": "<linear>", "error": 0.0123456}, {"law": "stable", "error": None, "why": "a | b"}]

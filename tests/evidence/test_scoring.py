@@ -11,17 +11,17 @@ from fake_recording import Maker
 from bench.methods import physics as physics_method
 from bench.methods import posterior
 from bench.methods.compliance import TissueKind
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from bench.methods.physics import GRID
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
-from bench.recording import writer
-from bench.recording.folder import open_recording
+from bench.recording import recording_writer
+from bench.recording.recording_folder import open_recording
 from bench.tracking.tracking import track_recording
 from evidence.curves.models import coarser
 from evidence.scoring import degradations, exvivo, stability
 from learn.data.clips import Clip
 from learn.data.grid import Grid, GridView
 from synth.flow.confidence import deviation
-from synth.recording_flow.decode import RecordingFlowSettings
+from synth.flow.recording.decode import RecordingFlowSettings
 from synth.tune.search import changed
 
 
@@ -94,7 +94,7 @@ def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=24, meta={"membrane": "stripped"})
     meta = degradations.read_meta(folder)
     meta["sensor"]["free_s"] = [[0.0, 0.2]]
-    writer.write_meta(folder, meta)
+    recording_writer.write_meta(folder, meta)
     case = {"given": 2, "cameras": 2}
     base = stability.degrade(folder, None, case, tmp_path)
     assert "membrane" not in degradations.read_meta(base)
@@ -112,7 +112,7 @@ def test_each_degradation_changes_a_recording(tmp_path: Path) -> None:
     for file in (source / "frames").iterdir():
         cv2.imwrite(str(source / "right" / file.name), cv2.imread(str(file))[:, ::-1])
     meta = degradations.read_meta(source)
-    writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
+    recording_writer.write_meta(source, meta | {"sensor": meta["sensor"] | {"free_s": [[0.0, 0.2]]}})
 
     def read(folder: Path) -> dict[str, bytes]:
         files = (file for file in sorted(folder.rglob("*")) if file.is_file())

@@ -19,8 +19,8 @@ from fake_recording import texture
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
-from bench.recording import writer
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
+from bench.recording import recording_writer
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -166,7 +166,7 @@ def make(root: Path, case: Case) -> Path:
             cv2.imwrite(str(folder / "masks" / f"{k:06d}.png"), rod.astype(np.uint8) * 255)
         cv2.imwrite(str(folder / "tissue.png"), np.full(case.size, 255, np.uint8))
     sensor = write_sensor(folder, case)
-    writer.write_meta(
+    recording_writer.write_meta(
         folder,
         {
             "scale_mm_per_px": scene.mm_per_px,
@@ -189,7 +189,7 @@ def write_pictures(folder: Path, case: Case, pictures: list[Floats], time_s: Flo
         for k, picture in enumerate(pictures):
             stored = np.rint(picture * 4).astype(np.uint16) if case.colour == "10 bits" else rounded[k]
             cv2.imwrite(str(folder / "frames" / f"{k:06d}.png"), np.ascontiguousarray(stored[..., ::-1]))
-        writer.write_frames(folder, time_s)
+        recording_writer.write_frames(folder, time_s)
     elif case.codec == "mp4v":
         video = cv2.VideoWriter(
             str(folder / "video.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (width, height)
@@ -226,7 +226,7 @@ def write_sensor(folder: Path, case: Case, drift_mn_per_s: float = 0.0) -> dict[
         if case.sensor == "ati":
             about["to_camera"] = TURN.T.tolist()
     noise = np.random.default_rng(100 + case.seed).normal(0, noise_mn, values.shape)
-    writer.write_force(folder, t, (values + noise) / 1000)
+    recording_writer.write_force(folder, t, (values + noise) / 1000)
     return about
 
 

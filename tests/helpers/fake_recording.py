@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.methods.protocol import ForceEstimate, FrameMotion, Method, MethodContext
-from bench.recording import pixel_scale, writer
-from bench.recording.folder import open_recording
+from bench.methods.method_interface import ForceEstimate, FrameMotion, Method, MethodContext
+from bench.recording import recording_scale, recording_writer
+from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
-from synth.recording_flow.decode import RecordingFlowSettings
+from synth.flow.recording.decode import RecordingFlowSettings
 
 GAIN_MN_PER_PX = 40.0
 SENSOR_HZ = 100.0
@@ -66,15 +66,15 @@ class Maker:
         if footage == "png":
             for k, rgb in enumerate(pictures):
                 cv2.imwrite(str(folder / "frames" / f"{k:04d}.png"), rgb[..., ::-1])
-            writer.write_frames(folder, time)
+            recording_writer.write_frames(folder, time)
         else:
             (folder / "frames").rmdir()
-            writer.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
+            recording_writer.write_video(folder / "video.mp4", iter(pictures), time, crf=6)
         t = np.arange(0, time[-1] + 1e-9, 1 / SENSOR_HZ)
-        writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
+        recording_writer.write_force(folder, t, np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0]))
         about = {"scale_mm_per_px": 0.2, "young_kpa": 1.0, "sensor": {"axes": "camera", "low_pass_hz": None}}
         known = {"membrane": "stripped", "poisson": [0.45, 0.45]}  # two tissues to solve, not twelve
-        writer.write_meta(folder, {**about, **known, **(meta or {})})
+        recording_writer.write_meta(folder, {**about, **known, **(meta or {})})
         return folder
 
 
@@ -95,5 +95,5 @@ def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings
     chosen = dict(methods or {"bump": Bump()})
     flow = settings.pop("flow_here", None)
     chosen_settings = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
-    scale = pixel_scale.find_scale(recording.meta, folder)
+    scale = recording_scale.find_scale(recording.meta, folder)
     return evaluate_recording(recording, chosen, next(iter(chosen)), scale, chosen_settings, {}, flow=flow)

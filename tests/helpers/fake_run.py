@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from synth.dataset.folder import claim, parse_part
+from synth.dataset.dataset_folder import claim, parse_part
 from synth.dataset.index import write_index
 from synth.engine.child import Attempt
 from synth.engine.journal import Watcher

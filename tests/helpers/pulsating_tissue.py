@@ -10,13 +10,13 @@ from fake_recording import texture
 from warped_cortex import inverse
 
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
-from bench.methods.protocol import Method
-from bench.recording import pixel_scale, writer
-from bench.recording.folder import open_recording
+from bench.methods.method_interface import Method
+from bench.recording import recording_scale, recording_writer
+from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
 from synth.arrays import Floats
-from synth.recording_flow.decode import RecordingFlowSettings
+from synth.flow.recording.decode import RecordingFlowSettings
 
 YOUNG_KPA, _FPS = 3.0, 10.0
 _CONTACT_MM, _RADIUS_MM = 4.0, 12.0
@@ -91,16 +91,16 @@ def record(
     cv2.imwrite(str(folder / "tissue.png"), inside.astype(np.uint8) * 255)
     (folder / "masks").mkdir()  # no instrument in view
     cv2.imwrite(str(folder / "masks" / "000000.png"), np.zeros((size, size), np.uint8))
-    writer.write_frames(folder, times)
-    writer.write_force(folder, times, force / 1000)
+    recording_writer.write_frames(folder, times)
+    recording_writer.write_force(folder, times, force / 1000)
     about = {"scale_mm_per_px": float(contact["mm_per_px"]), "young_kpa": YOUNG_KPA}
     sensor = {"axes": "camera", "low_pass_hz": None}
-    writer.write_meta(folder, about | {"pulse": {"remove": remove}, "sensor": sensor})
+    recording_writer.write_meta(folder, about | {"pulse": {"remove": remove}, "sensor": sensor})
 
 
 def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     """Scores of all frames of the recording."""
     opened = open_recording(folder)
-    scale = pixel_scale.find_scale(opened.meta, folder)
+    scale = recording_scale.find_scale(opened.meta, folder)
     settings = RecordingFlowSettings(backend, shrink=1, rate_hz=None)
     return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})

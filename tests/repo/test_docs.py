@@ -135,7 +135,7 @@ confidence = np.ones((2, height, width), np.float32)
 """,
     "models": """
 from pathlib import Path
-import learn.inference.shipped as shipped
+import learn.inference.shipped_networks as shipped
 shipped.MODELS = Path("packed")
 """,
 }

@@ -8,7 +8,7 @@ from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
 INSIDE = {
     "synth": "arrays errors arguments fields formats plugins system job flow flow.stereo video "
-    "recording_flow geometry fem.mesh fem fem.external "
+    "flow.recording geometry fem.mesh fem fem.external "
     "render.camera render.materials render.mitsuba render.appearance render.anatomy render.randomized render "
     "dataset sequence checks publish publish.export engine tune fit cli __main__",
     "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "

@@ -31,7 +31,7 @@ HEAVY = {"numpy", "pydantic", "torch", "mitsuba", "drjit", "scipy", "cv2", "zarr
     [
         ("import synth, learn, bench", HEAVY),
         ("import synth; synth.Job()", {"mitsuba", "drjit", "torch", "zarr", "numba"}),
-        ("import synth.sequence.pipeline, synth.recording_flow.flow", {"torch"}),
+        ("import synth.sequence.pipeline, synth.flow.recording.flow", {"torch"}),
         ("import synth.cli, learn.cli, bench.cli", {"torch", "numpy", "onnxruntime", "numba", "cv2"}),
         ("import synth, bench.scoring.score, bench.checks.check_recording, bench.tracking.live", {"torch"}),
         ("import synth, learn; learn.load_model('mono')", {"torch", "onnx"}),

@@ -14,8 +14,8 @@ import zarr
 from fake_run import in_process
 
 from synth.checks import verify
-from synth.checks.measure import Measure
-from synth.dataset.folder import Folder
+from synth.checks.measurements import Measure
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Dataset
 from synth.job.schema import Job
 from synth.system.stopwatch import Stopwatch

@@ -13,7 +13,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import quality
 from synth.fem.system import assemble
 from synth.job import schema
-from synth.job.laws import LARGEST_LOAD, LEAST_JACOBIAN
+from synth.job.law_choice import LARGEST_LOAD, LEAST_JACOBIAN
 from synth.sequence.simulation import simulate
 
 CONTACT = fem_case.CONTACTS[0]

@@ -11,7 +11,7 @@ import pytest
 from synth.errors import UserError
 from synth.job.schema import Job
 from synth.render.scene import SceneState
-from synth.sequence.scene import RestScene, at_rest
+from synth.sequence.rest_scene import RestScene, at_rest
 
 Changes = dict[str, Any]
 

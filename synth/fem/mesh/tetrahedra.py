@@ -17,8 +17,8 @@ from synth.fem.mesh.attachments import FIRM_PER_MM
 from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, scatter, shape
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
+from synth.fem.mesh.mesh_relief import HeightMap, raise_top
 from synth.fem.mesh.refine import edges_of, refine
-from synth.fem.mesh.relief import HeightMap, raise_top
 from synth.geometry.brain_surface import Brain
 from synth.job import schema
 

@@ -10,7 +10,7 @@ from synth.errors import UserError
 from synth.flow import image
 from synth.flow.confidence import deviation
 from synth.flow.stereo.depth_motion import Solver, fine
-from synth.flow.stereo.track import Moved
+from synth.flow.stereo.stereo_track import Moved
 
 _CAUTION = 1.5  # factor of the deviation of depth, which ignores its correlated errors; chosen by hand
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from synth.arrays import Array, Floats, Map
-from synth.checks import optics, stereo
+from synth.checks import optics, stereo_checks
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import write_png
@@ -66,7 +66,7 @@ def write_scenes(dataset: Dataset, target: Path) -> None:
             "young_kpa": sequence.attrs["young_kpa"],
         }
         if "rgb_right" in sequence:
-            right = stereo.right_of(sequence)
+            right = stereo_checks.right_of(sequence)
             maps = _maps(right, focal, between(left, right)[0].T)
             for t in range(sequence.frames):
                 write_png(here / "images_right" / f"{t:06d}.png", maps.smooth(sequence["rgb_right"][t]))

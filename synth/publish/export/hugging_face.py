@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from synth.arrays import Array
 from synth.dataset import index
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Dataset, Sequence
 from synth.fields import FIELDS, TIME
 from synth.publish import card

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import Array, Ints
-from synth.checks import optics, stereo
+from synth.checks import optics, stereo_checks
 from synth.dataset.store import Dataset, Sequence
 from synth.errors import UserError
 from synth.publish.export.encoding import as_png
@@ -67,7 +67,7 @@ def _choose(sequence: Sequence) -> Ints:
 
 def _in_depth(sequence: Sequence, pixels: Ints) -> dict[str, Array]:
     """Tracks of pixels (N, 2) of frame 0 in space, and the camera's intrinsics."""
-    view, right = optics.camera_of(sequence), stereo.right_of(sequence)
+    view, right = optics.camera_of(sequence), stereo_checks.right_of(sequence)
     (fx, _, cx), (_, fy, cy), _ = view.K
     columns, rows = pixels.T
     along = rays(view, pixels.astype(np.float64))

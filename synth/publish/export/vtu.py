@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import Array, Floats
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.geometry.skin import TRIANGLE
 from synth.job import identity
 from synth.render.camera import camera
 from synth.sequence.fem_mechanics import FemMechanics
-from synth.sequence.scene import Scene
+from synth.sequence.rest_scene import Scene
 from synth.sequence.simulation import simulate
 
 _TET = 24  # quadratic, in VTK

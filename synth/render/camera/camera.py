@@ -15,7 +15,7 @@ import numpy.typing as npt
 from synth.arrays import Floats, Map
 from synth.errors import UserError
 from synth.job.schema import RenderSection
-from synth.render.camera import calibration
+from synth.render.camera import camera_calibration
 
 _NEWTON = 20
 _BORDER = 65  # points on a side of the picture
@@ -84,7 +84,7 @@ def place(view: CameraView, render: RenderSection) -> Camera:
         K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
         distortion = np.asarray(render.distortion, np.float64)
     else:
-        K, distortion = calibration.read(render.calibration, render.size)
+        K, distortion = camera_calibration.read(render.calibration, render.size)
     return Camera(
         K=K,
         distortion=distortion,
@@ -121,7 +121,7 @@ def visible_radius(camera: Camera) -> float:
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with pictures of another size (width, height) px of the same field."""
     scale = np.array(size) / camera.size
-    K = calibration.scaled(camera.K, scale)
+    K = camera_calibration.scaled(camera.K, scale)
     return replace(camera, K=K, size=size, mm_per_px=camera.mm_per_px / float(scale[0]))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from synth.arrays import Pixels
 from synth.errors import UserError
 from synth.job import schema
-from synth.video.write import encode
+from synth.video.write_video import encode
 
 _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 

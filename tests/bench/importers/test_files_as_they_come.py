@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from fake_recording import texture
 
-from bench.importers import registry, rosbag
+from bench.importers import importer_registry, rosbag
 from synth.errors import UserError
 from synth.system import csv_table
-from synth.video import read as video
+from synth.video import read_video as video
 from synth.video.stereo_layout import find_layout
 
 WIDE = cv2.resize(texture(120, 200, 3), (800, 480), interpolation=cv2.INTER_CUBIC)
@@ -45,10 +45,10 @@ def join(layout: str) -> list[np.ndarray]:
 @pytest.mark.parametrize("layout", ["side-by-side", "top-bottom", "half-width", "half-height", "alternating"])
 def test_two_cameras_in_one_video_are_recognised_and_split(layout: str, tmp_path: Path) -> None:
     source = write(tmp_path / "v.mkv", join(layout))
-    noted = registry.read_source(source).notes
+    noted = importer_registry.read_source(source).notes
     assert any(layout in note for note in noted)
     for order, expected in (("", (LEFT, RIGHT)), (",right-first", (RIGHT, LEFT))):
-        found = registry.read_source(source, layout=layout + order)
+        found = importer_registry.read_source(source, layout=layout + order)
         assert len(found.times_s) == 4 == len(found.second.frame)
         for got, rgb in zip((found.pictures, found.second.pictures), expected, strict=True):
             off = np.abs(next(got()).astype(int) - rgb).mean()
@@ -73,9 +73,9 @@ def test_two_cameras_in_lines_or_colours_are_recognised_and_those_in_lines_split
     assert find_layout(9 * [interleave(layout)]) == layout
     if layout in ("checkerboard", "anaglyph"):
         with pytest.raises(UserError, match="two cameras"):
-            registry.read_source(source, layout=layout)
+            importer_registry.read_source(source, layout=layout)
         return
-    found = registry.read_source(source, layout=layout)
+    found = importer_registry.read_source(source, layout=layout)
     for got, rgb in ((found.pictures, LEFT), (found.second.pictures, RIGHT)):
         picture = next(got()).astype(int)
         # In place, to a fraction of a pixel.
@@ -134,18 +134,18 @@ def test_all_orientations_of_a_display_matrix(s: int, t: int, turned: bool, tmp_
 def test_stacks_bits_numbers_and_hidden_files(tmp_path: Path) -> None:
     cv2.imwritemulti(str(tmp_path / "s.tif"), [frame.astype(np.uint16) * 16 for frame in FRAMES])
     (tmp_path / "._s.tif").write_bytes(b"\0\5\x16\7" + bytes(100))
-    found = registry.read_source(tmp_path, {"fps": "10"})
+    found = importer_registry.read_source(tmp_path, {"fps": "10"})
     assert np.array_equal([one[..., ::-1] for one in found.pictures()], FRAMES)
     pngs = tmp_path / "p"
     pngs.mkdir()
     for k in (0, 1, 5):
         cv2.imwrite(str(pngs / f"{k}_l.png"), FRAMES[k])
-    assert registry.read_source(pngs, {"fps": "10"}).times_s == pytest.approx([0, 0.1, 0.5])
+    assert importer_registry.read_source(pngs, {"fps": "10"}).times_s == pytest.approx([0, 0.1, 0.5])
     for k in (0, 1):
         cv2.imwrite(str(pngs / f"{k}_r.png"), FRAMES[k])
     with pytest.raises(UserError, match=r"_l\.png"):
-        registry.read_source(pngs, {"fps": "10"})
-    pair = registry.read_source(pngs, {"fps": "10", "frames": "*_l.png", "right": "*_r.png"})
+        importer_registry.read_source(pngs, {"fps": "10"})
+    pair = importer_registry.read_source(pngs, {"fps": "10", "frames": "*_l.png", "right": "*_r.png"})
     assert pair.second.frame.tolist() == [0, 1]
 
 
@@ -159,7 +159,9 @@ def test_tables_of_forces(tmp_path: Path) -> None:
         "t,fx,fy,fz\n1700000000000000,1,2,3\n1700000000100000,1,2,3",
     ):
         (tmp_path / "f.csv").write_text(text, "utf-16")
-        found = registry.read_source(tmp_path / "v.npy", {"fps": "10", "force": str(tmp_path / "f.csv")})
+        found = importer_registry.read_source(
+            tmp_path / "v.npy", {"fps": "10", "force": str(tmp_path / "f.csv")}
+        )
         assert found.force_s - found.force_s[0] == pytest.approx([0, 0.1], abs=1e-6)
         assert found.force.tolist() == 2 * [[1, 2, 3]]
     (tmp_path / "f.csv").write_text("t,fx\nnoon,1\n")

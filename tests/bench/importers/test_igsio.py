@@ -10,9 +10,9 @@ from fake_recording import Maker, scored
 from igs_sequence import write_igs
 
 from bench.cli import app
-from bench.importers import registry
-from bench.recording import writer
-from bench.recording.folder import open_recording
+from bench.importers import importer_registry
+from bench.recording import recording_writer
+from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
 from synth.system import csv_table
 
@@ -27,7 +27,7 @@ def film(path: Path, count: int = N) -> Path:
         np.full((48, 64, 3), 8 * k, np.uint8) + rng.integers(0, 4, (48, 64, 3), np.uint8)
         for k in range(count)
     ]
-    writer.write_video(path, iter(pictures), np.arange(count) / 20, crf=0)
+    recording_writer.write_video(path, iter(pictures), np.arange(count) / 20, crf=0)
     return path
 
 
@@ -36,7 +36,7 @@ def test_pictures_come_from_the_video_beside_it(local: bool, tmp_path: Path) -> 
     film(tmp_path / "trial.mp4")
     invalid = {3: "Force", 5: "TipToWorldTransform"}
     source = write_igs(tmp_path / "a.igs.mha", TIMES, FORCE, "C:\\data\\trial.mp4", invalid, local=local)
-    found = registry.read_source(source)
+    found = importer_registry.read_source(source)
     assert found.times_s == pytest.approx(TIMES, abs=1e-6)
     assert [int(picture.mean()) // 8 for picture in found.pictures()] == [*range(N)]
     np.testing.assert_allclose(found.force, np.delete(FORCE, 3, 0), atol=1e-6)
@@ -66,7 +66,7 @@ def test_a_video_of_a_few_pictures_more_or_fewer_is_cut_to_the_frames(spare: int
 
 def test_a_sequence_is_a_table_of_forces_too(tmp_path: Path) -> None:
     video, source = film(tmp_path / "v.mp4"), write_igs(tmp_path / "a.mha", TIMES, FORCE, "v.mp4")
-    found = registry.read_source(video, {"force": str(source)})
+    found = importer_registry.read_source(video, {"force": str(source)})
     np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
     np.testing.assert_allclose(found.force_s, TIMES, atol=1e-6)
 
@@ -74,30 +74,30 @@ def test_a_sequence_is_a_table_of_forces_too(tmp_path: Path) -> None:
 def test_what_it_lacks_is_named(tmp_path: Path) -> None:
     source = write_igs(tmp_path / "a.mha", TIMES, FORCE, "v.mp4")
     with pytest.raises(UserError, match=r"v\.mp4"):
-        registry.read_source(source)
+        importer_registry.read_source(source)
     film(tmp_path / "v.mp4", N - 5)
     with pytest.raises(UserError, match="25"):
-        registry.read_source(source)
+        importer_registry.read_source(source)
     (tmp_path / "in").mkdir()
     outside = write_igs(tmp_path / "in/a.mha", TIMES, FORCE, "v.mp4")
     (tmp_path / "in/v.mp4").symlink_to(film(tmp_path / "v.mp4"))
     with pytest.raises(UserError, match="same folder"):
-        registry.read_source(outside)
+        importer_registry.read_source(outside)
     (tmp_path / "b.mha").write_text("hello world\n")
     with pytest.raises(UserError, match="hello world"):
-        registry.read_source(tmp_path / "b.mha")
+        importer_registry.read_source(tmp_path / "b.mha")
     (tmp_path / "c.mha").write_text(
         "NDims = 2\nDimSize = 4 4\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
     )
     with pytest.raises(UserError, match="MET_FLOAT"):
-        registry.read_source(tmp_path / "c.mha")
+        importer_registry.read_source(tmp_path / "c.mha")
 
 
 def test_six_numbers_of_force_with_pictures_of_which_some_are_invalid(tmp_path: Path) -> None:
     pytest.importorskip("SimpleITK")
     pixels = np.repeat(8 * np.arange(N, dtype=np.uint8), 16 * 24).reshape(N, 16, 24)
     source = write_igs(tmp_path / "a.mha", TIMES, FORCE, "", {2: "Image"}, pixels=pixels)
-    found = registry.read_source(source)
+    found = importer_registry.read_source(source)
     assert found.times_s == pytest.approx(np.delete(TIMES, 2), abs=1e-6)
     assert [int(picture.mean()) // 8 for picture in found.pictures()] == [0, 1, *range(3, N)]
     np.testing.assert_allclose(found.force, FORCE, atol=1e-6)
@@ -111,7 +111,7 @@ def test_a_recording_in_that_layout_is_scored_as_its_original(make: Maker, tmp_p
     force = np.stack(
         [np.interp(times, recording.force.time_s, axis) for axis in recording.force.force_mn.T / 1000], 1
     )
-    writer.write_video(tmp_path / "v.mp4", iter([frame.rgb for frame in frames]), times, crf=0)
+    recording_writer.write_video(tmp_path / "v.mp4", iter([frame.rgb for frame in frames]), times, crf=0)
     source = write_igs(tmp_path / "a.igs.mha", times, force, "v.mp4")
     run(app, "import", source, "-o", tmp_path / "rec", "--scale", 0.2)
     shutil.copy(original / "meta.yaml", tmp_path / "rec")

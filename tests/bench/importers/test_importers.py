@@ -11,9 +11,9 @@ from fake_recording import texture
 from numpy.typing import NDArray
 
 from bench.cli import app
-from bench.importers import registry
-from bench.importers.formats import IMPORTERS
-from bench.recording.folder import open_recording
+from bench.importers import importer_registry
+from bench.importers.import_formats import IMPORTERS
+from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
 from tests.bench.importers.test_stereo_bag import writing
 
@@ -91,7 +91,7 @@ def test_imported_data_equal_the_source(
 
 def test_the_bags_clock_is_used_only_for_topics_without_stamps(tmp_path: Path) -> None:
     """A single zero stamp, as the first of a simulated clock, is valid."""
-    found = registry.read_source(mcap(tmp_path / "bag", unstamped="/ft"))
+    found = importer_registry.read_source(mcap(tmp_path / "bag", unstamped="/ft"))
     assert found.times_s == pytest.approx(TIMES)
     assert found.force_s == pytest.approx(LATE_S + TIMES)
 
@@ -114,7 +114,7 @@ def test_unreadable_sources_are_refused(
     make: Callable[[Path], Path], name: str, use: dict[str, str], tmp_path: Path
 ) -> None:
     with pytest.raises(UserError):
-        registry.read_source(make(tmp_path / name), use)
+        importer_registry.read_source(make(tmp_path / name), use)
 
 
 def test_a_format_of_another_package_is_read_by_its_ending(
@@ -124,20 +124,22 @@ def test_a_format_of_another_package_is_read_by_its_ending(
     pictures = [np.full((16, 20, 3), 10 * k, np.uint8) for k in range(3)]
 
     def read_xyz(source: Path, use: Mapping[str, str]) -> object:
-        return registry.Intake(np.arange(3) / 25, lambda: iter(pictures)) if not use else None
+        return importer_registry.Intake(np.arange(3) / 25, lambda: iter(pictures)) if not use else None
 
     IMPORTERS.add("xyz", read_xyz)
-    found = registry.read_source(write_nonsense(tmp_path / "a.XYZ"))
+    found = importer_registry.read_source(write_nonsense(tmp_path / "a.XYZ"))
     np.testing.assert_array_equal(np.stack(list(found.pictures())), pictures)
     with pytest.raises(UserError, match="xyz"):
-        registry.read_source(tmp_path / "a.XYZ", {"force": "b"})
+        importer_registry.read_source(tmp_path / "a.XYZ", {"force": "b"})
 
 
 def test_truncated_sequence_leaves_nothing_behind(tmp_path: Path) -> None:
     source = igs(tmp_path / "a.mha")
     source.write_bytes(source.read_bytes()[:-700])
     with pytest.raises(UserError):
-        registry.write_recording(registry.read_source(source), tmp_path / "rec", 1.0, {}, lambda done: None)
+        importer_registry.write_recording(
+            importer_registry.read_source(source), tmp_path / "rec", 1.0, {}, lambda done: None
+        )
     assert not any(path.name.startswith("rec") for path in tmp_path.iterdir())
 
 
@@ -172,10 +174,10 @@ def test_a_fast_sensor_that_is_not_in_seconds_is_refused(tmp_path: Path) -> None
     np.save(tmp_path / "video.npy", VIDEO)
     table = tmp_path / "ft.csv"
 
-    def read(seconds: float, of: float) -> registry.Intake:
+    def read(seconds: float, of: float) -> importer_registry.Intake:
         rows = [f"{of * k / 1000:.6f},0,0,1" for k in range(int(seconds * 1000))]
         table.write_text("\n".join(["t_s,fx,fy,fz", *rows]) + "\n")
-        return registry.read_source(tmp_path / "video.npy", {"fps": "25", "force": str(table)})
+        return importer_registry.read_source(tmp_path / "video.npy", {"fps": "25", "force": str(table)})
 
     for unit in (1e3, 1e6):
         with pytest.raises(UserError, match="seconds"):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from fake_recording import texture
 
-from bench.importers import registry
+from bench.importers import importer_registry
 from synth.errors import UserError
 
 pytest.importorskip("rosbags")
@@ -77,13 +77,13 @@ def stamped() -> tuple[str, list[tuple[float, Any]]]:
     return kind, [(s, T[kind](header=head(s), wrench=wrench(s))) for s in np.arange(0, 0.4, 0.01).tolist()]
 
 
-def check_forces(found: registry.Intake) -> None:
+def check_forces(found: importer_registry.Intake) -> None:
     s = np.arange(0, 0.4, 0.01)
     np.testing.assert_allclose(found.force_s - START, s, atol=1e-5)
     np.testing.assert_allclose(found.force, np.stack([0 * s, -0.5 * s, 1 + 0 * s], 1), atol=1e-9)
 
 
-def nearest(found: registry.Intake) -> list[int]:
+def nearest(found: importer_registry.Intake) -> list[int]:
     return [int(np.argmin([np.abs(a.astype(int) - b).mean() for b in PICTURES])) for a in found.pictures()]
 
 
@@ -92,7 +92,7 @@ def test_a_bag_without_its_metadata(plugin: StoragePlugin, tmp_path: Path) -> No
     source = bag(tmp_path / "bag", {"/cam/image/compressed": jpegs(), "/ft": stamped()}, plugin)
     (source / "metadata.yaml").unlink()
     for one in (source, next(path for path in source.iterdir())):
-        found = registry.read_source(one)
+        found = importer_registry.read_source(one)
         assert nearest(found) == [*range(COUNT)]
         check_forces(found)
 
@@ -106,11 +106,11 @@ def test_packets_of_a_video_as_messages(kind: str, tmp_path: Path) -> None:
         (k / FPS, T[kind](**{field: make(k / FPS)}, data=data, format="h264", **more))
         for k, data in enumerate(packets())
     ]
-    found = registry.read_source(bag(tmp_path / "a", {"/video": (kind, messages), "/ft": stamped()}))
+    found = importer_registry.read_source(bag(tmp_path / "a", {"/video": (kind, messages), "/ft": stamped()}))
     assert nearest(found) == [*range(COUNT)]
     assert found.times_s - START == pytest.approx(np.arange(COUNT) / FPS, abs=1e-5)
     # Recorded from between two key frames on: the first pictures can't be decoded, and are no others' times.
-    late = registry.read_source(bag(tmp_path / "b", {"/video": (kind, messages[2:])}))
+    late = importer_registry.read_source(bag(tmp_path / "b", {"/video": (kind, messages[2:])}))
     assert nearest(late) == [*range(5, COUNT)]
     assert late.times_s - START == pytest.approx(np.arange(5, COUNT) / FPS, abs=1e-5)
 
@@ -133,13 +133,15 @@ def test_forces_inside_other_messages(tmp_path: Path) -> None:
         "/cam": jpegs(), "/device": (kind, device), "/array": (array, numbers), "/two": (two, both)
     }  # fmt: skip
     source = bag(tmp_path / "bag", topics)
-    check_forces(registry.read_source(source))
-    check_forces(registry.read_source(source, {"force": "/device"}))
-    check_forces(registry.read_source(source, {"force": "/array"}))
+    check_forces(importer_registry.read_source(source))
+    check_forces(importer_registry.read_source(source, {"force": "/device"}))
+    check_forces(importer_registry.read_source(source, {"force": "/array"}))
     for wanted in ("/two", "/cam", "/nowhere"):
         with pytest.raises(UserError, match=re.escape("/device")):
-            registry.read_source(source, {"force": wanted})
-    lone = registry.read_source(bag(tmp_path / "lone", {"/cam": jpegs(), "/array": (array, numbers)}))
+            importer_registry.read_source(source, {"force": wanted})
+    lone = importer_registry.read_source(
+        bag(tmp_path / "lone", {"/cam": jpegs(), "/array": (array, numbers)})
+    )
     assert len(lone.force) == 0
     assert any("/array (std_msgs/msg/Float64MultiArray)" in note for note in lone.notes)
 
@@ -148,7 +150,7 @@ def test_a_bag_cut_off_is_named_with_its_cure(tmp_path: Path) -> None:
     data = next(bag(tmp_path / "bag", {"/cam": jpegs()}).glob("*.mcap")).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
     with pytest.raises(UserError, match="mcap recover"):
-        registry.read_source(tmp_path / "cut.mcap")
+        importer_registry.read_source(tmp_path / "cut.mcap")
 
 
 @pytest.mark.parametrize(
@@ -174,7 +176,7 @@ def test_an_unknown_file_is_named_with_what_it_is(
 ) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=named) as refused:
-        registry.read_source(tmp_path / name)
+        importer_registry.read_source(tmp_path / name)
     assert "wrong ending" not in str(refused.value)
 
 
@@ -182,13 +184,13 @@ def test_stated_units_are_not_applied_twice(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.stack(PICTURES))
     rows = "".join(f"{k / 10},1,2,3\n" for k in range(9))
     (tmp_path / "f.csv").write_text("t,Fx (mN),Fy (mN),Fz (mN)\n" + rows)
-    found = registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
+    found = importer_registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
     assert found.force[0] == pytest.approx([1e-3, 2e-3, 3e-3])
     with pytest.raises(UserError, match="newtons"):
-        registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
+        importer_registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
     (tmp_path / "f.csv").write_text("t,Fz\n" + "".join(f"{k / 10},{k}\n" for k in range(9)))
-    found = registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
-    registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
+    found = importer_registry.read_source(tmp_path / "v.npy", {"fps": "25", "force": str(tmp_path / "f.csv")})
+    importer_registry.write_recording(found, tmp_path / "out", 0.001, {}, lambda done: None)
     assert (tmp_path / "out/force.csv").read_text().splitlines()[:3] == ["t_s,fz_n", "0.000000,0.000000000",
                                                                         "0.100000,0.001000000"]  # fmt: skip
 
@@ -218,11 +220,11 @@ def dicom(path: Path, syntax: str, pixels: Any, **about: object) -> Path:
 def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
     pytest.importorskip("pydicom")
     source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", np.stack(PICTURES), FrameTime="40")
-    found = registry.read_source(source)
+    found = importer_registry.read_source(source)
     assert np.array_equal(np.stack(list(found.pictures())), np.stack(PICTURES))
     assert found.times_s == pytest.approx(np.arange(COUNT) / FPS)
     with pytest.raises(UserError, match="without times"):
-        registry.read_source(dicom(tmp_path / "b.dcm", "1.2.840.10008.1.2.1", np.stack(PICTURES)))
+        importer_registry.read_source(dicom(tmp_path / "b.dcm", "1.2.840.10008.1.2.1", np.stack(PICTURES)))
     with av.open(str(tmp_path / "v.ts"), "w") as out:
         stream = out.add_stream("libx264", rate=FPS, options={"crf": "8", "bf": "0"})
         stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
@@ -230,7 +232,7 @@ def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")))
         out.mux(stream.encode(None))
     inside = dicom(tmp_path / "c.dcm", "1.2.840.10008.1.2.4.102", (tmp_path / "v.ts").read_bytes())
-    found = registry.read_source(inside)
+    found = importer_registry.read_source(inside)
     assert nearest(found) == [*range(COUNT)]
     assert found.times_s == pytest.approx(np.arange(COUNT) / FPS, abs=1e-4)
 
@@ -243,7 +245,7 @@ def test_dicom_of_inverted_grey(stored: int, tmp_path: Path) -> None:
     about |= {"HighBit": stored - 1, "FrameTime": "40", "PhotometricInterpretation": "MONOCHROME1"}
     values = ((1 << stored) - 1) - (dark << (stored - 8))
     source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", values.astype(dark.dtype), **about)
-    grey = np.stack(list(registry.read_source(source).pictures()))[..., 0].astype(int)
+    grey = np.stack(list(importer_registry.read_source(source).pictures()))[..., 0].astype(int)
     np.testing.assert_allclose(grey, dark, atol=1)
 
 
@@ -258,12 +260,12 @@ def test_dicom_of_a_palette(tmp_path: Path) -> None:
         about[f"{name}PaletteColorLookupTableData"] = (257 * column).astype("<u2").tobytes()
     source = dicom(tmp_path / "a.dcm", "1.2.840.10008.1.2.1", index, FrameTime="40", **about)
     np.testing.assert_allclose(
-        np.stack(list(registry.read_source(source).pictures())).astype(int), colours[index], atol=1
+        np.stack(list(importer_registry.read_source(source).pictures())).astype(int), colours[index], atol=1
     )
 
 
 def test_a_folder_of_neither_is_named_with_what_it_holds(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("x")
     with pytest.raises(UserError, match=r"notes\.md"):
-        registry.read_source(tmp_path)
+        importer_registry.read_source(tmp_path)
     shutil.rmtree(tmp_path)

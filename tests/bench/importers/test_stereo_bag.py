@@ -13,9 +13,9 @@ from command import run
 from scipy.spatial.transform import Rotation
 
 from bench.cli import app
-from bench.importers import registry
+from bench.importers import importer_registry
 from bench.importers.rosbag import _depth, partners
-from bench.recording.folder import open_recording
+from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
 
@@ -126,8 +126,10 @@ def test_depth_equals_the_bags(tmp_path: Path, kind: type) -> None:
     depth = (depth_mm / (1000 if kind is np.float32 else 1)).astype(kind)
     straight = lenses(PARALLEL, 2 * [np.zeros(5)])
     source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), straight, (depth,))
-    found = registry.read_source(source, {"depth": DEPTH, "force": ARMS[0]})
-    out = registry.write_recording(found, tmp_path / "rec", 1.0, {"scale_mm_per_px": 0.1}, lambda done: None)
+    found = importer_registry.read_source(source, {"depth": DEPTH, "force": ARMS[0]})
+    out = importer_registry.write_recording(
+        found, tmp_path / "rec", 1.0, {"scale_mm_per_px": 0.1}, lambda done: None
+    )
     recording = open_recording(out)
     path = recording.depths[0]
     got = np.load(path) if kind is np.float32 else cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -152,7 +154,7 @@ def test_ambiguous_or_wrong_topics_are_refused(tmp_path: Path, use: dict[str, st
     source = write_bag(tmp_path / "bag", video, np.zeros((2, 3)), lenses(PARALLEL, 2 * [np.zeros(5)]))
     for further in ({}, {"right": CAMERAS["right"]}):
         with pytest.raises(UserError):
-            registry.read_source(source, {"force": ARMS[0], **further, **use})
+            importer_registry.read_source(source, {"force": ARMS[0], **further, **use})
 
 
 def test_inverse_depth_is_refused() -> None:

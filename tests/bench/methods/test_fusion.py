@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bench.methods.force_fusion import Fusion
 from bench.methods.force_mixture import ForceMixture
-from bench.methods.fusion import Fusion
-from bench.methods.protocol import ForceEstimate, MethodContext
+from bench.methods.method_interface import ForceEstimate, MethodContext
 
 Floats = NDArray[np.float64]
 SCENE = MethodContext(np.ones((4, 4), bool), 0.1, 1.0)

@@ -11,7 +11,7 @@ from fake_model import write_model
 from fake_recording import Maker
 
 import bench
-from bench.methods import comparison, plugins
+from bench.methods import comparison, method_plugins
 from synth.errors import UserError
 
 CODE = '''
@@ -43,7 +43,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **named: str) -> None:
-    points = {plugins.METHODS.group: {name: f"lab_methods:{at}" for name, at in named.items()}}
+    points = {method_plugins.METHODS.group: {name: f"lab_methods:{at}" for name, at in named.items()}}
     tiny_package.install(tmp_path / "site", "lab_methods", CODE, points, monkeypatch)
 
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bench.methods import force_mixture, physics, posterior
 from bench.methods.compliance import ElasticBlock, TissueKind
+from bench.methods.method_interface import FrameMotion, MethodContext
 from bench.methods.posterior import LoadBasis, Observation
-from bench.methods.protocol import FrameMotion, MethodContext
 
 Floats = NDArray[np.float64]
 BARE = TissueKind("bonded", 0.0, 0.45)

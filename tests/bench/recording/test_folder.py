@@ -11,16 +11,16 @@ from fake_recording import Maker, texture
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bench.recording import meta, writer
-from bench.recording.folder import Recording, open_recording
+from bench.recording import meta, recording_writer
+from bench.recording.recording_folder import Recording, open_recording
 from synth.errors import UserError
 from synth.system import csv_table
-from synth.video import read as video
+from synth.video import read_video as video
 
 
 def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
     times = np.array([0, 0.04, 0.08, 0.21, 0.233, 1.0])
-    writer.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
+    recording_writer.write_video(tmp_path / "v.mp4", iter([texture(32, 48, k) for k in range(6)]), times)
     got = [picture.time_s for picture in video.read_video(tmp_path / "v.mp4")]
     assert got == pytest.approx(times, abs=1e-4)
 
@@ -28,8 +28,8 @@ def test_variable_frame_rate_keeps_its_times(tmp_path: Path) -> None:
 def test_times_of_day_keep_their_microseconds(tmp_path: Path) -> None:
     """Seconds since 1970, as a ROS bag stamps them, need sixteen figures."""
     times = 1.7e9 + np.array([0.0, 0.04, 0.080001])
-    writer.write_frames(tmp_path, times)
-    writer.write_force(tmp_path, times, np.eye(3))
+    recording_writer.write_frames(tmp_path, times)
+    recording_writer.write_force(tmp_path, times, np.eye(3))
     for name in ("frames", "force"):
         read = csv_table.read_csv(tmp_path / f"{name}.csv", ("t_s",) + ("fy_n",) * (name == "force"))
         assert read["t_s"] == pytest.approx(times, abs=1e-6, rel=0)
@@ -80,8 +80,8 @@ def _numbered(folder: Path, count: int, first: int, lost: int) -> Recording:
         assert cv2.imwrite(str(folder / f"masks/{k:06d}.png"), 255 * (np.arange(24).reshape(4, 6) <= k))
         if k != lost:
             assert cv2.imwrite(str(folder / f"frames/f2_{k + first}.png"), np.full((4, 6), k, np.uint8))
-    writer.write_frames(folder, 0.5 * np.arange(count))
-    writer.write_meta(folder, {"scale_mm_per_px": 0.1, "young_kpa": 1.0})
+    recording_writer.write_frames(folder, 0.5 * np.arange(count))
+    recording_writer.write_meta(folder, {"scale_mm_per_px": 0.1, "young_kpa": 1.0})
     return open_recording(folder)
 
 

@@ -11,8 +11,8 @@ from command import run
 from fake_model import write_model
 
 from bench.cli import app
-from bench.recording.folder import open_recording
 from bench.recording.from_sequence import export_recording
+from bench.recording.recording_folder import open_recording
 from learn.checkpoint import read_card, write_card
 from synth.dataset.store import Dataset, open_sequence
 from synth.job.schema import Job

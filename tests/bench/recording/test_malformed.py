@@ -10,7 +10,7 @@ import pytest
 from fake_recording import Maker, scored, texture
 
 from bench.checks.check_recording import check_recording
-from bench.recording import writer
+from bench.recording import recording_writer
 from synth.errors import UserError
 from synth.system import checked_file
 
@@ -32,7 +32,7 @@ def rows(change: Callable[[list[str]], list[str]]) -> Corruption:
 def cut_video(folder: Path) -> None:
     shutil.rmtree(folder / "frames")
     (folder / "frames.csv").unlink()
-    writer.write_video(folder / "video.mp4", iter([texture(96, 128)] * 6), np.arange(6) / 10)
+    recording_writer.write_video(folder / "video.mp4", iter([texture(96, 128)] * 6), np.arange(6) / 10)
     whole = (folder / "video.mp4").read_bytes()
     (folder / "video.mp4").write_bytes(whole[: len(whole) // 2])
 
@@ -82,7 +82,7 @@ def test_numbers_beyond_all_recordings_are_refused(
     folder = tmp_path / "rec"
     shutil.copytree(intact, folder)
     about = checked_file.read_yaml(folder / "meta.yaml") | changed
-    writer.write_meta(folder, {key: value for key, value in about.items() if value is not None})
+    recording_writer.write_meta(folder, {key: value for key, value in about.items() if value is not None})
     (only,) = (one for one in check_recording(folder) if one.severity == "error")
     assert "\n" not in only.message
 
@@ -92,7 +92,7 @@ def test_the_largest_and_least_numbers_are_reported(intact: Path, tmp_path: Path
     folder = tmp_path / "rec"
     shutil.copytree(intact, folder)
     about = checked_file.read_yaml(folder / "meta.yaml") | {"scale_mm_per_px": scale, "young_kpa": scale}
-    writer.write_meta(folder, about)
+    recording_writer.write_meta(folder, about)
     assert {one.cause for one in check_recording(folder) if one.severity == "error"} == {"scale", "stiffness"}
 
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from fake_recording import Bump, Maker
 
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
-from bench.recording.folder import open_recording
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
+from bench.recording.recording_folder import open_recording
 from bench.tracking.contact_free import ContactFreeSearch
 from bench.tracking.tracking import picture_masks, track_recording
-from synth.recording_flow.decode import RecordingFlowSettings
-from synth.video.read import read_mask
-from tests.synth.recording_flow.test_camera_motion import OPENING
-from tests.synth.recording_flow.test_find_tissue import RIM, SETTINGS, video
-from tests.synth.recording_flow.test_foreground import ROD, X, Y, load
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.video.read_video import read_mask
+from tests.synth.flow.recording.test_camera_motion import OPENING
+from tests.synth.flow.recording.test_find_tissue import RIM, SETTINGS, video
+from tests.synth.flow.recording.test_foreground import ROD, X, Y, load
 
 _SIZE = (96, 128)
 

@@ -9,8 +9,8 @@ from command import run
 from bench.checks import protocol
 from bench.checks.protocol import check_protocol, read_steps
 from bench.cli import app
-from bench.recording.folder import Force, Recording
 from bench.recording.meta import Meta
+from bench.recording.recording_folder import Force, Recording
 
 
 def lacking(tissue: Path | None = None, sensor_file: bool = True, **stated: Any) -> set[str]:

@@ -10,16 +10,16 @@ import pytest
 from numpy.typing import NDArray
 from skimage import data
 
-from bench.checks import stereo
+from bench.checks import camera_pair
 from bench.checks.judgement import judge
-from bench.methods.protocol import ForceEstimate, FrameMotion, MethodContext
-from bench.recording import writer
-from bench.recording.folder import open_recording
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
+from bench.recording import recording_writer
+from bench.recording.recording_folder import open_recording
 from bench.recording.right_pictures import StereoQuality
 from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import TrackedRecording, track_recording
-from synth.flow.stereo.track import Moved
-from synth.recording_flow.decode import RecordingFlowSettings
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.stereo.stereo_track import Moved
 from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, ROWS, K, source
 
 FPS = 6.0
@@ -59,10 +59,10 @@ def make(tmp_path: Path) -> Make:
                 now = cv2.remap(depth, *map(np.float32, (source(u), ROWS)), cv2.INTER_LINEAR)
                 np.save(tmp_path / f"depth/{t:03d}.npy", np.dstack([0 * now, 0 * now, now]) if t else now)
         about: dict[str, object] = {"scale_mm_per_px": AWAY / FOCAL, "young_kpa": 1.0, "fps": FPS}
-        writer.write_storage(tmp_path / "pair.yaml", CALIBRATION)
+        recording_writer.write_storage(tmp_path / "pair.yaml", CALIBRATION)
         pair = {"calibration": "pair.yaml", "mm_per_unit": BASE}
         about |= {"stereo": pair} if second == "right" else {"depth": {"focal_px": FOCAL}}
-        writer.write_meta(tmp_path, about)
+        recording_writer.write_meta(tmp_path, about)
         return tmp_path
 
     return made
@@ -155,7 +155,7 @@ def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: str) -> None:
 def test_a_baseline_in_metres_is_reported(make: Make) -> None:
     quality = StereoQuality(0.024, 0.1, 0.05e-3, 0.01)
     tracked = TrackedRecording(stereo=quality, scale_mm_per_px=0.05)
-    (found,) = stereo.check_scale(open_recording(make("right")), tracked)
+    (found,) = camera_pair.check_scale(open_recording(make("right")), tracked)
     assert found.severity == "error"
     assert {"metres,", "1000"} <= set(found.message.split())
 

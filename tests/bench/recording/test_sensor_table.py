@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fake_recording import Maker
 
-from bench.recording.folder import open_recording
+from bench.recording.recording_folder import open_recording
 from bench.recording.sensor_table import POUND, G, read_forces
 from synth.errors import UserError
 from synth.system import csv_table

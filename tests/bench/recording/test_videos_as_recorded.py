@@ -12,13 +12,13 @@ import pytest
 from fake_recording import Maker, texture
 
 from bench.checks.check_recording import check_recording
-from bench.importers import registry
-from bench.recording import writer
-from bench.recording.folder import open_recording
+from bench.importers import importer_registry
+from bench.recording import recording_writer
+from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
-from synth.video import read as video
+from synth.video import read_video as video
 from synth.video.file_numbers import find_stamps, number_files, still_times
-from synth.video.read import VideoFile
+from synth.video.read_video import VideoFile
 
 FPS = 25
 MOVED = [np.roll(texture(96, 128, 1), 2 * k, axis=1) for k in range(20)]
@@ -86,10 +86,10 @@ def test_covers_are_skipped_and_films_are_chosen(tmp_path: Path) -> None:
     several = mux(tmp_path / "s.mkv", [OTHER, MOVED])
     with pytest.raises(UserError, match="2 films"):
         next(video.read_video(several))
-    found = registry.read_source(several, {"stream": "1"})
+    found = importer_registry.read_source(several, {"stream": "1"})
     assert nearest(list(found.pictures())) == [*range(20)]
     with pytest.raises(UserError):
-        registry.read_source(several, {"stream": "2"})
+        importer_registry.read_source(several, {"stream": "2"})
 
 
 @pytest.mark.parametrize("codec", ["libx264", "mpeg2video"])
@@ -151,7 +151,7 @@ def test_a_video_that_ends_early_is_named(make: Maker, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_video_is_refused(content: bytes | None, tmp_path: Path) -> None:
-    writer.write_video(tmp_path / "v.mp4", iter(MOVED), np.arange(20) / FPS)
+    recording_writer.write_video(tmp_path / "v.mp4", iter(MOVED), np.arange(20) / FPS)
     whole = (tmp_path / "v.mp4").read_bytes()
     (tmp_path / "v.mp4").write_bytes(whole[: len(whole) // 2] if content is None else content)
     with pytest.raises(UserError) as refused:
@@ -172,16 +172,16 @@ def test_chapters_are_joined_with_their_gaps(tmp_path: Path) -> None:
 
     chapter("GX010123.MP4", MOVED[:10])
     chapter("GX020123.MP4", MOVED[10:])
-    found = registry.read_source(tmp_path)
+    found = importer_registry.read_source(tmp_path)
     assert found.times_s == pytest.approx(np.arange(20) / FPS, abs=1e-4)
     assert nearest(list(found.pictures())) == [*range(20)]
     chapter("GX010123.MP4", MOVED[:10], "2026-11-28T10:00:00Z")
     chapter("GX020123.MP4", MOVED[10:], "2026-11-28T10:00:30Z")
-    assert registry.read_source(tmp_path).times_s[10] == pytest.approx(30)
+    assert importer_registry.read_source(tmp_path).times_s[10] == pytest.approx(30)
     chapter("GX010124.MP4", MOVED[:10])  # another recording
     with pytest.raises(UserError, match="GX010124"):
-        registry.read_source(tmp_path)
-    assert len(registry.read_source(tmp_path, {"frames": "GX0?0123.MP4"}).times_s) == 20
+        importer_registry.read_source(tmp_path)
+    assert len(importer_registry.read_source(tmp_path, {"frames": "GX0?0123.MP4"}).times_s) == 20
 
 
 def test_folders_as_people_keep_them(make: Maker) -> None:

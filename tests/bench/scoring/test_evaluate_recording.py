@@ -9,8 +9,8 @@ from fake_recording import Maker, force_curve, scored
 from scipy.spatial.transform import Rotation
 
 from bench.checks.check_recording import check_recording
-from bench.recording import writer
-from bench.scoring import metrics
+from bench.recording import recording_writer
+from bench.scoring import force_metrics
 from bench.scoring.score import write_result
 
 
@@ -68,7 +68,7 @@ def test_a_contact_ends_at_samples_that_are_not_scored() -> None:
     force[:5] = 0
     used = np.ones(100, bool)
     used[40:60] = False
-    _, events = metrics.compute_all(time, force, force, 0.0, used)
+    _, events = force_metrics.compute_all(time, force, force, 0.0, used)
     assert [(event["from_s"], event["to_s"]) for event in events] == [(0.5, 3.9), (6.0, 9.9)]
 
 
@@ -78,9 +78,9 @@ EPOCH = 1.7e9
 def since_1970(folder: Path, frames: int, stamped: str = "both") -> None:
     time = np.arange(frames) / 10
     t = np.arange(0, time[-1] + 1e-9, 0.01)
-    writer.write_frames(folder, time + EPOCH * (stamped != "force"))
+    recording_writer.write_frames(folder, time + EPOCH * (stamped != "force"))
     newtons = np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0])
-    writer.write_force(folder, t + EPOCH * (stamped != "frames"), newtons)
+    recording_writer.write_force(folder, t + EPOCH * (stamped != "frames"), newtons)
 
 
 def test_times_since_1970_are_counted_from_the_start(make: Maker) -> None:
@@ -110,7 +110,7 @@ def test_a_rotated_sensor_is_converted_to_the_cameras_axes(make: Maker) -> None:
     folder = make(frames=12, meta=about)
     t = np.arange(0, 1.11, 0.01)
     in_camera = np.outer(force_curve(t) / 1000, [1.0, 0.0, 0.0])
-    writer.write_force(folder, t, in_camera @ turn)  # R^T f, as rows
+    recording_writer.write_force(folder, t, in_camera @ turn)  # R^T f, as rows
     result = scored(folder)
     assert result.sensor_axes_mn[:, 0] == pytest.approx(force_curve(np.arange(12) / 10), abs=0.5)
     assert np.abs(result.sensor_axes_mn[:, 1:]).max() < 1e-3

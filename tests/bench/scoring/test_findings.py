@@ -13,8 +13,8 @@ import bench
 from bench.checks import sensor as sensor_checks
 from bench.checks.contradiction import check_contradiction
 from bench.checks.sensor import SensorMotion
-from bench.recording import writer
-from synth.recording_flow.picture_faults import VideoFaults
+from bench.recording import recording_writer
+from synth.flow.recording.picture_faults import VideoFaults
 
 QUICK = Case("h264", (96, 128), "offset"), Case("mp4v", (96, 128), "ati", masks=False)
 
@@ -38,7 +38,7 @@ def test_none_of_24_clean_recordings_has_a_finding(tmp_path: Path, case: Case) -
 def edit(folder: Path, **sensor: object) -> None:
     meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
     meta["sensor"] |= sensor
-    writer.write_meta(folder, meta)
+    recording_writer.write_meta(folder, meta)
 
 
 def test_faults_of_the_sensor_are_found(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_faults_of_the_sensor_are_found(tmp_path: Path) -> None:
     assert "sensor" in {cause for cause, _ in found(folder)}
     edit(folder, free_s=[[0.0, 0.8]])
     meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
-    writer.write_meta(folder, meta | {"rest_frame": 45})
+    recording_writer.write_meta(folder, meta | {"rest_frame": 45})
     assert "rest frame" in {cause for cause, _ in found(folder)}
 
 

@@ -12,18 +12,18 @@ from fake_model import write_model
 from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
 
 from bench.methods.flow_size import flow_sizes
-from bench.methods.fusion import Fusion
+from bench.methods.force_fusion import Fusion
+from bench.methods.method_interface import ForceEstimate, Method, MethodContext
 from bench.methods.network import Model
-from bench.methods.protocol import ForceEstimate, Method, MethodContext
 from bench.scoring import charts
 from bench.scoring.headline import headline
-from bench.scoring.report import render_report
 from bench.scoring.result import Result, as_json
+from bench.scoring.score_report import render_report
 from learn.checkpoint import read_card, write_card
 from synth.arrays import Mask, Pixels
 from synth.flow.estimator import name_motion
-from synth.recording_flow.flow import LocalFlow
-from synth.recording_flow.frame_motion import FrameMotion
+from synth.flow.recording.flow import LocalFlow
+from synth.flow.recording.frame_motion import FrameMotion
 
 
 class Known(LocalFlow):

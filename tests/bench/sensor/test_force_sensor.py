@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from bench.recording import pixel_scale
-from bench.recording.folder import Force
+from bench.recording import recording_scale
 from bench.recording.meta import Meta, SensorMeta
+from bench.recording.recording_folder import Force
 from bench.sensor import force_sensor
 from synth.errors import UserError
 
@@ -92,9 +92,9 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
     dark = (((x - 30) // square + (y - 30) // square) % 2 == 0) & inside
     cv2.imwrite(str(tmp_path / "board.png"), np.where(dark, 20, 235).astype(np.uint8))
 
-    def find(columns: int, rows: int) -> pixel_scale.PixelScale:
+    def find(columns: int, rows: int) -> recording_scale.PixelScale:
         board = {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}
-        return pixel_scale.find_scale(Meta.model_validate({"calibration": board}), tmp_path)
+        return recording_scale.find_scale(Meta.model_validate({"calibration": board}), tmp_path)
 
     found = find(7, 5)
     assert found.mm_per_px == pytest.approx(2.0 / square, rel=0.005)
@@ -105,6 +105,6 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
 
 def test_scale_bar() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
-    found = pixel_scale.find_scale(about, Path())
+    found = recording_scale.find_scale(about, Path())
     assert found.mm_per_px == pytest.approx(0.05)
     assert found.uncertainty == pytest.approx(np.sqrt(2) / 100)

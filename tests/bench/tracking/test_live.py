@@ -18,16 +18,16 @@ from warped_cortex import Recipe, Stage
 
 from bench.cli import app
 from bench.methods.network import Model
-from bench.recording.folder import open_recording
-from bench.recording.writer import write_video
+from bench.recording.recording_folder import open_recording
+from bench.recording.recording_writer import write_video
 from bench.tracking import live
 from bench.tracking.tracking import track_recording
 from synth.arrays import Mask, Pixels
-from synth.recording_flow.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
-from synth.recording_flow.flow import FlowProcess, LocalFlow
-from synth.recording_flow.frame_motion import FrameMotion
-from synth.recording_flow.video_pass import VideoPass
-from synth.video.read import Picture, read_video
+from synth.flow.recording.decode import LIVE_COLUMNS, Footage, RecordingFlowSettings
+from synth.flow.recording.flow import FlowProcess, LocalFlow
+from synth.flow.recording.frame_motion import FrameMotion
+from synth.flow.recording.video_pass import VideoPass
+from synth.video.read_video import Picture, read_video
 
 
 def pictures(frames: int) -> list[Picture]:

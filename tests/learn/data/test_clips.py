@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from learn.data.clips import Clip, load_clips, pack, unpack
 from learn.data.grid import Grid
 from learn.split import groups
-from synth.dataset.split import name_anatomy
+from synth.dataset.sequence_split import name_anatomy
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 

@@ -20,12 +20,12 @@ from learn.data.clips import Clip, load_clips
 from learn.data.grid import Scales
 from learn.settings import preset
 from synth.cli import app as synth
-from synth.dataset import index, split
-from synth.dataset.folder import claim
-from synth.dataset.split import DatasetSplit
+from synth.dataset import index, sequence_split
+from synth.dataset.dataset_folder import claim
+from synth.dataset.sequence_split import DatasetSplit
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish.export.registry import EXPORTERS, export_dataset
+from synth.publish.export.exporter_registry import EXPORTERS, export_dataset
 
 BASE, SCALES = preset("tiny", size=32), Scales(1.0, 0.2, 1.0, 100.0, 0.3)
 
@@ -49,7 +49,7 @@ def divided(*datasets: Path) -> tuple[ModelCard, partition.Split]:
 
 
 WITH_SIDES = ("hf", "webdataset")
-"""Formats that state the side of a sequence beside split.csv."""
+"""Formats that state the side of a sequence beside sequence_split.csv."""
 
 
 def exported(dataset: Path, target: Path, every: bool) -> dict[str, dict[int, str]]:
@@ -94,7 +94,7 @@ def test_no_sequence_is_on_two_sides_in_any_artefact(tmp_path: Path, draw: int, 
     on = {row["index"]: stored.sides[row["content_hash"]] for row in rows}
     # Publication.
     assert {row["index"]: row["split"] for row in rows} == on
-    assert not split.leaks(rows, stored)
+    assert not sequence_split.leaks(rows, stored)
     assert stored.hash in (own / "README.md").read_text()
     for found in exported(own, tmp_path, every).values():
         assert found == on
@@ -115,7 +115,7 @@ def test_training_sequences_are_not_scored_whatever_another_split_says(tmp_path:
     card, _ = divided(own)
     fitted = card.split["fit"][0]
     sides = dict.fromkeys(index.read_split(own).sides, "train") | {fitted: "test"}
-    split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
+    sequence_split.store(own, DatasetSplit(sides=sides))  # type: ignore[arg-type]
     clips = load_clips(own, BASE.grid, ["ideal"])
     with pytest.raises(UserError):
         partition.choose_unseen(clips, own, card)

@@ -16,7 +16,7 @@ from learn.inference.grid_placement import GridPlacement
 from learn.inference.predict import load_model, net_force
 from learn.uncertainty.intervals import LEVEL
 from synth.errors import UserError
-from synth.recording_flow.frame_motion import FrameMotion
+from synth.flow.recording.frame_motion import FrameMotion
 
 SHAPE, SCALE = (48, 64), 0.5
 

@@ -17,7 +17,7 @@ from command import run
 from fake_model import write_model
 
 import learn
-from bench.recording import writer
+from bench.recording import recording_writer
 from learn.checkpoint import ModelCard, read_card, write_card
 from learn.cli import app
 from learn.data.clips import Clip
@@ -26,20 +26,20 @@ from learn.inference import prediction_file
 from learn.inference.apply import apply, stiffness
 from learn.inference.convert import examples
 from learn.inference.export import export
-from learn.inference.motion import motions
 from learn.inference.predict import load_model
-from learn.inference.shipped import MODELS
+from learn.inference.shipped_networks import MODELS
+from learn.inference.video_motion import motions
 from learn.settings import preset
 from learn.training.batches import measure_scales
 from synth.dataset.store import Dataset
 from synth.errors import UserError
 from synth.flow.estimator import name_motion
-from synth.recording_flow.decode import Footage, RecordingFlowSettings
-from synth.recording_flow.video_pass import VideoPass
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.video_pass import VideoPass
 from synth.system.checked_file import write_picture
 from synth.system.config_file import override
 from synth.video.pixel_scale import UNKNOWN_NOTE
-from synth.video.read import read_video
+from synth.video.read_video import read_video
 
 
 @pytest.fixture(
@@ -124,7 +124,7 @@ def write_video(file: Path, frames: int = 3) -> None:
     wide = (255 * (wide - wide.min()) / np.ptp(wide)).clip(40, 220).astype(np.uint8)
     coloured = (wide[..., None] * np.array([1.0, 0.75, 0.7])).astype(np.uint8)
     shown = (np.ascontiguousarray(coloured[:, 8 - t : 72 - t]) for t in range(frames))
-    writer.write_video(file, shown, np.arange(frames) / 10, crf=0)
+    recording_writer.write_video(file, shown, np.arange(frames) / 10, crf=0)
 
 
 def test_a_video_is_followed_and_predicted(model: Path, tmp_path: Path) -> None:

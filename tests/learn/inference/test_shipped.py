@@ -13,7 +13,7 @@ from command import run
 import learn
 from learn import checkpoint
 from learn.cli import app
-from learn.inference import shipped
+from learn.inference import shipped_networks
 from synth.flow.estimator import name_motion
 from synth.system.checked_file import folder_bytes
 from weights.pack import LARGEST_BYTES, pack_model
@@ -24,7 +24,7 @@ FILES = ("README.md", "config.json", "network.onnx", "weights.safetensors")
 @pytest.fixture
 def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder in place of the pretrained networks."""
-    monkeypatch.setattr(shipped, "MODELS", tmp_path / "models")
+    monkeypatch.setattr(shipped_networks, "MODELS", tmp_path / "models")
     monkeypatch.chdir(tmp_path)
     return tmp_path / "models"
 
@@ -52,19 +52,19 @@ def test_a_packed_model_is_equal(models: Path) -> None:
     ("name", "force"), [("mono", [196.83, 500.95, -1000.8]), ("stereo", [9.6826, 4.8439, 10.097])]
 )
 def test_the_pretrained_networks_predict_the_same_as_before(name: str, force: list[float]) -> None:
-    model, card = checkpoint.read_model(shipped.MODELS / name)
+    model, card = checkpoint.read_model(shipped_networks.MODELS / name)
     given = np.random.default_rng(0).random((1, len(card.settings.arch.channels), 128, 128), np.float32)
     with torch.no_grad():
         found = model(torch.from_numpy(given))[0].sum(dim=(1, 2))
     np.testing.assert_allclose(found, force, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", shipped.NAMES)
+@pytest.mark.parametrize("name", shipped_networks.NAMES)
 def test_pretrained_networks_are_small_complete_and_documented(name: str) -> None:
-    folder, card = shipped.MODELS / name, learn.load_model(name).card
+    folder, card = shipped_networks.MODELS / name, learn.load_model(name).card
     assert {file.name for file in folder.iterdir()} == set(FILES)
     assert max(file.stat().st_size for file in folder.iterdir()) <= LARGEST_BYTES == 4_000_000
     assert card.settings.arch.depth == (name == "stereo")
     for motion, doubts in ((["tvl1 0"], 1), ([], 1), ([name_motion("tvl1")], 0)):
         assert len(replace(card, motion=motion).doubt(name_motion("tvl1"))) == doubts
-    assert shipped.hash_data(card) in (folder / "README.md").read_text()
+    assert shipped_networks.hash_data(card) in (folder / "README.md").read_text()

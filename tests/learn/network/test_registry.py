@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from learn import checkpoint
 from learn.checkpoint import read_card, read_model, write_card
 from learn.data.clips import Clip
-from learn.inference import shipped
+from learn.inference import shipped_networks
 from learn.inference.convert import Portable, examples
 from learn.inference.predict import Predictor, input_names, load_model
 from learn.network.registry import NETWORKS, Network, build
@@ -45,9 +45,9 @@ def assert_equal(got: np.ndarray, expected: np.ndarray) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE * largest)
 
 
-@pytest.mark.parametrize("name", shipped.NAMES)
+@pytest.mark.parametrize("name", shipped_networks.NAMES)
 def test_the_pretrained_networks_equal_pytorch(name: str) -> None:
-    folder, predictor = shipped.MODELS / name, load_model(name)
+    folder, predictor = shipped_networks.MODELS / name, load_model(name)
     for batch in (1, 20):  # a frame, and more than a batch of training
         inputs = examples(predictor.card, batch, seed=batch)
         assert_equal(by_onnx(predictor, inputs), by_pytorch(folder, inputs))

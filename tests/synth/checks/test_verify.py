@@ -16,12 +16,12 @@ import zarr
 from fake_run import in_process
 
 from synth.checks import verify
-from synth.dataset import index, split
-from synth.dataset.folder import claim
+from synth.dataset import index, sequence_split
+from synth.dataset.dataset_folder import claim
 from synth.dataset.store import open_sequence
 from synth.errors import UserError
 from synth.job.schema import Job
-from synth.publish.export.registry import export_dataset
+from synth.publish.export.exporter_registry import export_dataset
 
 PAIR = {"size": (96, 72), "stereo_mm": 24.0}
 JOB = Job(seed=1, sequences=2, frames=5, render=PAIR, flow={"backend": "ideal"})
@@ -178,7 +178,7 @@ def test_an_index_of_another_program_and_a_damaged_split_are_refused(dataset: Pa
     assert "dataset" in failing(dataset)
     (dataset / "split.json").write_text(text)
     with pytest.raises(UserError, match="split"):
-        split.read_stored(dataset)
+        sequence_split.read_stored(dataset)
 
 
 def test_no_run_follows_a_link(dataset: Path, tmp_path: Path) -> None:

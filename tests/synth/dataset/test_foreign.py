@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.errors import UserError
 from synth.formats import FIRST, FOLDER, check_format
 from synth.job.reader import parse_job

@@ -17,7 +17,7 @@ from forked_workers import Forkserver
 
 from synth.cli import app
 from synth.dataset import index, provenance, size_forecast
-from synth.dataset.folder import Folder, Part, parse_part
+from synth.dataset.dataset_folder import Folder, Part, parse_part
 from synth.engine import child, status
 from synth.engine import run as engine
 from synth.engine.child import Child, Setup

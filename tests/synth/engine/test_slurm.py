@@ -7,7 +7,7 @@ import pytest
 import slurm_cluster
 from fake_run import Silent, wait_for
 
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.engine import run
 from synth.job.schema import Job
 

@@ -14,7 +14,7 @@ from synth.errors import UserError
 from synth.fem import solver, tool_gesture
 from synth.fem.material import Tissue
 from synth.fem.surface_embedding import vertex_area
-from synth.job import mechanics, reader, schema
+from synth.job import mechanics_sections, reader, schema
 from synth.render.camera import camera
 from synth.sequence import scenario
 
@@ -100,15 +100,15 @@ def test_the_page_has_the_table_of_instruments() -> None:
         gesture: [*re.findall(r"`(\w+)` \d+%", usual), *re.findall(r"`(\w+)`", others)]
         for gesture, usual, others in rows
     }
-    assert shown == {kind: list(takes) for kind, takes in mechanics.INSTRUMENTS.items()}
+    assert shown == {kind: list(takes) for kind, takes in mechanics_sections.INSTRUMENTS.items()}
     shares = [int(share) for _, usual, _ in rows for share in re.findall(r"(\d+)%", usual)]
-    known = [share for takes in mechanics.INSTRUMENTS.values() for share in takes.values() if share]
+    known = [share for takes in mechanics_sections.INSTRUMENTS.values() for share in takes.values() if share]
     assert shares == [round(100 * share) for share in known]
 
 
 def test_gestures_and_instruments_are_drawn_together() -> None:
-    for kind, takes in mechanics.INSTRUMENTS.items():
-        for tool in get_args(mechanics.Instrument):
+    for kind, takes in mechanics_sections.INSTRUMENTS.items():
+        for tool in get_args(mechanics_sections.Instrument):
             one = {"gesture": kind, "instrument": tool}
             if tool in takes or tool == "none":
                 (gesture,) = scenario.draw_scenario(job(one), 0).gestures

@@ -20,7 +20,7 @@ from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
 from synth.job import schema
-from synth.job.laws import LEAST_JACOBIAN
+from synth.job.law_choice import LEAST_JACOBIAN
 
 Floats = np.ndarray
 

@@ -6,7 +6,7 @@ from dome import ANATOMY
 
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import jacobians, quality, shape
-from synth.fem.mesh.relief import HeightMap
+from synth.fem.mesh.mesh_relief import HeightMap
 from synth.fem.mesh.tetrahedra import Tets
 
 EXTENT, SIDE = 34.0, 171

@@ -16,7 +16,7 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.refine import EDGES
 from synth.fem.solver import deform
 from synth.fem.tool_gesture import Gesture
-from synth.job import laws, schema
+from synth.job import law_choice, schema
 from synth.sequence import scenario
 
 
@@ -101,6 +101,6 @@ def test_what_no_law_or_surface_holds_is_refused(monkeypatch: pytest.MonkeyPatch
     away = replace(gesture.contacts[0], point_mm=(200.0, 0.0))
     with pytest.raises(UserError):
         run(fem, replace(gesture, contacts=(away,)))
-    monkeypatch.setitem(laws.LARGEST_LOAD, "corotational", 10.0)
+    monkeypatch.setitem(law_choice.LARGEST_LOAD, "corotational", 10.0)
     with pytest.raises(InvertedElement):
         run(schema.FemSection(law="corotational", load=(8.0, 8.0), gestures=("push",), tets=400))

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from synth.errors import UserError
 from synth.flow.stereo import depth_correction, depth_motion, rest
 from synth.flow.stereo.rig import Intrinsics, Rectified, StereoRig
-from synth.flow.stereo.track import StereoTracker
+from synth.flow.stereo.stereo_track import StereoTracker
 
 SIZE = (160, 120)
 FOCAL, BASE, AWAY = 1370.0, 24.0, 300.0

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from synth.errors import UserError
-from synth.job import identity, reader, writer
+from synth.job import identity, job_writer, reader
 from synth.job.schema import Job
 from synth.sequence import scenario
 
@@ -60,8 +60,8 @@ def test_commented_file_and_dump_read_back_as_the_same_job() -> None:
     timed = {"timing": ["0.1 s", "0.2 s", "0.3 s", "0.4 s"]}
     fem = {"load": 0.05, "instrument": "spatula", "instrument_list": [timed]}
     job = Job(seed=3, fem=fem, appearance={"families": ["pale", "calf"]})
-    assert reader.parse_job(writer.commented(job), "job.yaml", Path()) == job
-    assert reader.parse_job(writer.dump_job(job), "job.yaml", Path()) == job
+    assert reader.parse_job(job_writer.commented(job), "job.yaml", Path()) == job
+    assert reader.parse_job(job_writer.dump_job(job), "job.yaml", Path()) == job
 
 
 def test_the_identity_does_not_depend_on_the_number_of_sequences() -> None:

@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from synth.cli import app
 from synth.dataset import index
-from synth.dataset.folder import Folder
+from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Dataset
 from synth.publish import card, picture
 

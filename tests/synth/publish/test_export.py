@@ -16,7 +16,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 from synth.cli import app
-from synth.dataset import index, split
+from synth.dataset import index, sequence_split
 from synth.dataset.store import Dataset, Sequence, Writer
 from synth.dataset.torch_dataset import TorchDataset
 from synth.errors import UserError
@@ -25,7 +25,7 @@ from synth.job.schema import Job
 from synth.publish import sequence_video
 from synth.publish.export import endonerf, hugging_face
 from synth.publish.export.encoding import write_exr
-from synth.publish.export.registry import EXPORTERS, export_dataset
+from synth.publish.export.exporter_registry import EXPORTERS, export_dataset
 from synth.render.camera.camera import Camera, project, rays
 
 
@@ -35,7 +35,7 @@ def by_index(root: Path) -> dict[int, Sequence]:
 
 def sides(root: Path) -> dict[str, set[int]]:
     rows = index.read_index(root).to_pylist()
-    return {side: {row["index"] for row in rows if row["split"] == side} for side in split.SIDES}
+    return {side: {row["index"] for row in rows if row["split"] == side} for side in sequence_split.SIDES}
 
 
 def test_folder(root: Path, tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ from egg_brain import soup, written
 
 import synth
 from synth.cli import app
-from synth.job import identity, writer
+from synth.job import identity, job_writer
 from synth.job.reader import parse_job
 from synth.publish import openings
 from synth.publish.openings import Opening
 from synth.sequence.fem_mechanics import build_volume
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 
 pytestmark = pytest.mark.slow
 
@@ -69,4 +69,4 @@ def test_sequences_use_the_openings_of_a_brain_in_turn(egg: Path, found: list[Op
     named = [identity.identify_opening(job, index, identity.identify_anatomy(job, 0)) for index in range(6)]
     assert named[:3] == named[3:]
     assert len(set(named)) == 3
-    assert parse_job(writer.commented(job), "job", Path()) == job
+    assert parse_job(job_writer.commented(job), "job", Path()) == job

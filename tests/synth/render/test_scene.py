@@ -20,7 +20,7 @@ from synth.render.craniotomy import craniotomy
 from synth.render.mitsuba.adapter import pick
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
-from synth.sequence.scene import at_rest
+from synth.sequence.rest_scene import at_rest
 from synth.system import gpu, llvm
 
 pytestmark = pytest.mark.slow

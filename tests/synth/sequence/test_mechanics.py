@@ -19,7 +19,7 @@ from synth.fem.pulse import Pulse
 from synth.geometry.brain_surface import load_brain, read_brain
 from synth.job.schema import CraniotomySection
 from synth.render.camera import camera as cameras
-from synth.sequence.scene import RestScene, draw_craniotomy
+from synth.sequence.rest_scene import RestScene, draw_craniotomy
 
 TILTED = {"point": [20.0, 14.0, 12.0], "direction": [0.6, 0.4, 0.7], "radius_mm": 10.0}
 SMALL = {"sequences": 1, "frames": 4, "fem": {"tets": 400}, "render": {"size": (96, 72), "spp": 1}}

@@ -20,8 +20,8 @@ from synth.render.camera.video_link import recorded
 from synth.render.randomized.pattern import Pattern, paint
 from synth.render.scene import Renderer
 from synth.sequence.randomization import randomized
+from synth.sequence.rest_scene import at_rest
 from synth.sequence.scenario import Scenario, draw_scenario
-from synth.sequence.scene import at_rest
 
 COUNT = 100
 SENSOR = CameraSensor(full_well=1e9, read_noise=0.0, sharpening=0.0, bloom=0.0, vignette=0.0)

@@ -14,11 +14,11 @@ from synth.arrays import Floats
 from synth.checks.verify import verify_dataset
 from synth.cli import app
 from synth.errors import Caution, UserError
-from synth.fem.external.read import read_job_series
+from synth.fem.external.read_series import read_job_series
 from synth.job import identity
 from synth.job.schema import Job
 from synth.render.camera import camera
-from synth.sequence.scene import draw_craniotomy
+from synth.sequence.rest_scene import draw_craniotomy
 
 SMALL = [
     "sequences=1",

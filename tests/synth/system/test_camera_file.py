@@ -9,7 +9,7 @@ import pytest
 
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
-from synth.render.camera import calibration
+from synth.render.camera import camera_calibration
 from synth.system.camera_file import describe, find_baseline_mm, read_lens
 
 K = [[800.0, 0.0, 320.5], [0.0, 801.0, 238.5], [0.0, 0.0, 1.0]]
@@ -72,13 +72,13 @@ def test_what_opencv_wrote_is_read_and_another_size_of_the_same_shape_keeps_the_
         storage.write(key, value)
     storage.release()
     for width, height in ((640, 480), (320, 240)):
-        found, lens = calibration.read(tmp_path / name, (width, height))
+        found, lens = camera_calibration.read(tmp_path / name, (width, height))
         np.testing.assert_allclose(lens, D)
         assert found[0, 0] == pytest.approx(K[0][0] * width / 640)
         # The corner of the picture, half a pixel outside the first centre, is where it was.
         assert (-0.5 - found[0, 2]) / found[0, 0] == pytest.approx((-0.5 - K[0][2]) / K[0][0])
     with pytest.raises(UserError):
-        calibration.read(tmp_path / name, (640, 360))
+        camera_calibration.read(tmp_path / name, (640, 360))
 
 
 @pytest.mark.parametrize(("name", "text", "right"), [("a.yaml", KALIBR, 900), ("a.ini", INI, 800)])

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from synth.arrays import Floats, Ints
 from synth.errors import UserError
 from synth.fem.external.plausibility import contact_radius, is_rigid
-from synth.fem.external.read import doubt_load, read_series
+from synth.fem.external.read_series import doubt_load, read_series
 from synth.fem.external.series import MeshSeries, Units
 from synth.geometry.mesh_file import SURFACES, read_mesh, read_surface
 from synth.geometry.skin import skin

@@ -1,0 +1,82 @@
+"""Millimetres per pixel and their uncertainty.
+
+At equal flow in pixels both the depth u and the width a of a dent are proportional to the scale. On an
+elastic body F = E a² g(u/a), so force is proportional to the scale's square: 5% of scale is 10% of force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bench.recording.meta import Meta, ScaleCalibration
+from bench.recording.recording_folder import open_recording
+from synth.errors import UserError
+from synth.video import read_video as video
+from synth.video.pixel_scale import ASSUMED_WIDTH_MM, pixel_mm
+
+_UNKNOWN = 0.99  # relative uncertainty of an unknown scale
+_STATED = 0.02  # relative uncertainty of a stated scale, unless given
+_POINT_PX = 1.0  # standard error of a point marked by hand
+_DISTANCE = 0.01  # relative standard error of a stated working distance
+
+
+@dataclass(frozen=True)
+class PixelScale:
+    """Scale at the tissue."""
+
+    mm_per_px: float
+    uncertainty: float  # relative, one standard deviation
+    source: str
+
+
+def find_scale(meta: Meta, folder: Path) -> PixelScale:
+    """The recording's scale, stated or calibrated by `meta.yaml`. UserError for no checkerboard found, points
+    that coincide, or, for an unknown scale, no picture."""
+    if meta.scale_mm_per_px == "unknown":
+        wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
+        source = f"unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
+        found = PixelScale(pixel_mm("unknown", wide), _UNKNOWN, source)
+    elif meta.scale_mm_per_px is not None:
+        found = PixelScale(meta.scale_mm_per_px, _STATED, "stated")
+    else:
+        assert meta.calibration is not None
+        found = _calibrated(meta.calibration, folder)
+    return found if meta.scale_uncertainty is None else replace(found, uncertainty=meta.scale_uncertainty)
+
+
+def _calibrated(way: ScaleCalibration, folder: Path) -> PixelScale:
+    if way.focal_px is not None and way.distance_mm is not None:
+        return PixelScale(way.distance_mm / way.focal_px, _DISTANCE, "focal length and working distance")
+    if way.bar_px is not None and way.bar_mm is not None:
+        return _bar(way.bar_px, way.bar_mm)
+    assert way.checkerboard is not None
+    assert way.corners is not None
+    assert way.square_mm is not None
+    return _checkerboard(folder / way.checkerboard, way.corners, way.square_mm)
+
+
+def _bar(ends: tuple[tuple[float, float], tuple[float, float]], length_mm: float) -> PixelScale:
+    length = float(np.hypot(ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]))
+    if length < 2:
+        raise UserError(f"calibration: the ends of the bar are {length:.1f} px apart")
+    return PixelScale(length_mm / length, float(np.sqrt(2)) * _POINT_PX / length, "scale bar")
+
+
+def _checkerboard(path: Path, corners: tuple[int, int], square_mm: float) -> PixelScale:
+    """Scale by the mean length of the squares' sides; their spread, by tilt and distortion, is its error."""
+    columns, rows = corners
+    grey = np.ascontiguousarray(video.read_picture(path).mean(axis=2).astype(np.uint8))
+    found, points = cv2.findChessboardCornersSB(grey, (columns, rows))
+    if not found:
+        raise UserError(f"{path}: no checkerboard of {columns} x {rows} inner corners found")
+    grid = np.asarray(points, np.float64).reshape(rows, columns, 2)
+    sides = [np.linalg.norm(np.diff(grid, axis=k), axis=-1).ravel() for k in (0, 1)]
+    middle = float((lengths := np.concatenate(sides)).mean())
+    # Under tilt sides along rows and columns differ: half that difference is a systematic error.
+    tilt = abs(float(sides[0].mean() - sides[1].mean())) / 2
+    error = float(np.hypot(lengths.std() / np.sqrt(len(lengths)), tilt)) / middle
+    return PixelScale(square_mm / middle, max(error, 1e-4), "checkerboard")

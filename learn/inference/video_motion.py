@@ -1,0 +1,210 @@
+"""Motion of a video, read from sequence stores, datasets, videos or arrays of flow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from learn.data.clips import FIELDS, RECOVERED, check_readable, has_depth
+from synth.arrays import Array, Floats, Mask
+from synth.dataset.store import Dataset, Sequence, open_sequence
+from synth.errors import UserError, as_positive
+from synth.flow.estimator import name_motion
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.finding import Finding, judge_scale
+from synth.flow.recording.frame_motion import FrameMotion, Size
+from synth.flow.recording.video_track import track_video
+from synth.flow.stereo.stereo_track import Moved
+from synth.system import checked_file
+from synth.video import read_video as video
+from synth.video.mask_files import MaskFiles
+from synth.video.pixel_scale import UNKNOWN_NOTE, StatedScale, pixel_mm
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of one video."""
+
+    name: str
+    frames: Callable[[], Iterator[FrameMotion]]  # in order; may be called again
+    tissue: Mask  # (H, W) in the rest frame
+    scale_mm_per_px: float
+    young_kpa: float | None
+    force_mn: Floats | None = None  # (T,) size of the true force, if known
+    shrink: int = 1  # factor by which pictures were shrunk before flow
+    recovered_by: str = ""  # estimator and version of recovered motion; empty if unknown
+    notes: tuple[str, ...] = ()  # on the processing
+    findings: tuple[Finding, ...] = ()
+    scale_known: bool = True  # False: the picture's width was assumed, and forces are right up to a factor
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """What a video file lacks, and settings of its flow."""
+
+    scale_mm_per_px: StatedScale | None = None
+    tissue: Path | Array | None = None  # a picture, white on tissue, or (H, W); None: found
+    settings: RecordingFlowSettings = field(default_factory=RecordingFlowSettings)
+    tool: MaskFiles | Array | None = None  # instrument masks, (T, H, W) or (H, W); None: detected
+    fps: float = video.FPS  # of pictures without times
+
+
+def motions(path: Path | Array, source: str, options: VideoOptions | None = None) -> Iterator[Motion]:
+    """Motions in a dataset, a store, an .npz, a video, a folder of PNGs or frames (T, H, W, 3) uint8.
+
+    An .npz holds `flow` (T, H, W, 2) px, `tissue` (H, W), `scale_mm_per_px`, and if known `young_kpa`,
+    `confidence` (T, H, W) and `force_mn` (T,); or, for stereo, `motion` and `deviation` (T, H, W, 3) mm
+    instead of flow and confidence. Raises UserError for anything else, and for a video without a scale.
+    """
+    if isinstance(path, np.ndarray) or video.is_video(path):
+        yield _video(path, options or VideoOptions())
+    elif path.suffix == ".npz":
+        yield _arrays(path)
+    else:
+        for sequence in _sequences(path):
+            yield _stored(sequence, source)
+
+
+def has_right_camera(path: Path | Array) -> bool:
+    """Whether `path` holds motion in three dimensions; of a dataset its first sequence decides."""
+    if isinstance(path, np.ndarray) or video.is_video(path):
+        return False
+    if path.suffix == ".npz":
+        return "motion" in checked_file.ArrayFile(path)
+    first = next(_sequences(path), None)
+    return first is not None and FIELDS["motion"] in first
+
+
+def _sequences(path: Path) -> Iterator[Sequence]:
+    one = path.name.endswith((".zarr", ".zarr.part"))
+    yield from [open_sequence(path)] if one else Dataset(path)
+
+
+def _stored(sequence: Sequence, source: str) -> Motion:
+    check_readable(sequence, [source])
+    scale = float(sequence.attrs["scale_mm_per_px"])
+    time_s, tissue = map(sequence.read_whole, ("time", "tissue"))
+
+    def frames() -> Iterator[FrameMotion]:
+        confidences: Iterator[Any] = repeat(np.ones(tissue.shape, np.float32), sequence.frames)
+        if source == "recovered" and "flow_confidence" in sequence:
+            confidences = sequence.read_sealed("flow_confidence")
+        deviations: Iterator[Any] = repeat(np.zeros((*tissue.shape, 3), np.float32), sequence.frames)
+        if source == "motion":
+            deviations = sequence.read_sealed("motion_deviation")
+        arrays = zip(sequence.read_sealed(FIELDS[source]), confidences, deviations, time_s, strict=True)
+        for t, (values, confidence, deviation, at) in enumerate(arrays):
+            motion = Moved(values, deviation) if has_depth(source) else None
+            flow = values if motion is None else np.asarray(values[..., :2] / scale, np.float32)
+            yield FrameMotion(flow, confidence, motion=motion, index=t, time_s=float(at))
+
+    return Motion(
+        name=sequence.path.stem,
+        frames=frames,
+        tissue=tissue.astype(bool),
+        scale_mm_per_px=scale,
+        young_kpa=sequence.attrs["young_kpa"],
+        recovered_by=sequence.recovered_by if source in RECOVERED else "",
+        force_mn=np.linalg.norm(sequence.read_whole("force"), axis=1) if "force" in sequence else None,
+    )
+
+
+def _video(source: Path | Array, options: VideoOptions) -> Motion:
+    path = source if isinstance(source, Path) else Path("frames")
+    if options.scale_mm_per_px is None:
+        raise UserError(f"{path}: a video needs its scale (scale_mm_per_px, --scale): mm/px, or unknown")
+    if isinstance(source, np.ndarray) and (source.dtype != np.uint8 or source.shape[3:] != (3,)):
+        raise UserError(f"{path}: {source.dtype} {source.shape}, expected uint8 (T, H, W, 3)")
+    scale_known = options.scale_mm_per_px != "unknown"
+    tissue: Callable[[Size], Mask] | None = None
+    if isinstance(options.tissue, Path):
+        tissue = partial(video.read_mask, options.tissue)
+    elif options.tissue is not None:
+        tissue = partial(_mask, "tissue", options.tissue, 0)
+    taken: list[str] = [] if scale_known else [UNKNOWN_NOTE]
+    is_file = isinstance(source, Path) and not source.is_dir()
+    if isinstance(source, Path) and not is_file and options.fps == video.FPS:
+        taken.append(f"the pictures have no times: {options.fps:g} per second are assumed")
+    tool: Callable[[int, Size], Mask | None] | None = None
+    if isinstance(options.tool, MaskFiles):
+        count = video.count_frames(path) if is_file else None
+        tool = options.tool.of_frames(range(count or 0), taken).read
+    elif options.tool is not None:
+        tool = partial(_mask, "masks", options.tool)
+    footage = Footage(partial(_pictures, source, options.fps), str(path), tissue, tool)
+    track = track_video(footage, options.settings)
+    rest, findings = track.video.rest, track.video.findings
+    scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
+    removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
+    missing = [found.message for found in findings if found.severity == "missing"]
+    return Motion(
+        name=path.stem,
+        frames=lambda: (replace(frame, time_s=frame.time_s or 0.0) for frame in track.frames()),
+        tissue=rest.tissue,
+        scale_mm_per_px=scale * rest.shrink,
+        young_kpa=None,
+        recovered_by=name_motion(options.settings.backend),
+        shrink=rest.shrink,
+        notes=(*taken, *track.notes, *removed, *missing),
+        findings=(*judge_scale(scale, rest.size[1]), *findings),
+        scale_known=scale_known,
+    )
+
+
+def _pictures(source: Path | Array, fps: float) -> Iterator[video.Picture]:
+    if isinstance(source, Path):
+        return video.read_frames(source, fps)
+    return (video.Picture(t, t / fps, np.ascontiguousarray(rgb)) for t, rgb in enumerate(source))
+
+
+def _mask(what: str, given: Array, index: int, size: Size) -> Mask:
+    """The mask of a frame, (H, W), from one for all or from (T, H, W)."""
+    if given.shape[-2:] != size or given.ndim not in (2, 3) or (given.ndim == 3 and index >= len(given)):
+        raise UserError(f"{what}: {given.shape}, but frame {index} of the video is {size}")
+    return np.asarray((given if given.ndim == 2 else given[index]) != 0)
+
+
+def _arrays(path: Path) -> Motion:
+    found = checked_file.read_arrays(path)
+    names = ("motion", "deviation") if "motion" in found else ("flow",)
+    if missing := {*names, "tissue", "scale_mm_per_px"} - found.keys():
+        raise UserError(f"{path}: needs {', '.join(sorted(missing))}")
+    tissue, count = found["tissue"].astype(bool), found[names[0]].shape[:1]
+    if not count or not count[0]:
+        raise UserError(f"{path}: {names[0]} holds no frames")
+    if tissue.ndim != 2:
+        raise UserError(f"{path}: tissue is {tissue.shape}, expected (H, W)")
+    wanted = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
+    wanted |= {"confidence": (*count, *tissue.shape), "force_mn": count}
+    for name, shape in wanted.items():
+        if name in found and found[name].shape != shape:
+            raise UserError(f"{path}: {name} is {found[name].shape}, expected {shape} like the tissue")
+    scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
+
+    def frames() -> Iterator[FrameMotion]:
+        confidence = found.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
+        for t in range(count[0]):
+            first, *rest = (found[name][t].astype(np.float32) for name in names)
+            motion = Moved(first, rest[0]) if rest else None
+            flow = first[..., :2] / scale if rest else first
+            yield FrameMotion(flow, confidence[t].astype(np.float32), motion=motion, index=t)
+
+    return Motion(
+        name=path.stem,
+        frames=frames,
+        tissue=tissue,
+        scale_mm_per_px=scale,
+        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
+        force_mn=None if force is None else force.astype(np.float64),
+    )
+
+
+def _positive(path: Path, found: dict[str, Array], name: str) -> float:
+    """The number under a name. UserError unless it is one and positive."""
+    return as_positive(f"{path}: {name}", found[name].item() if found[name].size == 1 else found[name].shape)

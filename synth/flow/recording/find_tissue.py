@@ -1,0 +1,219 @@
+"""Tissue of a video that states none: found in the rest frame by the motion of a few frames and by colour.
+
+What is still while the rest moves is no tissue. Bonded tissue moves ever less towards its rim, so that motion
+marks only a part of it, from which GrabCut (Rother et al., SIGGRAPH 2004) grows to an edge of colour. Tissue
+that fills the picture is still too, far from a gentle contact: a rim is assumed only where elastic tissue
+without one would visibly move, and if what is still has other colours.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synth.arrays import Map, Mask, Pixels
+from synth.flow.confidence import deviation
+from synth.flow.recording.decode import Footage
+from synth.flow.recording.finding import Finding, Severity
+from synth.flow.recording.frame_motion import FrameMotion, RestFrame
+
+
+class Limits:
+    """Constants of the search, chosen by hand on renders and on photographs that were warped in a part."""
+
+    frames: int = 16  # tracked: in each part of the video the one that differs most from the rest frame
+    step_px: int = 8  # px between those compared for it
+    moves: float = 2.0  # root mean square of the motion over its standard deviation; still pixels have 0.7
+    well: float = 0.2  # likewise over the median of what moves: flow carries some across a rim
+    rim: float = 0.2  # least share of the picture, still though it should move: openings 0.38, others 0.05
+    alike: float = 0.4  # largest overlap of the colours of what is still and what moves: openings 0.31
+    bins: int = 16  # of each channel of the colours, for their overlap
+    near: float = 0.03  # of the picture's height: what flow smooths over, at rims and around instruments
+    wide: float = 0.06  # likewise: half the width of the narrowest tissue; shafts are narrower
+    sure: float = 0.7  # confidence above which a pixel is tracked
+    visible: float = 0.7  # share of frames in which a pixel has to be tracked
+    rounds: int = 5  # of GrabCut
+    small: float = 0.05  # share of the picture below which what is found is doubtful
+    solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
+
+
+def choose_frames(footage: Footage) -> frozenset[int]:
+    """Numbers of the rest frame and of some later ones, as `Limits.frames` says."""
+    rest: Map | None = None
+    number, change = list[int](), list[float]()
+    for picture in footage.pictures():
+        wanted = footage.only is None or picture.index in footage.only
+        if picture.index < footage.rest_frame or not wanted or (number and picture.time_s is None):
+            continue
+        some = picture.rgb[:: Limits.step_px, :: Limits.step_px].astype(np.float32)
+        rest = some if rest is None else rest
+        number.append(picture.index)
+        change.append(float(np.abs(some - rest).mean()) if some.shape == rest.shape else 0.0)
+    if not number:  # `Decoder` reports it
+        return frozenset()
+    parts = np.array_split(np.arange(1, len(number)), Limits.frames)
+    chosen = [0, *(max(part, key=change.__getitem__) for part in parts if len(part))]
+    return frozenset(number[k] for k in chosen)
+
+
+class TissueSearch:
+    """Gathers the motion of frames, the rest frame first, from which the tissue is then found."""
+
+    def __init__(self, rest: RestFrame) -> None:
+        self._rest, self._frames = rest, 0
+        sums = np.zeros((4, *rest.tissue.shape), np.float32)
+        self._square, self._variance, self._count, self._hidden = sums
+
+    def add(self, frame: FrameMotion) -> None:
+        """Adds a frame."""
+        if frame.is_rest:
+            self._hidden_at_rest = frame.hidden
+        elif frame.trusted:
+            known = frame.confidence > Limits.sure
+            self._square += known * np.square(frame.flow).sum(axis=-1)
+            self._variance += known * 2 * deviation(frame.confidence) ** 2
+            self._count += known
+            self._hidden += frame.hidden
+            self._frames += 1
+
+    def find(self) -> tuple[Mask, Finding]:
+        """Tissue (h, w) of the rest frame: the whole picture if motion shows no rim."""
+        whole = self._rest.tissue
+        near, wide = (max(1, round(share * len(whole))) for share in (Limits.near, Limits.wide))
+        hidden = self._hidden_at_rest | (self._hidden > (1 - Limits.visible) * self._frames)
+        visible = whole & (self._count > Limits.visible * self._frames)
+        visible &= ~_morph(hidden, cv2.MORPH_DILATE, near)
+        motion, noise = (np.sqrt(one / np.maximum(self._count, 1)) for one in (self._square, self._variance))
+        moves = visible & (motion > Limits.moves * noise)
+        if moves.any():
+            moves &= motion > Limits.well * np.median(motion[moves])
+        moves = _morph(_morph(moves, cv2.MORPH_CLOSE, 2), cv2.MORPH_OPEN, wide)
+        core = _morph(moves, cv2.MORPH_ERODE, near)
+        if not core.any():
+            return whole, _state("nothing moves by which to find it: the whole picture is assumed")
+        expected = _expected(motion, moves) > Limits.moves * noise
+        colours, still = _colours(self._rest.rgb), visible & (motion < noise)
+        is_bounded = np.mean(expected & still) > Limits.rim * np.mean(visible)
+        is_alike = np.minimum(*_histograms(colours, core, still)).sum() > Limits.alike
+        if not is_bounded or is_alike:
+            if np.mean(visible & ~expected) < 0.5 * np.mean(visible):
+                return whole, _state("it moves as tissue that fills the picture")
+            if is_alike:
+                text = "neither motion nor colour shows a rim: the whole picture is assumed"
+                return whole, _state(text, "warning")
+            text = "too little moves to find its rim: what moves is taken for it"
+            return whole & _hull(moves), _state(text, "warning")
+        guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
+        # From either guess tissue may be lost that instruments cut off: the rounder result is right.
+        guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))
+        found = [self._region(colours, one, core, hidden) for one in guesses]
+        tissue, solid = max(found, key=lambda one: one[1])
+        text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
+        if tissue.mean() < Limits.small:
+            return tissue, _state(f"{text}: is it an instrument that moves?", "warning")
+        if solid < Limits.solid:
+            text += ", but with an uneven outline: see the picture of the masks"
+            return tissue, _state(text, "warning")
+        return tissue, _state(text)
+
+    def _region(self, colours: Pixels, guess: Pixels, core: Mask, hidden: Mask) -> tuple[Mask, float]:
+        """The convex hull of what GrabCut finds from a guess, and the share of the hull that it found."""
+        near, wide = (max(1, round(share * len(core))) for share in (Limits.near, Limits.wide))
+        tissue = _morph(_grow(colours, guess), cv2.MORPH_OPEN, near) | core
+        tissue = _largest(_with_hidden(tissue, core, hidden), core)
+        tissue = _filled(_morph(_filled(tissue), cv2.MORPH_CLOSE, wide))
+        hull = _hull(tissue)
+        return self._rest.tissue & hull, float(tissue.sum() / hull.sum())
+
+
+def touches_border(tissue: Mask) -> float:
+    """Share of the outline of a mask (H, W) on the border of the picture, which is no edge of the tissue."""
+    inner = cv2.erode(tissue.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
+    outline = tissue & ~inner
+    border = np.ones(tissue.shape, bool)
+    border[1:-1, 1:-1] = False
+    return float((outline & border).sum() / max(outline.sum(), 1))
+
+
+def _state(text: str, severity: Severity = "missing") -> Finding:
+    return Finding(severity, "tissue", f"no mask of the tissue (tissue.png) is given: {text}")
+
+
+def _expected(motion: Map, moves: Mask) -> Map:
+    """Motion (h, w) px of tissue without a rim: around what moves most it falls with distance, as 1 / r."""
+    half = float(np.percentile(motion[moves], 98)) / 2
+    most = moves & (motion > half)
+    radius = np.sqrt(np.count_nonzero(most) / np.pi)
+    distance = cv2.distanceTransform((~most).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(half * radius / (radius + distance), np.float32)
+
+
+def _colours(rgb: Pixels) -> Pixels:
+    """Lab (h, w, 3), smoothed, with less of lightness, which shading changes, and more of colour."""
+    lab = cv2.medianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2Lab), 5).astype(np.float32)
+    return np.asarray(np.clip((lab - 128) * np.array([0.5, 2, 2]) + 128, 0, 255), np.uint8)
+
+
+def _histograms(colours: Pixels, *masks: Mask) -> list[Map]:
+    """Histograms of the colours (h, w, 3) in masks, each of sum 1."""
+    bins, every = [Limits.bins] * 3, [0, 256] * 3
+    found = [cv2.calcHist([colours], [0, 1, 2], one.astype(np.uint8), bins, every) for one in masks]
+    return [np.asarray(one / max(one.sum(), 1), np.float32) for one in found]
+
+
+def _by_colour(guess: Pixels, colours: Pixels, core: Mask, outside: Mask) -> Pixels:
+    """A guess that adds what has the colours (h, w, 3) of the core rather than of what is outside."""
+    core_share, outside_share = (
+        cv2.GaussianBlur(one.reshape(Limits.bins, -1), (0, 0), 0.5).reshape(one.shape) + 1e-5
+        for one in _histograms(colours, core, outside)
+    )
+    at = tuple((colours // (256 // Limits.bins)).transpose(2, 0, 1))
+    odds = cv2.GaussianBlur(np.log(core_share[at] / outside_share[at]), (0, 0), 2)
+    added = np.where((guess == cv2.GC_PR_BGD) & (odds > 0), cv2.GC_PR_FGD, guess)
+    return np.where(outside & (odds < 0) & ~core, cv2.GC_BGD, added).astype(np.uint8)
+
+
+def _inner(whole: Mask) -> Mask:
+    """The picture without a band along its border."""
+    inside, band = np.zeros_like(whole), max(1, round(2 * Limits.wide * len(whole)))
+    inside[band:-band, band:-band] = True
+    return inside
+
+
+def _grow(colours: Pixels, guess: Pixels) -> Mask:
+    """GrabCut of the colours (h, w, 3) from a guess (h, w) in its labels."""
+    label = guess.copy()
+    cv2.setRNGSeed(0)
+    background, foreground = np.zeros((2, 1, 65))
+    cv2.grabCut(colours, label, None, background, foreground, Limits.rounds, cv2.GC_INIT_WITH_MASK)
+    return np.asarray((label == cv2.GC_FGD) | (label == cv2.GC_PR_FGD))
+
+
+def _morph(mask: Mask, how: int, radius: int) -> Mask:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), how, disc) > 0)
+
+
+def _with_hidden(mask: Mask, core: Mask, hidden: Mask) -> Mask:
+    """The mask with what instruments hide within the convex hull of its components that move."""
+    label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]
+    parts = mask & np.isin(label, np.unique(label[core]))
+    return parts | (_hull(parts) & hidden)
+
+
+def _hull(mask: Mask) -> Mask:
+    """The convex hull of a mask (h, w)."""
+    outline = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
+    return np.asarray(cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), outline, 1) > 0)
+
+
+def _largest(mask: Mask, core: Mask) -> Mask:
+    """The component that contains most of the core."""
+    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    return np.asarray(label == 1 + np.argmax(np.bincount(label[core], minlength=count)[1:]))
+
+
+def _filled(mask: Mask) -> Mask:
+    """The mask without holes."""
+    edges = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    return np.asarray(cv2.drawContours(np.zeros(mask.shape, np.uint8), edges, -1, 1, cv2.FILLED) > 0)

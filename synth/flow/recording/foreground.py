@@ -1,0 +1,169 @@
+"""Detection of unmasked foreground: objects that stand above the tissue, move unlike it, or occlude it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synth.arrays import Map, Mask, Pixels
+from synth.flow.confidence import LOW_CONFIDENCE
+from synth.flow.recording.finding import Finding
+from synth.flow.recording.frame_motion import FrameMotion
+
+
+class Limits:
+    """Limits for foreground, chosen by hand on videos with foreign objects and without."""
+
+    front_mm: float = 2.5  # least height above the surface of the tissue: more than its relief
+    sigmas: float = 5.0  # least height in standard deviations of the depth
+    front: float = 0.005  # least share of the tissue that a raised object covers
+    step_px: float = 0.25  # least jump of the flow
+    step: float = 0.2  # least jump as a share of the largest motion
+    least_px: float = 0.7  # largest motion below which jumps are not searched
+    across_px: int = 5  # distance from a jump at which the flow is compared
+    long: float = 0.12  # least extent of a jump over the width of the picture: more than the rim of a contact
+    lost: float = 0.02  # least share of the tissue that an occluder covers
+    near_px: int = 8  # margin around masks that is not searched
+    rounds: int = 8  # iterations of the robust fit of the surface
+    wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
+    wider: float = 1.5  # its least width over that of the tools at rest, which may be as wide
+
+
+_WIDE = "is wider than an instrument"
+
+
+class ForegroundSearch:
+    """Searches frames of a video, in order from the rest frame on."""
+
+    def __init__(self, tissue: Mask, shrink: int, *, is_stated: bool, has_masks: bool) -> None:
+        """Starts before the rest frame, with tissue (h, w) that `is_stated` or found, in frames downsampled
+        by `shrink`. `has_masks`: instruments' masks are given: without, narrow objects are instruments."""
+        self._tissue, self._shrink = tissue, shrink
+        self._is_stated, self._has_masks = is_stated, has_masks
+        self._surface: tuple[Map, float] | None = None
+        self._found: dict[str, list[tuple[float, str, Mask]]] = {}
+        self._masked = ~tissue  # in any frame
+        self._width_px = 0.0  # of the widest tool at rest
+        self._hidden = np.zeros_like(tissue)  # in the rest frame
+        # Where the tissue is not stated, what is in front of it from the start may be its surroundings.
+        self._surroundings = np.zeros_like(tissue)
+
+    def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
+        """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
+        if frame.is_rest:
+            self._hidden = frame.hidden
+        masked = ~self._tissue | frame.hidden | self._hidden
+        self._masked |= masked
+        if not self._has_masks:
+            self._find_wide(frame.instruments, frame)
+        free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
+        if depth_mm is not None:
+            self._surface = self._surface or fit_surface(depth_mm, free)
+            surface, deviation = self._surface
+            with np.errstate(invalid="ignore"):
+                high = surface - depth_mm > max(Limits.front_mm, Limits.sigmas * deviation)
+            if frame.is_rest and not self._is_stated:
+                self._surroundings = cv2.dilate(high.astype(np.uint8), _square(Limits.near_px)) > 0
+            high &= free & ~self._surroundings
+            self._note("stands in front of the tissue", high, frame, Limits.front)
+        if frame.is_rest or not frame.trusted:
+            return
+        lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
+        # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
+        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0
+        self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)
+        motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
+        if motion > Limits.least_px and self._has_masks:  # else it would be that of an instrument
+            inner = cv2.erode(free.astype(np.uint8), _square(2 * Limits.across_px), borderValue=0) > 0
+            jump = flow_jump(frame.flow) > max(Limits.step_px, Limits.step * motion)
+            edge = jump & inner & (frame.confidence > LOW_CONFIDENCE)
+            self._note("moves unlike tissue", edge, frame, 0.0, Limits.long)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The largest object of each kind that is found in two frames or more and not masked in others."""
+        found = []
+        for why, places in self._found.items():
+            free = [why == _WIDE or self._masked[where].mean() < 0.5 for *_, where in places]
+            unmasked = [(share, text) for (share, text, _), use in zip(places, free, strict=True) if use]
+            if len(unmasked) > 1:
+                found.append(Finding("warning", "foreground", max(unmasked)[1]))
+        return found
+
+    def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
+        """Notes a detected tool that is wider than tools are and than those at rest."""
+        width_px = _width(tool)
+        if frame.is_rest:
+            self._width_px = float(width_px.max())
+        least = max(Limits.wide * tool.shape[1], Limits.wider * self._width_px)
+        self._note(_WIDE, width_px > least, frame, 0.0)
+
+    def _note(self, why: str, where: Mask, frame: FrameMotion, share: float, extent: float = 0.0) -> None:
+        """Stores the largest component if it has this share of tissue and this extent in picture widths.
+
+        Without masks narrow ones are left out: they are instruments, or parts of them, not detected.
+        """
+        whole = cv2.morphologyEx(where.astype(np.uint8), cv2.MORPH_OPEN, _square(0 if extent else 1))
+        _, label, stats, centres = cv2.connectedComponentsWithStats(whole)
+        if len(stats) < 2:
+            return
+        if not self._has_masks and why != _WIDE:
+            wide = np.unique(label[_width(whole > 0) > Limits.wide * where.shape[1]])
+            stats[np.setdiff1d(np.arange(len(stats)), wide)] = 0
+        k = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+        found = float(stats[k, cv2.CC_STAT_AREA] / np.count_nonzero(self._tissue))
+        wide, high = stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT]
+        if found > 0 and found >= share and np.hypot(wide, high) >= extent * where.shape[1]:
+            x, y = self._shrink * (centres[k] + 0.5) - 0.5
+            text = f"an object at x {x:.0f}, y {y:.0f} in frame {frame.index} {why}: mask it in masks/?"
+            self._found.setdefault(why, []).append((found, text, label == k))
+
+
+def fit_surface(depth_mm: Map, tissue: Mask) -> tuple[Map, float]:
+    """A smooth surface (h, w) mm fitted to the tissue (h, w), and the tissue's deviation from it [mm].
+
+    A quadratic by least squares; each round leaves out outliers, with a tighter limit in front.
+    """
+    height, width = depth_mm.shape
+    y, x = np.mgrid[:height, :width] / max(height, width) - 0.5
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    known = tissue & np.isfinite(depth_mm)
+    used, surface, deviation = known, np.full(depth_mm.shape, np.nan), 0.0
+    for _ in range(Limits.rounds):
+        if np.count_nonzero(used) < 10 * terms.shape[-1]:
+            break
+        surface = terms @ np.linalg.lstsq(terms[used], depth_mm[used], rcond=None)[0]
+        off = np.where(known, depth_mm - surface, np.nan)
+        deviation = 1.4826 * float(np.median(np.abs(off[used] - np.median(off[used]))))
+        with np.errstate(invalid="ignore"):
+            used = known & (off > -2 * max(deviation, 0.1)) & (off < 3.5 * max(deviation, 0.1))
+    return np.asarray(surface, np.float32), deviation
+
+
+def flow_jump(flow: Map) -> Map:
+    """Excess (h, w) px of the change of a flow (h, w, 2) across a place over that on both sides of it.
+
+    It is 0 for a linear flow and small for a smooth one, as on elastic tissue; it is large at edges.
+    """
+
+    def shifted(dx: float, dy: float) -> Map:
+        shift, size = np.array([[1, 0, dx], [0, 1, dy]], np.float32), (flow.shape[1], flow.shape[0])
+        return np.asarray(cv2.warpAffine(flow, shift, size, borderMode=cv2.BORDER_REPLICATE))
+
+    most, near, far = np.zeros(flow.shape[:2], np.float32), Limits.across_px, 2.5 * Limits.across_px
+    for dx, dy in ((1, 0), (0, 1), (0.7, 0.7), (0.7, -0.7)):
+        a, b, c, d = (shifted(k * dx, k * dy) for k in (near, -near, far, -far))
+        # The distance is 2 widths across the place and 1.5 widths on either side.
+        slopes = np.linalg.norm(c - a, axis=-1) + np.linalg.norm(b - d, axis=-1)
+        most = np.maximum(most, np.linalg.norm(a - b, axis=-1) - slopes * 2 / 3)
+    return most
+
+
+def _width(mask: Mask) -> Map:
+    """Width (h, w) px of a mask around each of its pixels: twice the distance from its outline."""
+    distance = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(2 * np.minimum(distance, mask.shape[1]), np.float32)
+
+
+def _square(around_px: int) -> Pixels:
+    return np.ones((2 * around_px + 1, 2 * around_px + 1), np.uint8)

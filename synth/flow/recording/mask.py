@@ -1,0 +1,53 @@
+"""A stage of a video: masks of instruments, highlights and other foreground, detected or given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from synth.arrays import Mask, Pixels
+from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
+from synth.flow.recording.picture_faults import find_fault
+from synth.flow.segmentation import Segmentation, segment
+from synth.video.read_video import shrink_mask
+
+_MOST = 0.4  # share of the tissue: more of it is taken for tissue that looks like instruments
+
+
+class MaskFrame:
+    """Masks what hides the tissue."""
+
+    def __init__(self, rest: RestFrame, kind: str, tool: Callable[[int, Size], Mask | None] | None) -> None:
+        """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected."""
+        self._rest, self._kind, self._tool = rest, kind, tool
+
+    def process(self, frame: FrameMotion) -> FrameMotion:
+        """The frame with its masks; it is not trusted if its picture shows nothing that could be tracked."""
+        trusted = frame.trusted and not find_fault(frame.rgb, self._rest.tissue)
+        masked = tool = np.zeros(frame.rgb.shape[:2], bool)
+        if self._kind != "none":
+            found = segment(self._rest.rgb, frame.rgb)
+            if self._tool is None:
+                masked, tool = _plausible(found, self._rest.tissue), found.objects
+            else:
+                given = self._tool(frame.index, self._rest.size)
+                tool = tool if given is None else shrink_mask(given, self._rest.shrink, 0)
+                if frame.camera is not None:
+                    tool = frame.camera.undo(tool.astype(np.uint8) * 255) > 127
+                masked = tool | found.shines
+        if frame.camera is not None:
+            masked = masked | frame.camera.outside(masked.shape)
+        return replace(frame, masked=masked, tool=tool, trusted=trusted)
+
+
+def mask_right(rest: Pixels, rgb: Pixels, kind: str, tissue: Mask) -> Mask:
+    """Mask (H, W) of what hides the tissue in a picture of the right camera, given its rest picture."""
+    return np.zeros(tissue.shape, bool) if kind == "none" else _plausible(segment(rest, rgb), tissue)
+
+
+def _plausible(found: Segmentation, tissue: Mask) -> Mask:
+    """What is hidden; the highlights alone if so much of the tissue is that it is taken for instruments."""
+    hidden = found.hidden
+    return hidden if (hidden & tissue).sum() <= _MOST * tissue.sum() else found.shines

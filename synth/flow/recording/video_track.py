@@ -1,0 +1,200 @@
+"""The track of a video: the motion of the tissue in every frame, without that of the camera and the pulse.
+
+    with track_video(footage, settings) as track:
+        for frame in track.frames():
+            ...
+
+A video is decoded and its flow computed once. Heart and breath are known when all of it has been tracked;
+they are subtracted when frames are read from the track, which is kept on disk meanwhile. Only where tissue
+fills the picture and the camera moves, pictures have to be aligned before flow: then it is computed again.
+
+`learn predict`, `bench score` and `bench check` are this driver; `bench live` is a single `VideoPass`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+from numcodecs import BitRound, Blosc
+
+from synth.arrays import Array, Mask
+from synth.errors import UserError
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.detrend import Detrend
+from synth.flow.recording.find_pulse import PulseEstimate, PulseSearch
+from synth.flow.recording.find_tissue import TissueSearch, choose_frames
+from synth.flow.recording.finding import first_fault
+from synth.flow.recording.flow import LocalFlow
+from synth.flow.recording.frame_motion import FrameMotion, Size
+from synth.flow.recording.harmonic_fit import Span
+from synth.flow.recording.video_pass import VideoPass
+from synth.flow.stereo.stereo_track import Moved
+from synth.system.stopwatch import Stopwatch
+
+_KEPT_BITS = 12
+"""Of the mantissa: a motion is kept to 1.2e-4 of itself, which its noise exceeds a hundred times."""
+_ROUNDED = ("flow", "confidence")
+_FLAGS = ("masked", "tool")
+
+FrameWatcher = Callable[[FrameMotion], None]
+
+
+class FrameFile:
+    """Frames on disk, in a temporary file without a name: read in order, any number of times."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._finalizer = weakref.finalize(self, self._file.close)
+        self._pack, self._round = Blosc(cname="lz4", shuffle=Blosc.BITSHUFFLE), BitRound(_KEPT_BITS)
+        self._frames: list[tuple[FrameMotion, list[tuple[str, int, int, str, tuple[int, ...]]]]] = []
+        self.bytes = 0
+
+    def add(self, frame: FrameMotion) -> None:
+        """Appends a frame; of a right camera only the motion is kept. UserError: the disk is full."""
+        arrays: dict[str, Array] = {name: self._rounded(getattr(frame, name)) for name in _ROUNDED}
+        if frame.motion is not None:
+            parts = frame.motion.motion, frame.motion.deviation
+            arrays |= dict(zip(("motion", "deviation"), map(self._rounded, parts), strict=True))
+        arrays |= {name: getattr(frame, name) for name in _FLAGS if getattr(frame, name) is not None}
+        arrays["rgb"] = frame.rgb
+        places = [(name, *self._write(array), array.dtype.str, array.shape) for name, array in arrays.items()]
+        empty = np.zeros((0, 0), np.float32)
+        bare = replace(frame, flow=empty, confidence=empty, motion=None, masked=None, tool=None, right=None)
+        self._frames.append((replace(bare, rgb=np.zeros((0, 0, 3), np.uint8)), places))
+
+    def read(self) -> Iterator[FrameMotion]:
+        """The frames in order."""
+        for bare, places in self._frames:
+            arrays = {name: self._read(start, size, kind, shape) for name, start, size, kind, shape in places}
+            moved = [arrays.pop(name) for name in ("motion", "deviation") if name in arrays]
+            fields: dict[str, Any] = {**arrays, "motion": Moved(*moved) if moved else None}
+            yield replace(bare, **fields)
+
+    def close(self) -> None:
+        """Gives the disk's space back, as the end of this object does."""
+        self._finalizer()
+
+    def _rounded(self, values: Array) -> Array:
+        given = np.ascontiguousarray(values, np.float32)
+        return np.asarray(self._round.encode(given)).view(np.float32).reshape(values.shape)
+
+    def _write(self, array: Array) -> tuple[int, int]:
+        data, start = self._pack.encode(np.ascontiguousarray(array)), self.bytes
+        try:
+            self._file.seek(start)
+            self._file.write(data)
+        except OSError as error:
+            where = tempfile.gettempdir()
+            raise UserError(
+                f"{where}: the motion of the video can't be kept there ({error.strerror}): free some space, "
+                "or set TMPDIR to another folder"
+            ) from error
+        self.bytes += len(data)
+        return start, len(data)
+
+    def _read(self, start: int, size: int, kind: str, shape: tuple[int, ...]) -> Array:
+        self._file.seek(start)
+        return np.frombuffer(self._pack.decode(self._file.read(size)), kind).reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
+class VideoTrack:
+    """A tracked video."""
+
+    video: VideoPass
+    """Rest frame, findings and summary; of the second pass if there were two."""
+    search: PulseSearch | None
+    """Search for heart and breath; None: not requested."""
+    kept: FrameFile
+
+    @property
+    def removed(self) -> PulseEstimate | None:
+        """Pulsation that is subtracted from every frame; None: none."""
+        return None if self.search is None else self.search.pulse
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on the processing for reports."""
+        missed = "" if self.search is None or first_fault(self.video.findings) else self.search.describe()
+        return self.video.notes + ([missed] if missed else [])
+
+    def frames(self) -> Iterator[FrameMotion]:
+        """The tracked frames without pulsation, the rest frame first; without the right camera's pictures."""
+        if self.removed is None:
+            return self.kept.read()
+        return map(Detrend(self.removed, self.video.mm_per_px).process, self.kept.read())
+
+    def __enter__(self) -> VideoTrack:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.kept.close()
+
+
+def track_video(
+    footage: Footage,
+    settings: RecordingFlowSettings,
+    free_s: Sequence[Span] = (),
+    *,
+    flow: LocalFlow | None = None,
+    watch: Stopwatch | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+    watch_frames: Callable[[VideoPass], FrameWatcher] | None = None,
+) -> VideoTrack:
+    """Tracks a video from its rest frame on.
+
+    Tissue that is not given is found before, in a few frames. `free_s`: spans known to be without contact
+    [s]; `watch_frames`: called with each pass; what it returns is called with the frames of that pass while
+    they are tracked, with the right camera's pictures and the pulse. Other arguments and errors as for
+    `VideoPass`.
+    """
+    flow, watch = flow or LocalFlow(), watch or Stopwatch()
+    if footage.tissue is None:
+        footage = _with_tissue(footage, settings, watch)
+    first = VideoPass(footage, settings, flow=flow, watch=watch, progress=progress)
+    kept = _keep(first, watch_frames)
+    search = first.search(free_s)
+    if search is None or search.camera is None:
+        return VideoTrack(first, search, kept)
+    kept.close()
+    second = VideoPass(footage, settings, search.camera, flow=flow, watch=watch, progress=progress)
+    return VideoTrack(second, search, _keep(second, watch_frames))
+
+
+def _keep(video: VideoPass, watch_frames: Callable[[VideoPass], FrameWatcher] | None) -> FrameFile:
+    kept, watcher = FrameFile(), None if watch_frames is None else watch_frames(video)
+    for frame in video.frames():
+        if watcher is not None:
+            watcher(frame)
+        with video.watch.stage("store"):
+            kept.add(frame)
+    return kept
+
+
+def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
+    """The footage with the tissue that is found in a few of its frames, by flow in this process."""
+    with watch.stage("decode"):
+        few = replace(footage, only=choose_frames(footage), depth=None)
+    video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
+    if video.rest.fault:
+        return footage
+    search = TissueSearch(video.rest)
+    for frame in video.frames():
+        search.add(frame)
+    with watch.stage("mask"):
+        found, finding = search.find()
+
+    def tissue(size: Size) -> Mask:
+        whole = cv2.resize(found.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+        return np.asarray(whole > 0)
+
+    return replace(footage, tissue=tissue, findings=(finding,))

@@ -1,0 +1,56 @@
+"""Tissue found in videos of analytic motion: an opening in still surroundings, and tissue everywhere."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.recording.find_tissue import touches_border
+from synth.flow.recording.video_track import track_video
+from synth.video.read_video import Picture
+from tests.synth.flow.recording.test_camera_motion import EVERYWHERE, OPENING, X, Y, texture
+
+SETTINGS = RecordingFlowSettings("dis", 1, None, False, "none")
+RIM = np.clip(1 - np.hypot(X - 80, Y - 60) / 40, 0, 1)  # motion falls to 0 at the rim
+
+
+def video(opening: NDArray[np.bool_], rim: NDArray[np.float64], px: float, bump: int) -> Footage:
+    """A load at (70, 60) drags the tissue by up to `px` and lets go; the surroundings have another colour."""
+    rng = np.random.default_rng(0)
+    pull = rim * np.minimum(1, 10 / np.maximum(np.hypot(X - 70, Y - 60), 1e-6))
+
+    def picture(frame: int) -> Picture:
+        drag = px * np.sin(np.pi * frame / 8) ** 2 * pull
+        rgb = texture(X - drag, Y) * np.array([1.0, 0.7, 0.6])
+        rgb[~opening] = (texture(Y, X) * np.array([0.6, 0.8, 1.0]))[~opening]
+        rgb = np.roll(rgb, bump * (frame > 5), axis=0) + rng.normal(0, 1, rgb.shape)
+        return Picture(frame, frame / 8, np.clip(rgb, 0, 255).astype(np.uint8))
+
+    return Footage(partial(map, picture, range(12)), "video")
+
+
+CASES = {
+    "opening": (OPENING, RIM, 4, 0),
+    "moved camera": (OPENING, RIM, 4, 3),
+    "edge to edge": (EVERYWHERE, EVERYWHERE, 4, 0),
+    "gentle contact": (EVERYWHERE, EVERYWHERE, 0.4, 0),
+    "nothing moves": (EVERYWHERE, EVERYWHERE, 0, 0),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_tissue_is_found(case: str) -> None:
+    last = track_video(video(*CASES[case]), SETTINGS).video
+    truth, severity = CASES[case][0], "warning" if case == "gentle contact" else "missing"
+    tissue = last.rest.tissue
+    assert (tissue & truth).sum() / (tissue | truth).sum() > 0.9
+    assert [one.severity for one in last.rest.findings] == [severity]
+    assert last.rest.findings[0].cause == "tissue"
+
+
+def test_the_border_of_the_picture_is_no_edge() -> None:
+    assert touches_border(EVERYWHERE) == 1
+    assert touches_border(OPENING) == 0
+    assert touches_border(X < 80) == pytest.approx(278 / 396)

@@ -1,0 +1,66 @@
+"""Foreground objects on tissue of analytic motion and depth."""
+
+import re
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from synth.flow.recording.foreground import ForegroundSearch, fit_surface, flow_jump
+from synth.flow.recording.frame_motion import FrameMotion
+
+SHAPE = (120, 160)
+Y, X = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
+ROD = (np.abs(Y - 60) < 8) & (X < 90)
+
+
+def load(peak_px: float) -> NDArray[np.float32]:
+    """Motion of a half-space around a load at (90, 60), which falls as 1 / r (Cerruti)."""
+    x, y = X - 90, Y - 60
+    r = np.sqrt(x**2 + y**2 + 17.0**2)
+    return peak_px * 17 * np.stack([(0.55 / r + 0.45 * x * x / r**3), 0.45 * x * y / r**3], -1)
+
+
+def found(motion: NDArray[np.float32], depth: NDArray[np.float32] | None, masked: bool = False) -> list[str]:
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
+    mask, sure = ROD if masked else None, np.ones(SHAPE, np.float32)
+    for k in range(4):
+        search.add(FrameMotion(k / 3 * motion, sure, is_rest=k == 0, index=k, masked=mask), depth)
+    return [one.message for one in search.findings]
+
+
+@pytest.mark.parametrize("peak_px", [0.5, 2.0, 8.0, 30.0])
+def test_a_rod_is_found_by_its_motion_or_its_depth_and_elastic_tissue_is_not(peak_px: float) -> None:
+    tissue, flat = load(peak_px), (300 + X / 50 + Y**2 / 9000).astype(np.float32)
+    rigid = np.where(ROD[..., None], tissue[60, 90], tissue)
+    assert found(tissue, flat) == []
+    moved = found(rigid, None)
+    assert len(moved) == (peak_px > 1)
+    high = found(tissue, np.where(ROD, flat - 6, flat))
+    assert len(high) == 1
+    for message in moved + high:
+        x, y = map(int, re.findall(r"\d+", message)[:2])
+        assert ROD[max(y - 10, 0) : y + 10, x].any()
+    assert found(rigid, np.where(ROD, flat - 6, flat), masked=True) == []
+
+
+@pytest.mark.parametrize(("half_width", "reported"), [(8, False), (24, True)])
+def test_a_detected_instrument_is_no_foreign_object_but_a_hand_is(half_width: int, reported: bool) -> None:
+    tool = (np.abs(Y - 60) < half_width) & (X < 90)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=False)
+    for k in range(4):
+        sure = np.where(tool & (k > 0), 0.1, 1).astype(np.float32)
+        masks = {"masked": tool & (k > 0), "tool": tool & (k > 0)}
+        frame = FrameMotion(k * load(2.0), sure, is_rest=k == 0, index=k, **masks)
+        search.add(frame, (300 - 6.0 * (tool & (k > 0))).astype(np.float32))
+    assert bool(search.findings) is reported
+
+
+def test_the_surface_follows_the_tissue_and_a_slope_is_not_a_jump() -> None:
+    flat = (300 + X / 50 + X * Y / 9000).astype(np.float32)
+    surface, deviation = fit_surface(np.where(ROD, flat - 6, flat), np.ones(SHAPE, bool))
+    assert np.abs(surface - flat).max() < 1e-3
+    assert deviation < 1e-3
+    step = np.stack([0 * X, 5.0 * (X > 80)], -1).astype(np.float32)
+    assert flow_jump(step)[20:-20, 60:100].max() == pytest.approx(5.0)
+    assert flow_jump(np.stack([X / 9, Y / 7], -1))[20:-20, 20:-20].max() < 1e-3
