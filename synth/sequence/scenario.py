@@ -18,7 +18,7 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
+from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, Contact, InstrumentSection
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
@@ -40,7 +40,7 @@ Range = tuple[float, float]
 # First element of the spawn key.
 _ANATOMY, _SEQUENCE = 0, 1
 _TISSUE, _GESTURE, _APPEARANCE, _VIEW, _NOISE, _FURTHER, _LABELS, _CAMERA_MOTION, _PULSE = range(9)
-_IDLE = 16
+_IDLE, _CONTACT = 16, 17
 
 _STRETCH = 1.01, 1.03
 """Pre-stretch of a membrane. Not measured: its tension then balances a pressure of 3-350 Pa (at most 2.6
@@ -109,14 +109,15 @@ def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenar
     family = job.appearance.families[index % len(job.appearance.families)]
     generator = partial(_generator, job, _SEQUENCE, index)
     relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
-    tissue = draw_tissue(job.fem, generator(_TISSUE))
+    fem = job.fem.of_contact(_choose(generator(_CONTACT), job.fem.contact))
+    tissue = draw_tissue(fem, generator(_TISSUE))
     pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
     view = vary_view(draw_view(job.render, generator(_VIEW)), job, index)
     motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
     lens, opening_mm = place(view, job.render), job.anatomy.craniotomy.radius_mm
     again, shown = (_REDRAW, attempt) if attempt else (), (visible_radius(lens), lens.centre)
     rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
+    gestures = draw_gestures(fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
     appearance = vary_appearance(draw_appearance(job, family, generator(_APPEARANCE)), job, index)
     acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
     strength = job.randomize.get("instruments", 0.0)
@@ -192,7 +193,7 @@ def draw_gestures(
         for k in order:
             for _ in range(_TRIES):
                 own = others if k else rng
-                if fem.contact == "driven":
+                if fem.contact == ("driven",):
                     trial = draw_driven_gesture(fem, opening_mm, own, wanted[k], visible_mm, frames)
                 else:
                     trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
@@ -392,6 +393,11 @@ def _draw_direction(
         rise = rise if kind == "slide" else abs(float(whole[2]))
     up = rise if kind in ("pull", "grasp") else -rise
     return along, np.append(np.sqrt(1 - rise**2) * along, up)
+
+
+def _choose(rng: Random, kinds: tuple[Contact, ...]) -> Contact:
+    """One of several kinds, in equal shares."""
+    return kinds[int(rng.integers(len(kinds)))]
 
 
 def _draw_timing(kind: str, rng: Random, frames: int) -> tuple[float, float, float, float]:

@@ -62,9 +62,10 @@ def simulate(
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
     stated = any(one.load or one.force_mn or one.travel_mm for one in job.fem.instrument_list)
-    attempts = DRIVEN_ATTEMPTS if job.fem.contact == "driven" else ATTEMPTS
-    left = 0 if case or stated or not ours else attempts - 1
+    again = case is None and not stated and ours
     case = case or draw_scenario(job, index)
+    driven = any(gesture.drive for gesture in case.gestures)
+    left = (DRIVEN_ATTEMPTS if driven else ATTEMPTS) - 1 if again else 0
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     mechanics = mechanics or (FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics())

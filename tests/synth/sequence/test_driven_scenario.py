@@ -119,3 +119,24 @@ def test_motions_of_the_job_for_flow_are_spread_evenly_over_decades() -> None:
     ends = [0.1, 1, 10, 80]
     share = np.histogram(pixels, ends)[0] / np.diff(np.log10(ends))
     assert np.abs(share / share.mean() - 1).max() < 0.3
+
+
+def test_a_job_with_both_contacts_draws_each_in_half_of_the_sequences() -> None:
+    """Forces and ways are as in jobs of one kind of contact; the law follows the contact."""
+    both = {"contact": ["loaded", "driven"], "travel_mm": [0.5, 2], "force_mn": [1, 3], "young_kpa": 2}
+    scenes = Job.model_validate({"sequences": 80, "fem": both})
+    drawn = [draw_scenario(scenes, index) for index in range(80)]
+    driven = [case for case in drawn if case.gestures[0].drive is not None]
+    loaded = [case for case in drawn if case.gestures[0].drive is None]
+    assert 25 < len(driven) < 55
+    assert {case.tissue.law for case in driven} == {"ogden"}
+    assert "ogden" not in {case.tissue.law for case in loaded}
+    assert all(0 < case.gestures[0].drive.travel_mm <= 2 for case in driven)  # type: ignore[union-attr, operator]
+    assert all(1 <= case.gestures[0].force_mn <= 3.1 for case in loaded if case.gestures[0].kind != "grasp")
+    assert "slide" in {case.gestures[0].kind for case in loaded}
+    assert "slide" not in {case.gestures[0].kind for case in driven}
+
+
+def test_driven_contacts_next_to_loaded_ones_need_their_way() -> None:
+    with pytest.raises(ValidationError):
+        FemSection.model_validate({"contact": ["loaded", "driven"], "force_mn": 3})
