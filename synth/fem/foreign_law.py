@@ -8,8 +8,8 @@ import numpy as np
 
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
+from synth.fem.law_choice import LAWS, Law, load_law
 from synth.fem.laws import lame
-from synth.job.law_choice import LAWS, Law, load_law
 
 _STEP, _CLOSE = 1e-5, 1e-4
 

@@ -9,7 +9,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,10 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
+from synth.geometry.craniotomy import Attachment, Craniotomy
 from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
 from synth.geometry.skin import skin
 from synth.geometry.triangles import Shape, side_areas
-from synth.job import identity
-from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
 _KINDS = ("obj", "stl", "ply", "off", *SUFFIXES, "gii")  # suffixes of the files that can be read
@@ -44,13 +43,13 @@ class Brain:
 
     shape: Shape
     to_world: Floats  # (4, 4) rigid, mm: a point p of the file (RAS if it states one) is to_world @ (p, 1)
-    attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
+    attachments: tuple[Attachment, ...]  # fixed regions inside, in world axes
 
 
 def load_brain(
     path: Path,
-    craniotomy: CraniotomySection,
-    attachments: Sequence[AttachmentSection] = (),
+    craniotomy: Craniotomy,
+    attachments: Sequence[Attachment] = (),
     fill_holes: bool = False,
 ) -> Brain:
     """Reads a surface (of a format of `anatomy.mesh`, mm), merges its vertices, and places it.
@@ -65,12 +64,10 @@ def place_brain(
     vertices: Floats,
     faces: Ints,
     name: str,
-    craniotomy: CraniotomySection,
-    attachments: Sequence[AttachmentSection] = (),
+    craniotomy: Craniotomy,
+    attachments: Sequence[Attachment] = (),
 ) -> Brain:
     """Places a surface of vertices (V, 3) mm and faces (F, 3) as `load_brain`; `name` is used in messages."""
-    assert craniotomy.point is not None  # the job requires both with a mesh
-    assert craniotomy.direction is not None
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)
     placed = (vertices - origin) @ turn.T
@@ -79,13 +76,17 @@ def place_brain(
     _check_place(name, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
-    held = []
-    for one in attachments:
-        normal = None if one.normal is None else tuple(turn @ np.asarray(one.normal))
-        held.append(one.model_copy(update={"point": tuple(turn @ (one.point - origin)), "normal": normal}))
+    placed_attachments = tuple(_turn(attachment, turn, origin) for attachment in attachments)
     to_world = np.eye(4)
     to_world[:3] = np.column_stack([turn, -turn @ origin])
-    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, tuple(held))
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, placed_attachments)
+
+
+def _turn(attachment: Attachment, turn: Floats, origin: Floats) -> Attachment:
+    """An attachment of a surface's own axes in axes turned by (3, 3) about an origin (3,) mm."""
+    x, y, z = turn @ (attachment.point - origin)
+    normal = None if attachment.normal is None else tuple(turn @ np.asarray(attachment.normal))
+    return replace(attachment, point=(x, y, z), normal=normal)
 
 
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
@@ -184,7 +185,7 @@ def _heights(vertices: Floats, faces: Ints) -> Floats:
 
 def _read(path: Path) -> tuple[Floats, Ints]:
     with as_user_error("anatomy.mesh"):
-        data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
+        data = checked_file.read_bytes(path, checked_file.LARGEST_MESH)
     kind = path.suffix.lower().removeprefix(".")
     if data.startswith(_FREESURFER):
         kind = "freesurfer"
@@ -255,7 +256,7 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
 
 def _refuse_expansion(data: bytes) -> None:
     """ValueError if the compressed arrays of a GIfTI file expand to more than a file may have."""
-    left = identity.FILES["anatomy", "mesh"]
+    left = checked_file.LARGEST_MESH
     for text in re.findall(rb"<Data>([^<]*)</Data>", data) if b"GZipBase64Binary" in data else ():
         unpacker, packed = zlib.decompressobj(), base64.b64decode(text)
         while packed and not unpacker.eof:

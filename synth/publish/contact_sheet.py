@@ -13,10 +13,9 @@ from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.camera.camera import resized
+from synth.render.camera.camera import resize
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
-from synth.sequence import scenario
 from synth.sequence.rest_scene import RestScene, at_rest
 from synth.sequence.simulation import simulate
 from synth.system.terminal import ProgressCallback
@@ -59,8 +58,9 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     sensor, part = scene.scenario.appearance.sensor, size[0] / job.render.size[0]
     sensor = replace(sensor, blur=part * sensor.blur)  # which is in px of the whole picture
     case = replace(scene.scenario, appearance=replace(scene.scenario.appearance, sensor=sensor))
-    scene = replace(scene, view=resized(scene.view, size), scenario=case)
-    frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
+    drawn = replace(scene.draw, camera=resize(scene.view, size), scenario=case)
+    scene = replace(scene, draw=drawn)
+    frame = scene.renderer.render(state, drawn.frame_seeds[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
     acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")
     return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)

@@ -13,6 +13,7 @@ from synth.arrays import Mask, Pixels
 from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Writer
 from synth.errors import UserError
+from synth.fem.law_choice import LAWS
 from synth.fields import FIELDS, MOST_INSTRUMENTS
 from synth.flow import track
 from synth.flow.estimator import create
@@ -21,12 +22,10 @@ from synth.flow.stereo import rig
 from synth.flow.stereo import stereo_track as stereo
 from synth.flow.track import Track
 from synth.job import identity
-from synth.job.law_choice import LAWS
 from synth.job.schema import Job
-from synth.render.camera import video_link
 from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
-from synth.sequence import scenario
+from synth.render.camera.video_link import transmit
 from synth.sequence.published_labels import Published
 from synth.sequence.rest_scene import Scene
 from synth.sequence.simulation import simulate
@@ -118,7 +117,7 @@ def _render_frames(task: _Task) -> list[_Video]:
     width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
-        rng = scenario.label_rng(job, scene.index)
+        rng = np.random.default_rng(scene.draw.label_seed)
         labels = Published(job.labels, scene.tissue, job.frames, rng)
     every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
     later = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
@@ -154,7 +153,8 @@ def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
     """Writes and returns the videos after the job's codec."""
     job = task.scene.job
     with task.watch.stage("store"):
-        coded = [_Video(video_link.recorded(rgb, job.sensor, job.fps), tools) for rgb, tools in videos]
+        link = job.fps, job.sensor.bitrate_mbps, job.sensor.chroma
+        coded = [_Video(transmit(rgb, *link), tools) for rgb, tools in videos]
         for video, (name, _) in zip(coded, _CAMERAS, strict=False):
             task.writer.put(name, video.rgb)
     return coded

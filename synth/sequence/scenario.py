@@ -1,16 +1,14 @@
-"""Scenario of one sequence: every number drawn for it, a function of (job, index) only."""
+"""Scenario of one sequence: every number drawn for it, part by part; `draw` puts it together."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from synth.arguments import checked
 from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem import tool_gesture
@@ -20,27 +18,20 @@ from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
 from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
 from synth.job.microscope import BLUR_WIDTH_PX
-from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render import instrument
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
-from synth.render.camera.camera import CameraView, place, visible_radius
+from synth.render.camera.camera import CameraView
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
-from synth.render.idle import IdleInstrument, draw_idle
+from synth.render.idle import IdleInstrument
 from synth.render.randomized.surroundings import Randomization
-from synth.sequence.randomization import draw_randomization, randomized, vary_appearance, vary_view
 
 Random = np.random.Generator
 Range = tuple[float, float]
-
-# First element of the spawn key.
-_ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _APPEARANCE, _VIEW, _NOISE, _FURTHER, _LABELS, _CAMERA_MOTION, _PULSE = range(9)
-_IDLE = 16
 
 _STRETCH = 1.01, 1.03
 """Pre-stretch of a membrane. Not measured: its tension then balances a pressure of 3-350 Pa (at most 2.6
@@ -48,7 +39,6 @@ mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
 ATTEMPTS = 4  # draws of a sequence's gestures, each where the mesh did not bear those before
 DRIVEN_ATTEMPTS = 12  # likewise, of driven instruments, whose range is found while solving
-_REDRAW = 32  # third element of the spawn key of further attempts
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
@@ -93,48 +83,6 @@ class Scenario:
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
-
-
-@checked
-def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenario:
-    """Draws sequence `index` of `job`, independently of the others' number and order.
-
-    `attempt`: number of earlier draws of its gestures; all else is the same in every attempt
-    but idle instruments, which keep away from them.
-    """
-    job = as_job(job)
-    if index < 0:
-        raise UserError(f"index {index}: sequences are numbered from 0")
-    job, how = randomized(job, index), draw_randomization(job, index)
-    family = job.appearance.families[index % len(job.appearance.families)]
-    generator = partial(_generator, job, _SEQUENCE, index)
-    relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
-    tissue = draw_tissue(job.fem, generator(_TISSUE))
-    pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
-    view = vary_view(draw_view(job.render, generator(_VIEW)), job, index)
-    motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
-    lens, opening_mm = place(view, job.render), job.anatomy.craniotomy.radius_mm
-    again, shown = (_REDRAW, attempt) if attempt else (), (visible_radius(lens), lens.centre)
-    rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
-    appearance = vary_appearance(draw_appearance(job, family, generator(_APPEARANCE)), job, index)
-    acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
-    strength = job.randomize.get("instruments", 0.0)
-    idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_radius(lens), acting)
-    return Scenario(
-        index, family, relief, tissue, gestures, appearance, view, motion, pulse, idle, how, attempt
-    )
-
-
-def frame_seeds(job: Job, index: int) -> list[int]:
-    """One seed per frame for light paths and sensor noise, so that noise differs between frames."""
-    sequence = np.random.SeedSequence(job.seed, spawn_key=(_SEQUENCE, index, _NOISE))
-    return [int(seed) for seed in sequence.generate_state(job.frames)]
-
-
-def label_rng(job: Job, index: int) -> Random:
-    """Random generator for the noise of the published labels."""
-    return _generator(job, _SEQUENCE, index, _LABELS)
 
 
 def draw_relief(anatomy: schema.AnatomySection, rng: Random) -> Relief:
@@ -409,7 +357,7 @@ def _draw_timing(kind: str, rng: Random, frames: int) -> tuple[float, float, flo
 
 
 def draw_view(render: RenderSection, rng: Random) -> CameraView:
-    """Draws the microscope's pose and field; a calibration replaces the latter, see `camera.calibrated`."""
+    """Draws the microscope's pose and field; a calibration replaces the latter, see `camera.state_field`."""
     return CameraView(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),
@@ -507,7 +455,3 @@ def _log_uniform(rng: Random, ends: Range) -> float:
 
 def _vector(value: Floats) -> tuple[float, float, float]:
     return float(value[0]), float(value[1]), float(value[2])
-
-
-def _generator(job: Job, *key: int) -> Random:
-    return np.random.default_rng(np.random.SeedSequence(job.seed, spawn_key=key))

@@ -34,7 +34,7 @@ class SeriesMechanics:
         turn, shift = rest.brain.to_world[:3, :3], rest.brain.to_world[:3, 3]
         with watch.stage("mesh"):
             transfer = attach(series.points @ turn.T + shift, series.faces, rest.shape)
-        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], job.anatomy.craniotomy.radius_mm
+        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], rest.draw.opening_mm
         moved = np.zeros((len(time), len(area), 3))
         load, lost = np.zeros_like(moved), np.zeros((len(time), 3))
         parts, work = np.zeros((len(time), count, 3)), np.zeros(len(time))

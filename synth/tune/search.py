@@ -25,8 +25,8 @@ from scipy import stats
 from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
+from synth.fem.law_choice import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job import identity, reader
-from synth.job.law_choice import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
 from synth.render.mitsuba import adapter
 from synth.system import cache, packages

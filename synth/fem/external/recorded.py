@@ -23,7 +23,6 @@ from synth.fem.external.series import MeshSeries, State, Units, assemble, find_s
 from synth.fem.external.vtk_series import force_field
 from synth.geometry.mesh_file import Numbers, read_surface, whole
 from synth.geometry.skin import TRIANGLE
-from synth.job import identity
 from synth.system import checked_file
 
 _CELLS = {"faces": TRIANGLE, "tetrahedra": 10, "hexahedra": 12}
@@ -92,7 +91,7 @@ def _faces_of(arrays: Path, rest: Floats) -> Ints:
     found = sorted(arrays.parent.glob("*.obj"))
     if len(found) != 1:
         raise UserError(f"{arrays.parent}: {len(found)} OBJ files; the recorded surface, one, is needed")
-    data = checked_file.read_bytes(found[0], identity.FILES["anatomy", "mesh"])
+    data = checked_file.read_bytes(found[0], checked_file.LARGEST_MESH)
     with as_user_error(f"{found[0]}: is not a readable surface"):
         vertices, faces = read_surface(data, "obj")
     away, nearest = cKDTree(rest).query(vertices)

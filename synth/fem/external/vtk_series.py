@@ -14,8 +14,8 @@ from synth.errors import UserError, as_user_error, did_you_mean
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.geometry.mesh_file import SUFFIXES, SURFACES, MeshFile, read_mesh, read_surface
 from synth.geometry.skin import TRIANGLE
-from synth.job.identity import COLLECTIONS, LARGEST_STATE, read_collection
 from synth.system import checked_file
+from synth.system.series_files import COLLECTIONS, LARGEST_STATE, read_collection
 
 MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {

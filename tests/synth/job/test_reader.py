@@ -7,7 +7,7 @@ import pytest
 from synth.errors import UserError
 from synth.job import identity, job_writer, reader
 from synth.job.schema import Job
-from synth.sequence import scenario
+from synth.sequence.draw import draw_scenario
 
 BAD = """\
 seed: -1
@@ -76,7 +76,7 @@ HOME = Path(__file__).resolve().parents[3]
 def test_a_named_job_is_read_and_drawn(name: str) -> None:
     job = reader.load_job(name)
     for index in range(min(job.sequences, 5)):
-        assert scenario.draw_scenario(job, index).gestures
+        assert draw_scenario(job, index).gestures
 
 
 def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data() -> None:

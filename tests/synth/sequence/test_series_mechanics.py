@@ -204,7 +204,7 @@ def test_files_enter_the_identity_by_content_and_folders_take_turns(tmp_path: Pa
     for name in ("run_a", "run_b"):
         write(tmp_path / name, "ascii")
     job = job_of(tmp_path / "run_*", *FORCE, "sequences=3")
-    assert [one.name for one in identity.list_sources(job.mechanics)] == ["run_a", "run_b"]
+    assert [one.name for one in series_files.list_sources(source)] == ["run_a", "run_b"]
     before, file = identity.identify_job(job), tmp_path / "run_b" / "block_3.vtu"
     (tmp_path / "elsewhere").mkdir()
     for name in ("run_a", "run_b"):
