@@ -99,42 +99,38 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
     def generator(*key: int) -> np.random.Generator:
         return np.random.default_rng(seed(*key))
 
-    if case is not None:
-        view = case.view
-    else:
-        drawn = scenario.draw_view(job.render, generator(_VIEW))
-        view = randomization.vary_view(drawn, job, index, lens, off_centre)
-    camera = cameras.place(view, lens)
-    if lens.K is not None:
-        view = cameras.state_field(view, camera)
-    right = place_right(job.render, camera)
     if case is None:
         family = job.appearance.families[index % len(job.appearance.families)]
-        relief = SeedSequence(job.seed, spawn_key=(_ANATOMY, index, 0))
-        tissue = scenario.draw_tissue(job.fem, generator(_TISSUE))
-        opening_mm, visible_mm = job.anatomy.craniotomy.radius_mm, visible_radius(camera)
-        again = (_REDRAW, attempt) if attempt else ()
-        rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-        shown = visible_mm, camera.centre
-        gestures = scenario.draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
-        appearance = scenario.draw_appearance(job, family, generator(_APPEARANCE))
-        acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
-        strength = job.randomize.get("instruments", 0.0)
+        relief = np.random.default_rng(SeedSequence(job.seed, spawn_key=(_ANATOMY, index, 0)))
         case = Scenario(
             index=index,
             family=family,
-            relief=scenario.draw_relief(job.anatomy, np.random.default_rng(relief)),
-            tissue=tissue,
-            gestures=gestures,
-            appearance=randomization.vary_appearance(appearance, job, index),
-            view=view,
+            relief=scenario.draw_relief(job.anatomy, relief),
+            tissue=scenario.draw_tissue(job.fem, generator(_TISSUE)),
+            gestures=(),
+            appearance=scenario.draw_appearance(job, family, generator(_APPEARANCE)),
+            view=scenario.draw_view(job.render, generator(_VIEW)),
             camera_motion=scenario.draw_camera_motion(job.render, generator(_CAMERA_MOTION)),
             pulse=scenario.draw_pulse(job.fem.pulse, generator(_PULSE)),
-            idle=draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting),
             randomized=how,
             attempt=attempt,
         )
-    case = replace(case, view=view)
+        view, appearance = randomization.vary(case.view, case.appearance, job, index, lens, off_centre)
+        camera = cameras.place(view, lens)
+        visible_mm, opening_mm = visible_radius(camera), job.anatomy.craniotomy.radius_mm
+        again = (_REDRAW, attempt) if attempt else ()
+        rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
+        shown = visible_mm, camera.centre
+        young_kpa = case.tissue.young_kpa
+        gestures = scenario.draw_gestures(job.fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
+        acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
+        strength = job.randomize.get("instruments", 0.0)
+        idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting)
+        case = replace(case, view=view, appearance=appearance, gestures=gestures, idle=idle)
+    else:
+        camera = cameras.place(case.view, lens)
+    if lens.K is not None:
+        case = replace(case, view=cameras.state_field(case.view, camera))
     if job.mechanics.source is not None:  # whose files hold motion and load
         outside = replace(case.tissue, law="external", why="mechanics.source", membrane=None)
         case = replace(case, gestures=(), pulse=None, tissue=outside)
@@ -145,7 +141,7 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
         job=job,
         scenario=case,
         camera=camera,
-        right=right,
+        right=place_right(job.render, camera),
         craniotomy=craniotomy,
         attachments=attachments,
         frame_seeds=tuple(seed(_NOISE).generate_state(job.frames).tolist()),

@@ -170,20 +170,17 @@ def _draw_texture(job: Job, index: int, scale: float, sheet: Surroundings | None
     return replace(how, pattern=draw.pattern(kind, colours, size, 0.06 * draw.strength, rough))
 
 
-def vary_view(view: CameraView, job: Job, index: int, lens: Lens, off_centre: Ends) -> CameraView:
-    """The view with the opening off its centre (`field`) and out of focus (`camera`)."""
-    draw, (across, down) = _Draws(job, index, "camera", 1), job.render.size
-    x, y = off_centre
+def vary(
+    view: CameraView, appearance: Appearance, job: Job, index: int, lens: Lens, off_centre: Ends
+) -> tuple[CameraView, Appearance]:
+    """A view and an appearance with what groups draw: the opening off its centre (`field`) and out of focus
+    (`camera`), lamps (`light`) and sensor (`camera`)."""
+    draw, (across, down), (x, y) = _Draws(job, index, "camera", 1), job.render.size, off_centre
     # Radius of the circle of confusion: 2 px at most; stronger ones are rarer.
     defocus_px = 2.0 * draw.strength * draw.rng.uniform(-1, 1) ** 3
     share = defocus_px * lens.mm_per_px(view) / max(job.render.aperture_mm, 0.1)
     share = float(np.clip(share, -0.5, 0.5))  # of the plane's distance by which it is out of focus
     focus_mm = view.focus_mm + view.working_distance_mm * share / (1 - share)
-    return replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
-
-
-def vary_appearance(appearance: Appearance, job: Job, index: int) -> Appearance:
-    """The appearance with randomised lamps (`light`) and sensor (`camera`)."""
     sensor, lighting, draw = appearance.sensor, appearance.light, _Draws(job, index, "camera", 2)
     if draw.strength:
         native = draw("native") if draw.rng.random() < 0.5 else 1.0
@@ -191,7 +188,8 @@ def vary_appearance(appearance: Appearance, job: Job, index: int) -> Appearance:
         sensor = replace(sensor, native=native, halo_px=draw("halo_px"), white=white)
     if job.randomize.get("light"):
         lighting = _draw_light(lighting, job, index)
-    return replace(appearance, sensor=sensor, light=lighting)
+    varied = replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
+    return varied, replace(appearance, sensor=sensor, light=lighting)
 
 
 def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:

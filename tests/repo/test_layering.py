@@ -7,8 +7,8 @@ from pathlib import Path
 from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
 INSIDE = {
-    "synth": "arrays errors arguments fields formats plugins system fem.law_choice job flow flow.stereo video "
-    "flow.recording geometry fem.mesh fem fem.external "
+    "synth": "arrays errors arguments fields formats plugins system fem.law_choice job flow flow.stereo "
+    "video flow.recording geometry fem.mesh fem fem.external "
     "render.camera render.materials render.mitsuba render.appearance render.anatomy render.randomized render "
     "dataset sequence checks publish publish.export engine tune fit cli __main__",
     "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "
