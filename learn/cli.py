@@ -81,7 +81,7 @@ def train_command(
     settings = change_preset(preset, given)
     begin = read_model(find_model(start)) if start else None
     with made_folder(out, disk_needed(out, settings)):
-        clips, split = _divided([dataset, *(also or [])], labels or [], settings, cache)
+        clips, split = _divide([dataset, *(also or [])], labels or [], settings, cache)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
             card = train(clips, split, settings, out, start=begin, device=device, report=progress, log=log)
@@ -117,13 +117,13 @@ def _read(datasets: Iterable[Path], grid: Grid, wanted: Sequence[str], cache: Pa
     from learn.data.clips import load_clips
 
     clips: list[Clip] = []
-    for one in datasets:
+    for dataset in datasets:
         with counting("Reading sequences") as progress:
-            clips += load_clips(one, grid, wanted, cache=cache, report=progress)
+            clips += load_clips(dataset, grid, wanted, cache=cache, report=progress)
     return clips
 
 
-def _divided(
+def _divide(
     datasets: Sequence[Path], labels: Sequence[Path], settings: TrainingSettings, cache: Path | None
 ) -> tuple[list[Clip], Split]:
     """The sequences of datasets and of those for labels, and what each is for."""

@@ -44,7 +44,7 @@ def divide(
     test) are used. `seed`: of `keep_back`. UserError for too few groups to split, or an empty fit or select
     part.
     """
-    splits, where = [read_split(one) for one in datasets], " ".join(map(str, datasets))
+    splits, where = [read_split(dataset) for dataset in datasets], " ".join(map(str, datasets))
     if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
         clips = regroup(clips, "opening" if shared == {True} else "sequence")
         note("Brains may be on several sides of the split: scores don't apply to other brains.")
@@ -85,7 +85,7 @@ def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> t
     UserError: none of them is left.
     """
     known = {clip.content_hash for clip in clips}
-    new = [one for one in labels if one.content_hash not in known]
+    new = [label for label in labels if label.content_hash not in known]
     if labels and not new:
         raise UserError("--labels: holds the training data itself; give a dataset of other sequences")
     every = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
@@ -121,7 +121,7 @@ def choose_unseen(
     known = {name for part in card.split.values() for name in part}
     if split.sides and any(clip.content_hash in known for clip in clips):
         candidates = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = unseen(candidates, card)
+    chosen = keep_unseen(candidates, card)
     if not chosen:
         raise UserError(
             f"{dataset}: the model was trained on the brains of all {len(candidates)} test sequences; use "
@@ -132,7 +132,7 @@ def choose_unseen(
     return chosen
 
 
-def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
+def keep_unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
     brains, used = {name for part in USED for name in card.groups.get(part, ())}, card.used
     grouped = zip(clips, regroup(clips, find_unit(card)), strict=True)

@@ -101,8 +101,8 @@ def solve(tissue: TissueKind, components: int) -> Floats:
 
     Rows: x of every point, then y, then in stereo z (C = 3); columns: loads along x at every node, then y, z.
     """
-    surface = _condensed("free" if tissue.edge == "free" else "held", tissue.poisson)
-    whole = surface.stiffness + surface.added(tissue)
+    surface = _condense("free" if tissue.edge == "free" else "held", tissue.poisson)
+    whole = surface.stiffness + surface.assemble_added(tissue)
     # The window is last, so that only its own part of the factor meets the loads.
     root = cholesky(whole.T, lower=True, overwrite_a=True, check_finite=False)  # .T: without a copy
     first, rows = len(root) - len(surface.loads), components * len(lattice().points)
@@ -123,7 +123,7 @@ class _Surface:
     observed: Floats  # (3 P, 3 W) motion of the points, x, y, z in turn, by that of the window's nodes
     loads: Floats  # (3 W, 3 K) forces on the window's nodes by unit loads
 
-    def added(self, tissue: TissueKind) -> Floats:
+    def assemble_added(self, tissue: TissueKind) -> Floats:
         """What skull and membrane add to the stiffness, (3 S, 3 S) mN/mm."""
         volume = self.volumes[tissue.edge]
         stiffness = springs(volume)
@@ -138,7 +138,7 @@ Block = Literal["held", "free"]
 
 
 @lru_cache(maxsize=1)
-def _condensed(block: Block, poisson: float) -> _Surface:
+def _condense(block: Block, poisson: float) -> _Surface:
     volumes, nodes, observed, loads = _geometry(block)
     volume = next(iter(volumes.values()))
     tissue, _ = tissue_stiffness(quadrature(volume.points, volume.cells), poisson)

@@ -64,9 +64,9 @@ def mix(parts: Sequence[ForceMixture], weight: Floats, worlds: Sequence[int]) ->
     """The mixture of distributions with weights of sum 1, each under an assumption `worlds`."""
     return ForceMixture(
         np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
-        np.concatenate([one.force for one in parts]),
-        np.concatenate([one.covariance for one in parts]),
-        world=np.repeat(worlds, [len(one.weight) for one in parts]),
+        np.concatenate([part.force for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        world=np.repeat(worlds, [len(part.weight) for part in parts]),
     )
 
 
@@ -79,7 +79,7 @@ def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[f
     """
     if found.world is not None and len(worlds := np.unique(found.world)) > 1:
         size = float(np.linalg.norm(found.mean))
-        ends = [size_interval(found.within(one), gain, cameras) for one in worlds]
+        ends = [size_interval(found.within(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
     size = float(np.linalg.norm(found.mean))  # may be less than most drawn magnitudes
     weight = found.weight / found.weight.sum()

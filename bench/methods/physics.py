@@ -124,7 +124,7 @@ class Physics:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
         self._contact_free = int(contact_free.sum())
-        return widen_small_forces([self._estimate(one, False) for one in self._frames])
+        return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
 
     @property
     def notes(self) -> list[str]:
@@ -168,7 +168,7 @@ def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list
 
     A large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
     """
-    size = np.array([one.signal_mm**2 for one in frames])
+    size = np.array([frame.signal_mm**2 for frame in frames])
     order = np.argsort(size, kind="stable")
     count = np.arange(1, len(frames) + 1)
     share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
@@ -205,7 +205,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
     if known != "unknown":
         return np.full(len(tissues), 1 / len(tissues))
-    stiff, intact = np.array([one.membrane > 0 for one in tissues]), TISSUES.intact
+    stiff, intact = np.array([tissue.membrane > 0 for tissue in tissues]), TISSUES.intact
     return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
@@ -244,7 +244,7 @@ def weigh_tissues(
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     """The posterior of a frame's loads, as a mixture over tissues."""
     components, weight = len(weights.own_mm), weights.weight
-    worlds = [(one, weights.own_mm) for one in weights.tissues]
+    worlds = [(tissue, weights.own_mm) for tissue in weights.tissues]
     if weights.assumed:
         worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
         weight = np.append(weight, TISSUES.unlikely)

@@ -13,7 +13,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from learn.data.grid import Grid, GridView, certainty, settled
+from learn.data.grid import Grid, GridView, certainty, settle
 from synth.arrays import Array, Floats, Map
 from synth.dataset.sequence_split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
@@ -125,7 +125,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     if "motion" in wanted:
         spatial = on_grid("motion_deviation", certainty)
     loads = (traction.transpose(2, 0, 1) * area for traction in sequence.read_sealed("traction"))
-    density = np.stack([settled(view.sum(load), view.mask) for load in loads])
+    density = np.stack([settle(view.sum(load), view.mask) for load in loads])
     density /= np.float32(grid.pitch_mm**2 * young)
     return Clip(
         **_plain(sequence),
@@ -185,13 +185,13 @@ def load_clips(
     clips = []
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
-        packed = cache and _packed(sequence, grid, wanted, cache)
+        packed = cache and _pack(sequence, grid, wanted, cache)
         clips.append(packed or read_clip(sequence, grid, wanted))
     report(len(dataset), len(dataset))
     return clips
 
 
-def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+def _pack(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
     key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, CLIPS]

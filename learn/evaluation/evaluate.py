@@ -55,7 +55,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     true_mn: Floats = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
     centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
-    off = [d for d in (float(np.linalg.norm(one)) for one in centres) if math.isfinite(d)]
+    off = [d for d in (float(np.linalg.norm(centre)) for centre in centres) if math.isfinite(d)]
     peak = float(true_mn.max())
     others = {}
     if parts == 3:

@@ -64,7 +64,7 @@ def _fit(
     if distribution is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
     # A recording's distance doesn't depend on errors: all sequences but the training ones count.
-    distribution = distribution.calibrated([one.motion for one in examples])
+    distribution = distribution.calibrated([example.motion for example in examples])
     return fit(first, second, distribution, motion_names(card.settings.arch.depth), unit, source)
 
 

@@ -68,7 +68,7 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
         yield _arrays(path)
     else:
         for sequence in _sequences(path):
-            yield _stored(sequence, source)
+            yield _read_stored(sequence, source)
 
 
 def has_right_camera(path: Path | Array) -> bool:
@@ -86,7 +86,7 @@ def _sequences(path: Path) -> Iterator[Sequence]:
     yield from [open_sequence(path)] if one else Dataset(path)
 
 
-def _stored(sequence: Sequence, source: str) -> Motion:
+def _read_stored(sequence: Sequence, source: str) -> Motion:
     check_readable(sequence, [source])
     scale = float(sequence.attrs["scale_mm_per_px"])
     time_s, tissue = map(sequence.read_whole, ("time", "tissue"))

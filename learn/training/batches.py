@@ -11,7 +11,7 @@ from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
 from learn.data.grid import Scales, membrane_code
-from learn.network.channels import channels, divergence, turned
+from learn.network.channels import channels, divergence, rotate
 from learn.settings import TrainingSettings
 from learn.training import error_transfer
 from learn.training.error_transfer import Transfer
@@ -31,10 +31,10 @@ class Batch(NamedTuple):
     target: Tensor  # (B, C, N, N) in the unit of `Scales.target`
     membrane: Tensor  # (B,) of `membrane_code`
 
-    def turned(self, turn: int) -> Batch:
-        """All fields turned by `turned`; each confidence is a scalar."""
-        planes = turned(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
-        moved, mask, true = (turned(one, turn) for one in (self.displacement, self.mask, self.target))
+    def rotate(self, turn: int) -> Batch:
+        """All fields turned by `rotate`; each confidence is a scalar."""
+        planes = rotate(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
+        moved, mask, true = (rotate(one, turn) for one in (self.displacement, self.mask, self.target))
         return Batch(moved, mask, planes, true, self.membrane)
 
 
@@ -44,7 +44,7 @@ class FrameItem(NamedTuple):
     clip: int
     frame: int
     source: str  # displacement, as in `learn.data.clips.FIELDS`
-    turn: int = 0  # 0-7, as of `turned`
+    turn: int = 0  # 0-7, as of `rotate`
     membrane_known: bool = False
     errors: Transfer | None = None  # an error that is added to `source`, with its confidence
     deviation_factor: float = 1.0  # of the deviation that the confidence states
@@ -139,10 +139,10 @@ class FrameDataset:
                 moved, confidence = error_transfer.transfer(moved, donor, there[0] - donor, there[1], errors)
                 moved, confidence = moved * self._masks[c], confidence * self._masks[c]
             if factor != 1:
-                confidence = error_transfer.restated(confidence, factor)
+                confidence = error_transfer.restate(confidence, factor)
             code = membrane_code(self.clips[c].membrane) if known else 0.0
             codes = torch.full((1,), code, device=self.device)
-            frames.append(Batch(moved, self._masks[c], confidence, true, codes).turned(turn))
+            frames.append(Batch(moved, self._masks[c], confidence, true, codes).rotate(turn))
         return Batch(*map(torch.cat, zip(*frames, strict=True)))
 
     def _read(self, c: int, t: int, source: str) -> tuple[Tensor, ...]:
@@ -151,7 +151,7 @@ class FrameDataset:
             clip = self.clips[c]
             truth = target(clip, t, self.settings.arch.components)
             arrays = clip.displacement[source][t], clip.confidence_of(source)[t], truth
-            found = tuple(torch.from_numpy(np.array(one))[None].to(self.device) for one in arrays)
+            found = tuple(torch.from_numpy(np.array(array))[None].to(self.device) for array in arrays)
             if self._stores:
                 self._stored[c, t, source] = found
         return found

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from learn.network.channels import turned
+from learn.network.channels import rotate
 
 IDEAL, TRANSFERRED, RECOVERED = 0.25, 0.25, 0.25
 FACTOR = 2.0  # largest factor of a transferred error, of either sign
@@ -46,7 +46,7 @@ def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: in
     return Transfer(clip, int(rng.integers(frames)), factor), float(np.exp(rng.normal(0, SPREAD)))
 
 
-def restated(confidence: Tensor, factor: float) -> Tensor:
+def restate(confidence: Tensor, factor: float) -> Tensor:
     """The confidence for deviations `factor` times as large, as of `learn.data.grid.certainty`."""
     return confidence / (confidence + factor**2 * (1 - confidence)).clamp_min(1e-6)
 
@@ -69,16 +69,16 @@ def transfer(
         error, confidence = error * far, torch.where(far, confidence, 1.0)
     else:
         for one in range(8):
-            there = turned(donor_true, one)
+            there = rotate(donor_true, one)
             row, column = _contact(there)[0]
             moved = place[0] - row, place[1] - column
-            alike = float((_shifted(there, moved) * true).sum())
+            alike = float((_shift(there, moved) * true).sum())
             if abs(alike) > abs(likeness):
                 likeness, turn, shift = alike, one, moved
         scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
     factor = scale * error.new_tensor(how.factor).view(1, -1, 1, 1)
-    planes = turned(confidence.transpose(0, 1), turn).transpose(0, 1)
-    return true + factor * _shifted(turned(error, turn), shift), _shifted(planes, shift)
+    planes = rotate(confidence.transpose(0, 1), turn).transpose(0, 1)
+    return true + factor * _shift(rotate(error, turn), shift), _shift(planes, shift)
 
 
 def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:
@@ -88,7 +88,7 @@ def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:
     return divmod(at, size.shape[1]), float(size.flatten()[at].sqrt())
 
 
-def _shifted(values: Tensor, shift: tuple[int, int]) -> Tensor:
+def _shift(values: Tensor, shift: tuple[int, int]) -> Tensor:
     """Fields shifted down and right by whole cells, 0 where nothing is known."""
     (down, right), (height, width) = shift, values.shape[2:]
     up, left = max(-down, 0), max(-right, 0)

@@ -106,9 +106,9 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
         likely = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
         hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if likely else "convert it to mm"
         raise UserError(f"anatomy.mesh: {path.name} is {span.max():.3g} mm long, a brain 100 to 200; {hint}")
-    faces = _oriented(vertices, faces)
+    faces = _orient(vertices, faces)
     if fill_holes:
-        faces = _filled(vertices, faces, path.name)
+        faces = _fill_holes(vertices, faces, path.name)
     flat = len(faces) < 4 or span.min() < 1e-3 * span.max()
     if flat or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod():
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
@@ -229,7 +229,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
         plus = f"scanner RAS is this plus {offset.round(2).tolist()}"
         what = f"{path.name} and points on it are in surface RAS, SurfaceRAS in freeview"
         warnings.warn(f"anatomy.mesh: {what}; {plus}", Caution, stacklevel=1)
-    return _merged(vertices, faces)
+    return _merge(vertices, faces)
 
 
 def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
@@ -246,7 +246,7 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
         _refuse_expansion(data)
         image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
         held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{one}") for one in ("POINTSET", "TRIANGLE")]
-        if [[one.data.shape[1:] for one in arrays] for arrays in held] != [[(3,)], [(3,)]]:
+        if [[array.data.shape[1:] for array in arrays] for arrays in held] != [[(3,)], [(3,)]]:
             raise ValueError("one list of points and one of triangles are needed, as in a .surf.gii")
         points, vertices, faces = held[0][0], held[0][0].data, held[1][0].data
         if points.coordsys is None or points.coordsys.dataspace != 1:  # 1: NIFTI_XFORM_SCANNER_ANAT
@@ -276,7 +276,7 @@ def _whole(data: bytes) -> bytes:
     return data[:80] + struct.pack("<I", held) + data[84 : 84 + 50 * held]
 
 
-def _oriented(vertices: Floats, faces: Ints) -> Ints:
+def _orient(vertices: Floats, faces: Ints) -> Ints:
     """The faces; if neighbours are oriented differently or bodies cancel, turned until all face outwards."""
     import trimesh
 
@@ -296,7 +296,7 @@ def _oriented(vertices: Floats, faces: Ints) -> Ints:
     return faces
 
 
-def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+def _merge(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     """The surface without duplicate vertices and faces, faces without area, and vertices without faces."""
     if len(vertices) == 0 or len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -310,7 +310,7 @@ def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     return vertices[first][used], faces.reshape(-1, 3)
 
 
-def _filled(vertices: Floats, faces: Ints, name: str) -> Ints:
+def _fill_holes(vertices: Floats, faces: Ints, name: str) -> Ints:
     """The faces, with a fan of triangles over each hole."""
     import trimesh
 

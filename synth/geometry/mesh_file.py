@@ -294,14 +294,14 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> _Reader:
         dtype = np.dtype(_XML_TYPES[kind])
         data, form = (node.text or "").encode(), node.get("format", "ascii")
         if form == "ascii":
-            found = _parsed(data, dtype)
+            found = _parse(data, dtype)
         else:
             if form == "appended":
                 data = tail[(at := int(node.get("offset", 0))) : ends[at]]
             if form != "appended" or not raw:  # header and data may be coded separately, each with padding
                 data = b"".join(map(base64.b64decode, re.findall(rb"[^=]+=*", b"".join(data.split()))))
             limit = budget[0] if expected is None else min(budget[0], expected * dtype.itemsize)
-            data = _unpacked(data, word, packer, limit)
+            data = _unpack(data, word, packer, limit)
             budget[0] -= len(data)
             found = np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
         if expected is not None and len(found) != expected:
@@ -311,7 +311,7 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> _Reader:
     return array
 
 
-def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit: int) -> bytes:
+def _unpack(data: bytes, word: np.dtype[np.number], packer: str | None, limit: int) -> bytes:
     """The bytes of an array after its header, expanded; ValueError if they are not those that it states, or
     more than `limit`."""
     count, width = int(np.frombuffer(data, word, 1)[0]), word.itemsize
@@ -338,7 +338,7 @@ def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit:
     return b"".join(parts)
 
 
-def _parsed(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
+def _parse(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
     """The numbers in a text."""
     kind = np.int64 if dtype.kind in "iu" else np.float64
     if len(text) < 2000:
@@ -447,7 +447,7 @@ class _Legacy:
         self._at = end = stop.start() if stop else len(self._data)
 
         def read() -> Numbers:
-            found = _parsed(self._data[start:end], dtype)
+            found = _parse(self._data[start:end], dtype)
             if len(found) != count:
                 raise ValueError(f"it has {len(found)} numbers where {count} are stated; is it truncated?")
             return found.reshape(shape)

@@ -123,7 +123,9 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
         shown = visible_mm, camera.centre
         young_kpa = case.tissue.young_kpa
         gestures = scenario.draw_gestures(job.fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
-        acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
+        acting = np.array([[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]).reshape(
+            -1, 2, 3
+        )
         strength = job.randomize.get("instruments", 0.0)
         idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting)
         case = replace(case, view=view, appearance=appearance, gestures=gestures, idle=idle)
@@ -178,7 +180,10 @@ def open_skull(anatomy: AnatomySection, index: int) -> tuple[Craniotomy | None, 
     opening = None
     if where.point is not None and where.direction is not None:
         opening = Craniotomy(where.point, where.direction, where.radius_mm)
-    held = (Attachment(one.point, one.radius_mm, one.normal, one.thickness_mm) for one in anatomy.attachments)
+    held = (
+        Attachment(attachment.point, attachment.radius_mm, attachment.normal, attachment.thickness_mm)
+        for attachment in anatomy.attachments
+    )
     return opening, tuple(held)
 
 

@@ -108,7 +108,9 @@ class RestScene:
         """Gesture, kind and radius of the contact in mm of each acting instrument, then of idle ones."""
         idle = [("idle", one.kind, one.radius_mm) for one in self.scenario.idle]
         if self.series is None:
-            return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures] + idle
+            return [
+                (gesture.kind, gesture.instrument, gesture.footprint_mm) for gesture in self.scenario.gestures
+            ] + idle
         kinds, radius = self.job.fem.instrument or ("probe",), self.job.fem.footprint_mm[0]
         return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])] + idle
 
@@ -229,7 +231,7 @@ class Scene(RestScene):
         chosen = self.job.flow.backend if backend is None else backend
         if chosen == "ideal":
             raise UserError("flow.backend: `ideal` recovers no flow; name an estimator")
-        rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
+        rgb, tools = np.stack([frame.rgb for frame in frames]), np.stack([frame.tool for frame in frames])
         rgb = transmit(rgb, self.job.fps, self.job.sensor.bitrate_mbps, self.job.sensor.chroma)
         return track.recover_flow(rgb, tools, self.tissue, chosen)
 

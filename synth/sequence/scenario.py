@@ -148,7 +148,7 @@ def draw_gestures(
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 hides = trial.shaft @ sight > least and trial.instrument != "none"
-                if fits and not hides and all(_apart(trial, other) for other in found.values()):
+                if fits and not hides and all(_are_apart(trial, other) for other in found.values()):
                     found[k] = trial
                     break
             else:
@@ -299,7 +299,7 @@ def draw_driven_gesture(
     )
 
 
-def _apart(one: Gesture, other: Gesture) -> bool:
+def _are_apart(one: Gesture, other: Gesture) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
     if tool_gesture.clearance(one, other) < 0:
         return False
@@ -380,7 +380,8 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     if job.appearance.blood:
         ranges = ranges | {"blood": job.appearance.blood}
     drawn: dict[str, Any] = {
-        name: _near(ends, rng) if len(ends) == 3 else _uniform(rng, ends) for name, ends in ranges.items()
+        name: _vary_colour(ends, rng) if len(ends) == 3 else _uniform(rng, ends)
+        for name, ends in ranges.items()
     }
     # More glare: a thicker and rougher layer of a higher index, over more relief. Chosen on photographs.
     square = lighting.glare**2
@@ -439,7 +440,7 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
     return replace(sensor, matrix=section.matrix or camera.matrix, curves=section.curves or camera.curves)
 
 
-def _near(colour: Colour, rng: Random) -> Colour:
+def _vary_colour(colour: Colour, rng: Random) -> Colour:
     """A colour of slightly different brightness and hue."""
     value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
     return _vector(np.clip(value, 0.01, 0.95))

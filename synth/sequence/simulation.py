@@ -62,7 +62,10 @@ def simulate(
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
-    stated = any(one.load or one.force_mn or one.travel_mm for one in job.fem.instrument_list)
+    stated = any(
+        instrument.load or instrument.force_mn or instrument.travel_mm
+        for instrument in job.fem.instrument_list
+    )
     attempts = DRIVEN_ATTEMPTS if job.fem.contact == "driven" else ATTEMPTS
     left = 0 if case or stated or not ours else attempts - 1
     drawn = draw(job, index, case=case)

@@ -69,7 +69,7 @@ def _read(
 
 def doubt_load(series: MeshSeries, young_kpa: float | None) -> list[str]:
     """Doubts on the load of a series, if it has one; see `plausibility`."""
-    if series.force is None or any(one.startswith("nodes") for one in series.cautions):
+    if series.force is None or any(caution.startswith("nodes") for caution in series.cautions):
         return []  # nor of false motion
     motion = series.points, series.faces, series.displacement, series.force
     return plausibility.find_load_doubts(*motion, young_kpa)

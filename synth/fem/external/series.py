@@ -104,7 +104,7 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
     _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     place = first[place.ravel()]
     with as_user_error(str(where)):
-        if any(one.min(initial=0) < 0 for one in cells.values()):
+        if any(cell.min(initial=0) < 0 for cell in cells.values()):
             raise ValueError("a cell refers to a missing point")
         cells = {kind: place[one] for kind, one in cells.items()}
         outer = skin(points, cells)
@@ -113,8 +113,8 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
         if not area.max(initial=0) > 0:
             raise ValueError("its surface has no area")
         nodes, faces = np.unique(outer[area > _ROUNDING**2 * area.max()], return_inverse=True)
-    links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
-    graph = sp.coo_array((np.ones(sum(one.shape[1] for one in links)), np.hstack(links)), [len(points)] * 2)
+    links = [np.stack([cell[:, :-1], cell[:, 1:]]).reshape(2, -1) for cell in cells.values()]
+    graph = sp.coo_array((np.ones(sum(link.shape[1] for link in links)), np.hstack(links)), [len(points)] * 2)
     bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
     if len(bodies) > 1:
         raise UserError(f"{where}: has {len(bodies)} separate bodies; write the tissue alone")

@@ -108,7 +108,7 @@ def from_brain(
     UserError: the surface encloses no volume that can be meshed, or none under the opening; an attachment
     holds nothing.
     """
-    points, cells = _filled(brain, _grading(opening_mm, focus), tets)
+    points, cells = _fill(brain, _grading(opening_mm, focus), tets)
     if len(cells) < 0.2 * tets:
         raise UserError("anatomy.mesh: the surface encloses no volume that tetrahedra fit into")
     top = points[np.hypot(points[:, 0], points[:, 1]) < opening_mm, 2].max(initial=-np.inf)
@@ -185,13 +185,13 @@ def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
     return grid, cells
 
 
-def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
+def _fill(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
     """Graded tetrahedra inside a surface, about as many as wanted after up to four tries."""
     turns = winding.prepare(*brain.shape)
     low, high = brain.shape.vertices.min(axis=0), brain.shape.vertices.max(axis=0)
     size = 1.1 * (high - low)
 
-    def wanted(at: Floats) -> Floats:
+    def grade(at: Floats) -> Floats:
         """The grading, coarser well outside the surface, where refining gains nothing."""
         outside = turns(at) < 0.01
         far = np.linalg.norm(at, axis=1) > _ALL_MM
@@ -201,7 +201,7 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
     for _ in range(4):
         points, cells = _bricks(size, lattice / 18)
         points += 0.5 * (low + high) + [0, 0, 0.5 * size[2]]
-        points, cells = refine(points, cells, wanted, lattice)
+        points, cells = refine(points, cells, grade, lattice)
         points, cells = stuff(points, cells, lambda at: turns(at) - 0.5)
         if 0.9 * tets <= len(cells) <= 1.1 * tets or len(cells) == 0:
             break
@@ -247,16 +247,16 @@ def _springs(
     value = shape(TRI_POINTS)
     pressed = FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
 
-    def gathered(part: Floats) -> sp.csr_array:
+    def gather(part: Floats) -> sp.csr_array:
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))
 
     if not slips:
-        return gathered(pressed), None
+        return gather(pressed), None
     normal = facing / (2 * area)[:, None]
     slip = sp.csr_array((3 * len(points),) * 2)
     for i, j in product(range(3), repeat=2):
         one = np.zeros((3, 3))
         one[i, j] = 1
         part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
-        slip = slip + sp.kron(gathered(part), one, format="csr")
-    return gathered(np.where(deep, pressed, 0)), sp.csr_array(slip)
+        slip = slip + sp.kron(gather(part), one, format="csr")
+    return gather(np.where(deep, pressed, 0)), sp.csr_array(slip)

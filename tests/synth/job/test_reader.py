@@ -1,12 +1,14 @@
 """Job files: read as written, errors reported with their place; named jobs can all be drawn."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from synth.errors import UserError
 from synth.job import identity, job_writer, reader
-from synth.job.schema import Job
+from synth.job.schema import Family, Job
+from synth.render.appearance.family import FAMILIES
 from synth.sequence.draw import draw_scenario
 
 BAD = """\
@@ -87,3 +89,7 @@ def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data
     assert ood.anatomy.sulcus_mm[1] <= train.anatomy.sulcus_mm[0]
     assert ood.fem == train.fem == bench.fem
     assert len({job.seed for job in (train, bench, ood)}) == 3
+
+
+def test_every_family_has_its_ranges() -> None:
+    assert get_args(Family) == tuple(FAMILIES)

@@ -1,6 +1,7 @@
 """A scenario depends on (job, index) only; its contacts lie in the opening and in the picture."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,9 @@ import pytest
 from synth.fem import equilibrium
 from synth.job.schema import Job
 from synth.render.camera import camera
+from synth.sequence import randomization
 from synth.sequence.draw import draw, draw_scenario, read_lens
+from synth.sequence.rest_scene import at_rest
 from synth.sequence.simulation import simulate
 
 
@@ -88,3 +91,19 @@ def test_a_stated_load_that_the_mesh_does_not_bear_is_refused(brittle: Job) -> N
     fem = brittle.fem.model_validate({"tets": 300, "instrument_list": [given]})
     with pytest.raises(equilibrium.InvertedElement, match=r"load 0\.4"):
         simulate(brittle.model_copy(update={"fem": fem}))
+
+
+def test_a_scene_is_drawn_and_placed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = {name: 0 for name in ("randomize", "place")}
+    for module, name in ((randomization, "randomize"), (camera, "place")):
+        original = getattr(module, name)
+
+        def counted(*args: object, name: str = name, original: Any = original) -> Any:
+            calls[name] += 1
+            return original(*args)
+
+        monkeypatch.setattr(module, name, counted)
+    groups = {"field": 1, "camera": 1, "surroundings": 1}
+    rest = at_rest(Job.model_validate({"anatomy": {"vertices": 900}, "randomize": groups}), 3)
+    assert calls == {"randomize": 1, "place": 1}
+    assert rest.draw.camera is rest.view
