@@ -102,7 +102,7 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
         raise UserError(f"anatomy.mesh: {path.name} contains no triangles or polygons")
     span = np.ptp(vertices, axis=0)
     if not _BRAIN_MM[0] <= span.max() <= _BRAIN_MM[1]:
-        unit, factor = min(_UNITS_MM.items(), key=lambda one: abs(np.log(one[1] * span.max() / 150)))
+        unit, factor = min(_UNITS_MM.items(), key=lambda unit: abs(np.log(unit[1] * span.max() / 150)))
         likely = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
         hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if likely else "convert it to mm"
         raise UserError(f"anatomy.mesh: {path.name} is {span.max():.3g} mm long, a brain 100 to 200; {hint}")
@@ -133,10 +133,10 @@ def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_
     """
     from trimesh.triangles import closest_point
 
-    def nearest(at: Floats) -> tuple[float, Floats, int]:
-        found = np.asarray(closest_point(corners, np.broadcast_to(at, (len(corners), 3))))
-        away = np.linalg.norm(found - at, axis=1)
-        return float(away.min()), found[away.argmin()], int(away.argmin())
+    def nearest(place: Floats) -> tuple[float, Floats, int]:
+        feet = np.asarray(closest_point(corners, np.broadcast_to(place, (len(corners), 3))))
+        away = np.linalg.norm(feet - place, axis=1)
+        return float(away.min()), feet[away.argmin()], int(away.argmin())
 
     def text(vector: Floats) -> str:
         return "[" + ", ".join(f"{x:.2f}" for x in vector) + "]"
@@ -245,7 +245,7 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
     else:
         _refuse_expansion(data)
         image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
-        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{one}") for one in ("POINTSET", "TRIANGLE")]
+        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
         if [[array.data.shape[1:] for array in arrays] for arrays in held] != [[(3,)], [(3,)]]:
             raise ValueError("one list of points and one of triangles are needed, as in a .surf.gii")
         points, vertices, faces = held[0][0], held[0][0].data, held[1][0].data
@@ -281,13 +281,15 @@ def _orient(vertices: Floats, faces: Ints) -> Ints:
     import trimesh
 
     mesh, count = trimesh.Trimesh(vertices, faces, process=False), len(faces)
-    one, other = mesh.face_adjacency.T
+    first, other = mesh.face_adjacency.T
     start, end = mesh.face_adjacency_edges[:, :, None].swapaxes(0, 1)
-    runs = [((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (one, other)]
+    runs = [
+        ((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (first, other)
+    ]
     alike = runs[0] != runs[1]  # neighbours pass along their edge in opposite directions
     # Faces as they are and, from `count`, turned: each is linked to what its neighbours then are.
-    links = np.array([[one, one + count], [other + count * ~alike, other + count * alike]]).reshape(2, -1)
-    graph = coo_array((np.ones(2 * len(one)), links), shape=(2 * count, 2 * count))
+    links = np.array([[first, first + count], [other + count * ~alike, other + count * alike]]).reshape(2, -1)
+    graph = coo_array((np.ones(2 * len(first)), links), shape=(2 * count, 2 * count))
     label = connected_components(graph, directed=False)[1].reshape(2, count)
     turned, body = label[0] > label[1], label.min(axis=0)
     volumes = np.bincount(body, np.where(turned, -1, 1) * _volumes(vertices, faces))

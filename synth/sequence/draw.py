@@ -65,8 +65,8 @@ class Draw:
     @property
     def scale(self) -> float:
         """Of the tissue: mm in a mm of the patch as it is grown and painted."""
-        how = self.scenario.randomized
-        return 1.0 if how is None else how.scale
+        randomized = self.scenario.randomized
+        return 1.0 if randomized is None else randomized.scale
 
     @property
     def scheme(self) -> TimeScheme:
@@ -90,7 +90,7 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
     """
     if index < 0:
         raise UserError(f"index {index}: sequences are numbered from 0")
-    dataset, (job, how, off_centre) = job, randomization.randomize(job, index)
+    dataset, (job, randomized, off_centre) = job, randomization.randomize(job, index)
     lens = read_lens(job.render)
 
     def seed(*key: int) -> SeedSequence:
@@ -108,11 +108,11 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
             relief=scenario.draw_relief(job.anatomy, relief),
             tissue=scenario.draw_tissue(job.fem, generator(_TISSUE)),
             gestures=(),
-            appearance=scenario.draw_appearance(job, family, generator(_APPEARANCE)),
             view=scenario.draw_view(job.render, generator(_VIEW)),
             camera_motion=scenario.draw_camera_motion(job.render, generator(_CAMERA_MOTION)),
             pulse=scenario.draw_pulse(job.fem.pulse, generator(_PULSE)),
-            randomized=how,
+            appearance=scenario.draw_appearance(job, family, generator(_APPEARANCE)),
+            randomized=randomized,
             attempt=attempt,
         )
         view, appearance = randomization.vary(case.view, case.appearance, job, index, lens, off_centre)
@@ -123,9 +123,8 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
         shown = visible_mm, camera.centre
         young_kpa = case.tissue.young_kpa
         gestures = scenario.draw_gestures(job.fem, opening_mm, young_kpa, *rngs, *shown, job.frames)
-        acting = np.array([[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]).reshape(
-            -1, 2, 3
-        )
+        lines = [[(*gesture.point_mm, 0.0), gesture.shaft] for gesture in gestures]
+        acting = np.array(lines).reshape(-1, 2, 3)
         strength = job.randomize.get("instruments", 0.0)
         idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_mm, acting)
         case = replace(case, view=view, appearance=appearance, gestures=gestures, idle=idle)
@@ -210,11 +209,11 @@ def place_right(render: RenderSection, camera: Camera) -> Callable[[Camera], Cam
     Rectified(pair)  # refuses a right camera that is not to the right
     place = partial(_place_pair, pair=pair, distortion=distortion)
     right = place(camera)
-    at = cameras.project(right, np.zeros((1, 3)))[0]
-    if right.translation[2] <= 0 or (at < 0).any() or (at >= right.size).any():
+    pixel = cameras.project(right, np.zeros((1, 3)))[0]
+    if right.translation[2] <= 0 or (pixel < 0).any() or (pixel >= right.size).any():
         raise UserError(
-            f"render.calibration: the opening, {camera.translation[2]:.4g} mm away, is at ({at[0]:.0f}, "
-            f"{at[1]:.0f}) px for the right camera, outside its picture; change render.working_distance_mm"
+            f"render.calibration: the opening, {camera.translation[2]:.4g} mm away, is at ({pixel[0]:.0f}, "
+            f"{pixel[1]:.0f}) px for the right camera, outside its picture; change render.working_distance_mm"
         )
     return place
 

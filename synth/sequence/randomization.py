@@ -150,24 +150,24 @@ def randomize(job: Job, index: int) -> tuple[Job, Randomization | None, Ends]:
     if job.randomize.get("camera"):
         aperture, keys["sensor"] = _draw_sensor(job, index)
         keys["render"]["aperture_mm"] = aperture
-    how = _draw_texture(job, index, scale, sheet) if job.randomize else None
+    randomization = _draw_texture(job, index, scale, sheet) if job.randomize else None
     sections = {name: getattr(job, name).model_copy(update=values) for name, values in keys.items() if values}
-    return job.model_copy(update=sections), how, off_centre
+    return job.model_copy(update=sections), randomization, off_centre
 
 
 def _draw_texture(job: Job, index: int, scale: float, sheet: Surroundings | None) -> Randomization:
     """Tint and pattern of the tissue, with what is drawn already."""
     draw = _Draws(job, index, "texture")
-    how = Randomization(scale, None, draw.colour(), draw("tinted"), sheet)
+    randomization = Randomization(scale, None, draw.colour(), draw("tinted"), sheet)
     if not draw.happens(0.5 if job.appearance.photo else 0.85):
-        return how
+        return randomization
     kind = str(draw.rng.choice(list(_CONTRASTS)))
     colours = draw.colours(draw.between((0.2, 0.4), (_CONTRASTS[kind], 1.0)))
     if draw.rng.random() < 0.5:
         colours = _NATURAL.get(kind, colours)
     size = (72.0 if kind == "spectrum" else 24.0) * draw("pattern_size")
     rough = draw("pattern_roughness")
-    return replace(how, pattern=draw.pattern(kind, colours, size, 0.06 * draw.strength, rough))
+    return replace(randomization, pattern=draw.pattern(kind, colours, size, 0.06 * draw.strength, rough))
 
 
 def vary(

@@ -106,7 +106,7 @@ class RestScene:
     @property
     def instruments(self) -> list[tuple[str, str, float]]:
         """Gesture, kind and radius of the contact in mm of each acting instrument, then of idle ones."""
-        idle = [("idle", one.kind, one.radius_mm) for one in self.scenario.idle]
+        idle = [("idle", instrument.kind, instrument.radius_mm) for instrument in self.scenario.idle]
         if self.series is None:
             return [
                 (gesture.kind, gesture.instrument, gesture.footprint_mm) for gesture in self.scenario.gestures

@@ -136,26 +136,29 @@ def draw_gestures(
     # Each time all anew: the shaft of one may be in the way of the next. At last fewer, if the job allows it.
     for count in (*[drawn] * _ROUNDS, *range(drawn - 1, max(fewest, len(given)) - 1, -1)):
         wanted = [*given, *[InstrumentSection()] * (count - len(given))]
-        order, found = sorted(range(count), key=lambda k: wanted[k].place is None), dict[int, Gesture]()
+        order, placed_gestures = (
+            sorted(range(count), key=lambda k: wanted[k].place is None),
+            dict[int, Gesture](),
+        )
         for k in order:
             for _ in range(_TRIES):
-                own = others if k else rng
+                generator = others if k else rng
                 if fem.contact == "driven":
-                    trial = draw_driven_gesture(fem, opening_mm, own, wanted[k], visible_mm, frames)
+                    trial = draw_driven_gesture(fem, opening_mm, generator, wanted[k], visible_mm, frames)
                 else:
-                    trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
+                    trial = draw_gesture(fem, opening_mm, young_kpa, generator, wanted[k], visible_mm, frames)
                 longest = np.linalg.norm(trial.axes, axis=1).max()
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 hides = trial.shaft @ sight > least and trial.instrument != "none"
-                if fits and not hides and all(_are_apart(trial, other) for other in found.values()):
-                    found[k] = trial
+                if fits and not hides and all(_are_apart(trial, other) for other in placed_gestures.values()):
+                    placed_gestures[k] = trial
                     break
             else:
                 break
         else:
-            return tuple(found[k] for k in range(count))
-    placed = f" next to {len(found)} others" if found else ""
+            return tuple(placed_gestures[k] for k in range(count))
+    placed = f" next to {len(placed_gestures)} others" if placed_gestures else ""
     key = "instrument_list" if given else "instruments"
     raise UserError(
         f"fem.{key}: instrument {k + 1} of {count} does not fit{placed} "
@@ -178,11 +181,11 @@ def draw_gesture(
     Its contacts stay within the opening and within `visible_mm` of its middle, which the camera shows of a
     wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
-    drawn, wanted, own = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
+    drawn, wanted, further = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
     choices = fem.choices(given)
-    kind = drawn if drawn in choices else list(choices)[int(own.integers(len(choices)))]
+    kind = drawn if drawn in choices else list(choices)[int(further.integers(len(choices)))]
     tools = choices[kind]
-    tool = str(own.choice(list(tools), p=list(tools.values())))
+    tool = str(further.choice(list(tools), p=list(tools.values())))
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
@@ -200,8 +203,8 @@ def draw_gesture(
         point = np.asarray(given.place, np.float64)
     along, direction = _draw_direction(fem, kind, rng, given)
     if kind == "retract":  # the hand is on the side that tissue is drawn to, in a quarter of them opposite
-        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (own.random() < 0.25)
-        azimuth = float((turn + _uniform(own, (-30, 30))) % 360)
+        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (further.random() < 0.25)
+        azimuth = float((turn + _uniform(further, (-30, 30))) % 360)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
     each = zip(places.tolist(), load * unit_mn * directions, strict=True)
@@ -266,10 +269,10 @@ def draw_driven_gesture(
     if kind == "retract":  # the hand is on the side that tissue is drawn to
         azimuth = float((np.degrees(np.arctan2(along[1], along[0])) + _uniform(rng, (-30, 30))) % 360)
     way, force = rng.uniform(), None
-    own = given if given.travel_mm or given.force_mn else fem
-    if own.force_mn is not None:
-        force = float(own.force_mn[0] * (own.force_mn[1] / own.force_mn[0]) ** way)
-    low, high = own.travel_mm or (0.0, 0.0)
+    ranges = given if given.travel_mm or given.force_mn else fem
+    if ranges.force_mn is not None:
+        force = float(ranges.force_mn[0] * (ranges.force_mn[1] / ranges.force_mn[0]) ** way)
+    low, high = ranges.travel_mm or (0.0, 0.0)
     holds = _HOLDS[kind] * mean
     if given.travel_mm is None:  # one that is named is as given
         low, high = min(low, holds), min(high, holds)
@@ -299,11 +302,11 @@ def draw_driven_gesture(
     )
 
 
-def _are_apart(one: Gesture, other: Gesture) -> bool:
+def _are_apart(gesture: Gesture, other: Gesture) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
-    if tool_gesture.clearance(one, other) < 0:
+    if tool_gesture.clearance(gesture, other) < 0:
         return False
-    (here, wide), (there, broad) = _rings(one), _rings(other)
+    (here, wide), (there, broad) = _rings(gesture), _rings(other)
     gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
     return float(gap.min(initial=np.inf)) >= _APART_MM
 
@@ -312,12 +315,12 @@ def _are_apart(one: Gesture, other: Gesture) -> bool:
 def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
     """Middles (N, 3) mm and radii (N,) mm of the instrument's rings before, at the start and at the end."""
     parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
-    found = [np.zeros((0, 3))]
+    shapes = [np.zeros((0, 3))]
     for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
         place = gesture.point_mm + slid * np.asarray(gesture.path_mm)
         tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + away * gesture.shaft
-        found += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
-    rings = np.concatenate(found).reshape(-1, instrument.RING, 3)[::_RINGS]
+        shapes += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
+    rings = np.concatenate(shapes).reshape(-1, instrument.RING, 3)[::_RINGS]
     middles = rings.mean(axis=1)
     return middles, np.linalg.norm(rings - middles[:, None], axis=2).max(axis=1)
 
@@ -403,7 +406,7 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     sensor = replace(appearance.sensor, blur=blur * job.render.size[0] / BLUR_WIDTH_PX)
     parts = job.render.scenery
     shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
-    scenery = tuple(part for part, one in zip(parts, shown, strict=True) if one)
+    scenery = tuple(part for part, is_shown in zip(parts, shown, strict=True) if is_shown)
     return replace(appearance, sensor=sensor, scenery=scenery)
 
 

@@ -59,7 +59,9 @@ class SeriesMechanics:
         corners = series.points[series.faces]
         cell = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
         cautions = list(series.cautions)
-        if (step := float(steps.max())) > cell and not any(one.startswith("nodes") for one in cautions):
+        if (step := float(steps.max())) > cell and not any(
+            caution.startswith("nodes") for caution in cautions
+        ):
             between = f"from frame {steps.argmax()} to the next, more than a cell of the mesh, {cell:.2g} mm"
             cautions.append(f"the surface moves by {step:.2g} mm {between}: store more states, or raise fps")
         whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm

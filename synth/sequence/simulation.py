@@ -86,7 +86,7 @@ def simulate(
             drawn = draw(job, index, drawn.scenario.attempt + 1)
     acting = len(rest.instruments) - len(drawn.scenario.idle)
     check_deformation(motion, rest.shape, job.frames, acting, "force" in job.stored_fields)
-    return Scene(**{one.name: getattr(rest, one.name) for one in fields(rest)}, motion=motion)
+    return Scene(**{field.name: getattr(rest, field.name) for field in fields(rest)}, motion=motion)
 
 
 def refuse_untouched(drawn: Draw) -> None:

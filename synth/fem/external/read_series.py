@@ -93,9 +93,9 @@ def read_series(
     if source.is_dir() and len(alone := list(source.glob("*.npz"))) == 1:
         source = alone[0]
     if run is not None or source.suffix == ".npz":
-        found = read_arrays(run or source, units, field, recorded=run is not None)
+        motion = read_arrays(run or source, units, field, recorded=run is not None)
     else:
-        found = read_files(source, units, field)
+        motion = read_files(source, units, field)
     if table is not None:
-        found = series.press(found, inside(folder, table), units, patch_mm)
-    return found if instruments is None else series.equip(found, inside(folder, instruments))
+        motion = series.press(motion, inside(folder, table), units, patch_mm)
+    return motion if instruments is None else series.equip(motion, inside(folder, instruments))
