@@ -45,24 +45,29 @@ def divide(
     part.
     """
     splits, where = [read_split(dataset) for dataset in datasets], " ".join(map(str, datasets))
-    if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
+    if shared := {dataset_split.by == "opening" for dataset_split in splits if dataset_split.share_anatomy}:
         clips = regroup(clips, "opening" if shared == {True} else "sequence")
         note("Brains may be on several sides of the split: scores don't apply to other brains.")
     names = [clip.content_hash for clip in clips]
-    DatasetSplit(sides={k: v for one in splits for k, v in one.sides.items()}).find(names, where)
-    own = [{SIDES.index(one.sides[name]) for one in splits if name in one.sides} for name in names]
+    DatasetSplit(sides={k: v for dataset_split in splits for k, v in dataset_split.sides.items()}).find(
+        names, where
+    )
+    sides = [
+        {SIDES.index(dataset_split.sides[name]) for dataset_split in splits if name in dataset_split.sides}
+        for name in names
+    ]
     number, last = groups(clips), dict[int, int]()
-    for group, found in zip(number, own, strict=True):
-        last[group] = max(last.get(group, 0), *found)
+    for group, group_sides in zip(number, sides, strict=True):
+        last[group] = max(last.get(group, 0), *group_sides)
     fit, select, test = (
-        tuple(k for k, group in enumerate(number) if own[k] == {part} == {last[group]}) for part in range(3)
+        tuple(k for k, group in enumerate(number) if sides[k] == {part} == {last[group]}) for part in range(3)
     )
     if left := len(clips) - len(fit) - len(select) - len(test):
         note(f"{left} sequences are left out: another dataset has their brain on another side.")
     for side, part in zip(SIDES, (fit, select), strict=False):
         if not part:
             raise UserError(f"{where}: the {side} side is empty; change it with `synth split --shares`")
-    split = Split(fit, select, test, hashes=tuple(one.hash for one in splits))
+    split = Split(fit, select, test, hashes=tuple(dataset_split.hash for dataset_split in splits))
     return clips, keep_back(clips, split, seed)
 
 
@@ -146,10 +151,10 @@ def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str
         ("left for intervals", calibration, least),
         ("left to choose the epoch and to fit the error model", selection, LEAST_SELECTED),
     ):
-        if (found := len(set(groups(part)))) < needed:
-            brains = "brain is" if found == 1 else "brains are"
+        if (held := len(set(groups(part)))) < needed:
+            brains = "brain is" if held == 1 else "brains are"
             return (
-                f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
+                f"{held} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
                 "validation side, half of which are used (more sequences, or `synth split --shares`)"
             )
     return ""

@@ -118,7 +118,7 @@ class Physics:
             bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
             if breaths > TISSUES.quiet:
                 bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
-            least = min(bounds, key=lambda one: float(np.square(one).sum()))
+            least = min(bounds, key=lambda bound: float(np.square(bound).sum()))
             own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
         else:
             own_mm = posterior.own_motion(basis, free)
@@ -133,25 +133,25 @@ class Physics:
             return []
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
-        sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
-        own = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
+        sizes = ", ".join(f"{np.sqrt(square.sum(axis=1).mean()):.2g}" for square in np.square(moved))
+        stated = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
         if self._weights.assumed or not self._contact_free:
             known = "only part of a breath" if self._contact_free else "no span"
-            own = f"{'at most, ' * self._weights.assumed}{own}"
-            own = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {own}"
-        return [describe(self._weights, self._scene), own]
+            stated = f"{'at most, ' * self._weights.assumed}{stated}"
+            stated = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {stated}"
+        return [describe(self._weights, self._scene), stated]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        found = infer(self._weights, frame)
+        answer = infer(self._weights, frame)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
-        low, high = size_interval(found.force, gain, cameras)
-        density = np.float32(young) * self._picture(found) if picture else None
-        likely = found.force.times(young).with_gain(TISSUES.gain)
-        return ForceEstimate(young * found.force.mean, density, young * low, young * high, likely)
+        low, high = size_interval(answer.force, gain, cameras)
+        density = np.float32(young) * self._picture(answer) if picture else None
+        likely = answer.force.times(young).with_gain(TISSUES.gain)
+        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely)
 
-    def _picture(self, found: Posterior) -> Field:
+    def _picture(self, answer: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         known, view = basis.lattice, self._view
@@ -159,7 +159,7 @@ class Physics:
         column, row = np.rint(known.nodes / step).astype(int).T
         most = max(column.max(), row.max())
         lattice = np.zeros((2 * most + 1,) * 2)
-        lattice[row + most, column + most] = np.linalg.norm(found.load, axis=1) / known.node_area
+        lattice[row + most, column + most] = np.linalg.norm(answer.load, axis=1) / known.node_area
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
@@ -213,16 +213,16 @@ def weigh_tissues(
     scene: MethodContext, frames: Sequence[Observation], own_mm: Floats, assumed: bool = False
 ) -> TissueWeights:
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
-    strongest = sorted(frames, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
-    strongest = [one for one in strongest if one.size_mm > 0]
+    strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
+    strongest = [frame for frame in strongest if frame.size_mm > 0]
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
-        return TISSUES.temper * sum(posterior.evidence(basis, one, own_mm) for one in strongest)
+        return TISSUES.temper * sum(posterior.evidence(basis, frame, own_mm) for frame in strongest)
 
     tissues = list(candidate_tissues(scene))
     prior = _prior(tissues, scene.membrane)
-    score = [evidence(one) + np.log(share) for one, share in zip(tissues, prior, strict=True)]
+    score = [evidence(tissue) + np.log(share) for tissue, share in zip(tissues, prior, strict=True)]
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
@@ -248,11 +248,13 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     if weights.assumed:
         worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
         weight = np.append(weight, TISSUES.unlikely)
-    found = [posterior.infer(posterior.load_basis(components, one), frame, own) for one, own in worlds]
+    posteriors = [
+        posterior.infer(posterior.load_basis(components, tissue), frame, modes) for tissue, modes in worlds
+    ]
     return Posterior(
-        float(weight @ [one.evidence for one in found]),
-        mix([one.force for one in found], weight, range(len(found))),
-        sum((share * one.load for share, one in zip(weight, found, strict=True)), np.zeros(())),
+        float(weight @ [answer.evidence for answer in posteriors]),
+        mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
+        sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
     )
 
 

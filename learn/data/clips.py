@@ -143,8 +143,8 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
     for source in wanted:
         if FIELDS[source] not in sequence:
             what = "stereo motion" if has_depth(source) else f"{source} flow"
-            alike = (one for one in FIELDS if has_depth(one) is has_depth(source))
-            others = [f"use --input {one}" for one in alike if FIELDS[one] in sequence]
+            alike = (name for name in FIELDS if has_depth(name) is has_depth(source))
+            others = [f"use --input {name}" for name in alike if FIELDS[name] in sequence]
             hint = ", or ".join([_CURE[source], *others[:1]])
             raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
     if sequence.attrs.get("scale_mm_per_px") is None:
@@ -230,10 +230,10 @@ def unpack(file: Path) -> Clip:
 
 
 def _checksum(arrays: Mapping[str, Array]) -> int:
-    found = 0
+    checksum = 0
     for name in sorted(arrays):
-        found = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, found)
-    return found
+        checksum = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, checksum)
+    return checksum
 
 
 def target(clip: Clip, frame: int, components: int) -> Map:

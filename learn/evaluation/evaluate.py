@@ -105,12 +105,12 @@ class EvaluationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
-        found = {
+        values = {
             "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
             "summary": self.summary(),
             "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
         }
-        return dict(as_plain(found))
+        return dict(as_plain(values))
 
 
 def _mean(values: Sequence[float]) -> float:

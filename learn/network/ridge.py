@@ -46,6 +46,6 @@ def solve(network: LinearMap, batches: Iterable[tuple[Tensor, Tensor]]) -> None:
     pairs = [(network.pool(x[:, network.shape.axes]), network.pool(y)) for x, y in batches]
     moved, force = (torch.cat(each).cpu().double().numpy() for each in zip(*pairs, strict=True))
     penalty = network.shape.strength * float(np.square(moved).sum(0).mean())
-    found = Ridge(alpha=penalty, fit_intercept=False).fit(moved, force)
-    weight = torch.from_numpy(np.atleast_2d(found.coef_)).to(network.linear.weight)
+    fitted = Ridge(alpha=penalty, fit_intercept=False).fit(moved, force)
+    weight = torch.from_numpy(np.atleast_2d(fitted.coef_)).to(network.linear.weight)
     network.linear.weight.copy_(weight)

@@ -34,7 +34,7 @@ class Batch(NamedTuple):
     def rotate(self, turn: int) -> Batch:
         """All fields turned by `rotate`; each confidence is a scalar."""
         planes = rotate(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
-        moved, mask, true = (rotate(one, turn) for one in (self.displacement, self.mask, self.target))
+        moved, mask, true = (rotate(field, turn) for field in (self.displacement, self.mask, self.target))
         return Batch(moved, mask, planes, true, self.membrane)
 
 
@@ -105,7 +105,7 @@ class FrameDataset:
         order = rng.permutation(len(items))
         known = [False] * len(items)
         if self.settings.arch.membrane:
-            known = [bool(one) for one in rng.random(len(items)) >= MEMBRANE_HIDDEN]
+            known = [bool(is_known) for is_known in rng.random(len(items)) >= MEMBRANE_HIDDEN]
         drawn = [FrameItem(items[i][0], items[i][1], self.sources[0], int(turn[i]), known[i]) for i in order]
         return [self._with_errors(one, rng) for one in drawn] if len(self.sources) > 1 else drawn
 
@@ -147,14 +147,14 @@ class FrameDataset:
 
     def _read(self, c: int, t: int, source: str) -> tuple[Tensor, ...]:
         """Displacement, confidence and target of a frame of clip `c`."""
-        if (found := self._stored.get((c, t, source))) is None:
+        if (frame := self._stored.get((c, t, source))) is None:
             clip = self.clips[c]
             truth = target(clip, t, self.settings.arch.components)
             arrays = clip.displacement[source][t], clip.confidence_of(source)[t], truth
-            found = tuple(torch.from_numpy(np.array(array))[None].to(self.device) for array in arrays)
+            frame = tuple(torch.from_numpy(np.array(array))[None].to(self.device) for array in arrays)
             if self._stores:
-                self._stored[c, t, source] = found
-        return found
+                self._stored[c, t, source] = frame
+        return frame
 
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:
@@ -165,7 +165,7 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
         mask = torch.from_numpy(np.array(clip.mask))[None, None]
         inside = clip.mask > 0
         for t in np.unique(np.linspace(0, clip.frames - 1, frames).astype(int)):
-            for source in (one for one in sources(settings.input) if one in clip.displacement):
+            for source in (name for name in sources(settings.input) if name in clip.displacement):
                 u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
                 moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
                 strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))
@@ -175,7 +175,7 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
             cells += float(inside.sum() * len(truth))
         total = amount(clip, settings.arch.components, settings.grid.pitch_mm)
         force.append(np.linalg.norm(total, axis=1))
-    found = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
-    if min(found) <= 0:
+    scales = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
+    if min(scales) <= 0:
         raise UserError("the training sequences have no motion or no force")
-    return Scales(found[0], found[1], found[2], found[3], (squares / cells) ** 0.5)
+    return Scales(scales[0], scales[1], scales[2], scales[3], (squares / cells) ** 0.5)

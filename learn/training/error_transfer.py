@@ -42,7 +42,7 @@ class Transfer(NamedTuple):
 def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: int) -> tuple[Transfer, float]:
     """A frame out of `donors` (clip, frames of it) with factors, and the factor of the stated deviation."""
     clip, frames = donors[int(rng.integers(len(donors)))]
-    factor = tuple(float(one) for one in rng.uniform(-FACTOR, FACTOR, components))
+    factor = tuple(float(value) for value in rng.uniform(-FACTOR, FACTOR, components))
     return Transfer(clip, int(rng.integers(frames)), factor), float(np.exp(rng.normal(0, SPREAD)))
 
 
@@ -52,7 +52,7 @@ def restate(confidence: Tensor, factor: float) -> Tensor:
 
 
 def transfer(
-    true: Tensor, donor_true: Tensor, error: Tensor, confidence: Tensor, how: Transfer
+    true: Tensor, donor_true: Tensor, error: Tensor, confidence: Tensor, transfer: Transfer
 ) -> tuple[Tensor, Tensor]:
     """Motion and confidence of a frame with the error of another.
 
@@ -68,15 +68,15 @@ def transfer(
         far = donor_true.norm(dim=1, keepdim=True) <= max(_FAR * donor_size, _LEAST_MM)
         error, confidence = error * far, torch.where(far, confidence, 1.0)
     else:
-        for one in range(8):
-            there = rotate(donor_true, one)
+        for trial in range(8):
+            there = rotate(donor_true, trial)
             row, column = _contact(there)[0]
             moved = place[0] - row, place[1] - column
             alike = float((_shift(there, moved) * true).sum())
             if abs(alike) > abs(likeness):
-                likeness, turn, shift = alike, one, moved
+                likeness, turn, shift = alike, trial, moved
         scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
-    factor = scale * error.new_tensor(how.factor).view(1, -1, 1, 1)
+    factor = scale * error.new_tensor(transfer.factor).view(1, -1, 1, 1)
     planes = rotate(confidence.transpose(0, 1), turn).transpose(0, 1)
     return true + factor * _shift(rotate(error, turn), shift), _shift(planes, shift)
 

@@ -114,9 +114,9 @@ def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
     for known, new in ((start.split, card.split), (start.groups, card.groups)):
         barred = {"select": ("fit", "start"), "intervals": ("fit", "select", "start"), "test": USED}
         for part, used in barred.items():
-            if {one for name in used for one in known.get(name, ())}.intersection(new.get(part, ())):
+            if {group for name in used for group in known.get(name, ())}.intersection(new.get(part, ())):
                 raise UserError(f"start: was trained on brains of this data's {part} part")
-        new["start"] = sorted({one for name in USED for one in known.get(name, ())})
+        new["start"] = sorted({group for name in USED for group in known.get(name, ())})
     return dataclasses.replace(card, motion=sorted({*card.motion, *start.motion}))
 
 
@@ -283,7 +283,7 @@ def _gain(forces: Floats, anatomies: int) -> float:
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     """The state to continue from, or None for a new run in a new folder."""
     # An interrupted write of the first card leaves a hidden file.
-    if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):
+    if not out.exists() or (out.is_dir() and all(path.name.startswith(".") for path in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
