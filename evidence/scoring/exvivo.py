@@ -181,8 +181,9 @@ def _moved(
     """Deformation from no load to full load, by a gesture that only rises."""
     rising = tool_gesture.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
-    sizes = {"opening_mm": job.anatomy.craniotomy.radius_mm, "dome_mm": job.anatomy.dome_mm}
-    tets = tetrahedra.block(job.fem.tets, gesture.focus, height, **sizes)
+    opening_mm, dome_mm = job.anatomy.craniotomy.radius_mm, job.anatomy.dome_mm
+    sizes = job.fem.tets, gesture.focus, height
+    tets = tetrahedra.block(*sizes, opening_mm=opening_mm, dome_mm=dome_mm)
     shape = Shape(surface.vertices, surface.faces)
     return solver.deform(read_scheme(job.fem), case.tissue, [rising], tets, shape, job.frames, job.fps)
 

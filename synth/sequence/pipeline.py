@@ -202,7 +202,7 @@ def _recover_motion(task: _Task, videos: Sequence[_Video]) -> Iterator[_Values]:
             size=job.render.size,
         )
         still = stereo.still_frames(recovered.flow, tissue)
-        rest = [video.rgb[:still] for video in videos]
+        rest = videos[0].rgb[:still], videos[1].rgb[:still]
         tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
