@@ -10,7 +10,7 @@ import numpy as np
 from synth.arrays import Pixels
 from synth.job.reader import load_job
 from synth.job.schema import Family, Job
-from synth.publish.contact_sheet import poised
+from synth.publish.contact_sheet import pose_touching
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
 from synth.sequence.rest_scene import RestScene, at_rest
@@ -93,7 +93,7 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
 def _ready(scene: RestScene) -> Pixels:
     """The picture of a scene whose instruments touch the tissue."""
     case, surface = scene.scenario, scene.surface
-    ends, shafts = zip(*(poised(gesture, surface) for gesture in case.gestures), strict=True)
+    ends, shafts = zip(*(pose_touching(gesture, surface) for gesture in case.gestures), strict=True)
     poses = with_idle(case.idle, 0.0, np.concatenate(ends), np.concatenate(shafts))
     return scene.renderer.render(SceneState(surface.vertices, *poses), scene.draw.frame_seeds[0]).rgb
 

@@ -176,7 +176,7 @@ def eval_command(
     from learn.training.threads import choose_threads
 
     predictor = load_model(model, threads=choose_threads(threads))
-    source = predictor.readable(input or scored_source(predictor.card.settings.input))
+    source = predictor.check_source(input or scored_source(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
@@ -274,7 +274,7 @@ def calibrate_command(
     if wrong := [path for path in data if path.suffix not in (".npz", ".zarr")]:
         raise UserError(f"{wrong[0]}: not a press (.zarr or .npz); intervals are fitted by `learn train`")
     predictor = load_model(model, threads=choose_threads(threads))
-    presses = [motion for path in data for motion in motions(path, predictor.stored(input))]
+    presses = [motion for path in data for motion in motions(path, predictor.choose_source(input))]
     young = {press.name: calibrate(predictor, press) for press in presses}
     if json:
         print(json_.dumps({"young_kpa": young}))

@@ -90,7 +90,7 @@ def open_source(
     """
     named = model or choose_model(has_right_camera(source))
     predictor = named if isinstance(named, Predictor) else load_model(named, threads=threads)
-    return predictor, motions(source, predictor.stored(input), options)
+    return predictor, motions(source, predictor.choose_source(input), options)
 
 
 def apply(

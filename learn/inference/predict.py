@@ -80,7 +80,7 @@ class Predictor:
             raise UserError("network.onnx: its inputs are not those of config.json")
         self._view: GridView | None = None
 
-    def readable(self, source: str) -> str:
+    def check_source(self, source: str) -> str:
         """The source of displacement as given. Raises UserError if this model can't use it."""
         fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
         if source not in fit:
@@ -88,9 +88,9 @@ class Predictor:
             raise UserError(f"{what} input {source!r}: one of {', '.join(fit)}")
         return source
 
-    def stored(self, source: str | None) -> str:
-        """The source to read from a store; the recovered one if none is given. Raises as `readable`."""
-        return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
+    def choose_source(self, source: str | None) -> str:
+        """The source to read from a store; the recovered one if none is given. Raises as `check_source`."""
+        return self.check_source(source or ("motion" if self.card.settings.arch.depth else "recovered"))
 
     @checked
     def __call__(

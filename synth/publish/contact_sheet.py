@@ -51,7 +51,7 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
         state = replace(deformed.state(deformed.strongest), camera=None)
     else:
         scene = at_rest(job, index)
-        ready = [poised(gesture, scene.surface) for gesture in scene.scenario.gestures]
+        ready = [pose_touching(gesture, scene.surface) for gesture in scene.scenario.gestures]
         touching = (np.concatenate(part) for part in zip(*ready, strict=True))
         tips, shafts = with_idle(scene.scenario.idle, 0.0, *touching)
         state = SceneState(scene.surface.vertices, tips, shafts)
@@ -66,7 +66,7 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
     return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
 
 
-def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
+def pose_touching(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     touching = ToolMotion(np.zeros(1), np.zeros(1), np.zeros((1, 2)))
     shape = Shape(surface.vertices, surface.faces)
