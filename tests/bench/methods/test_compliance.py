@@ -22,7 +22,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Compliances of a coarse mesh, which are forgotten afterwards."""
     monkeypatch.setattr(compliance, "_TETS", TETS)
     monkeypatch.setattr(compliance, "SETTINGS", (1.0, 1.2, TETS))
-    caches = compliance._condensed, compliance._geometry, posterior.load_basis
+    caches = compliance._condense, compliance._geometry, posterior.load_basis
     for cache in caches:
         cache.cache_clear()
     yield
