@@ -24,14 +24,14 @@ from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, assemble, springs, tissue_stiffness
-from synth.job import schema
 
 # World (z out of the brain) to camera (x right, y down, z away) for a camera straight above.
 TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
-_ANATOMY = schema.AnatomySection()
-OPENING_MM = _ANATOMY.craniotomy.radius_mm
-_OPEN = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=40.0))  # no skull near
+OPENING_MM = 12.0
+"""Radius of the opening in the skull, a job's default."""
+_DOME_MM = 70.0  # radius of curvature of the surface, likewise
+_OPEN_MM = 40.0  # radius of an opening without skull near
 # By hand; docs/results/fem/pareto has what elements cost and err.
 _POINT_MM = 1.0  # spacing of the points, which reach to the opening's edge
 _NODE_MM = 1.2  # spacing of the nodes, which stay as far inside it
@@ -101,8 +101,8 @@ def solve(tissue: TissueKind, components: int) -> Floats:
 
     Rows: x of every point, then y, then in stereo z (C = 3); columns: loads along x at every node, then y, z.
     """
-    surface = _condensed("free" if tissue.edge == "free" else "held", tissue.poisson)
-    whole = surface.stiffness + surface.added(tissue)
+    surface = _condense("free" if tissue.edge == "free" else "held", tissue.poisson)
+    whole = surface.stiffness + surface.assemble_added(tissue)
     # The window is last, so that only its own part of the factor meets the loads.
     root = cholesky(whole.T, lower=True, overwrite_a=True, check_finite=False)  # .T: without a copy
     first, rows = len(root) - len(surface.loads), components * len(lattice().points)
@@ -123,7 +123,7 @@ class _Surface:
     observed: Floats  # (3 P, 3 W) motion of the points, x, y, z in turn, by that of the window's nodes
     loads: Floats  # (3 W, 3 K) forces on the window's nodes by unit loads
 
-    def added(self, tissue: TissueKind) -> Floats:
+    def assemble_added(self, tissue: TissueKind) -> Floats:
         """What skull and membrane add to the stiffness, (3 S, 3 S) mN/mm."""
         volume = self.volumes[tissue.edge]
         stiffness = springs(volume)
@@ -138,7 +138,7 @@ Block = Literal["held", "free"]
 
 
 @lru_cache(maxsize=1)
-def _condensed(block: Block, poisson: float) -> _Surface:
+def _condense(block: Block, poisson: float) -> _Surface:
     volumes, nodes, observed, loads = _geometry(block)
     volume = next(iter(volumes.values()))
     tissue, _ = tissue_stiffness(quadrature(volume.points, volume.cells), poisson)
@@ -176,13 +176,13 @@ def _motion(embedding: Embedding, window: Ints) -> Floats:
 
 def _mesh(tets: int, edge: Edge) -> Tets:
     if edge == "free":
-        return tetrahedra.block(_OPEN, tets, [(0.0, 0.0, OPENING_MM)])
-    return tetrahedra.block(_ANATOMY, tets, slips=edge == "slipping")
+        return tetrahedra.block(tets, [(0.0, 0.0, OPENING_MM)], opening_mm=_OPEN_MM, dome_mm=_DOME_MM)
+    return tetrahedra.block(tets, opening_mm=OPENING_MM, dome_mm=_DOME_MM, slips=edge == "slipping")
 
 
 def _embed(volume: Tets, xy: Floats) -> Embedding:
     world = xy * np.array([1.0, -1.0])
-    return surface_embedding.embed(volume, np.column_stack([world, tetrahedra.dome(world, _ANATOMY.dome_mm)]))
+    return surface_embedding.embed(volume, np.column_stack([world, tetrahedra.dome(world, _DOME_MM)]))
 
 
 def _disc(spacing_mm: float, radius_mm: float) -> Floats:

@@ -51,11 +51,11 @@ class Fusion:
         gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         known = np.full(len(estimates), np.nan) if known_mn is None else known_mn
         cautions = [_widening([frame[name] for frame in estimates], known) for name in self.parts]
-        found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
+        fused, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in estimates:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
-                found.append(replace(network, likely=None))
+                fused.append(replace(network, likely=None))
                 self._alone += 1
                 continue
             spread = (_CAUTION[cameras] * cautions[0]) ** 2 * network.likely.covariance[0]
@@ -70,10 +70,10 @@ class Fusion:
             force = both.mean + (weight - share) * off
             size = float(np.linalg.norm(force))
             low, high = min(low, physics.low_mn, size), max(high, physics.high_mn, size)
-            found.append(ForceEstimate(force, None, low, high))
+            fused.append(ForceEstimate(force, None, low, high))
             pulled, apart = pulled + weight * square, apart + square
         self._share = pulled / apart if apart else 0.0
-        return widen_small_forces(found)
+        return widen_small_forces(fused)
 
     @property
     def notes(self) -> list[str]:
@@ -91,8 +91,12 @@ class Fusion:
 def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:
     """Factor of at least 1 by which a method's 90% intervals hold 90% of the known forces (T,) [mN]."""
     needed = []
-    for one, true in zip(estimates, known_mn, strict=True):
-        side = one.high_mn - one.size_mn if true > one.size_mn else one.size_mn - one.low_mn
+    for estimate, true in zip(estimates, known_mn, strict=True):
+        side = (
+            estimate.high_mn - estimate.size_mn
+            if true > estimate.size_mn
+            else estimate.size_mn - estimate.low_mn
+        )
         if np.isfinite(true) and np.isfinite(side):
-            needed.append(abs(true - one.size_mn) / max(side, 1e-9))
+            needed.append(abs(true - estimate.size_mn) / max(side, 1e-9))
     return float(np.clip(np.quantile(needed, 0.9), 1, _MOST)) if needed else 1.0

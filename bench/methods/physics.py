@@ -118,13 +118,13 @@ class Physics:
             bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
             if breaths > TISSUES.quiet:
                 bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
-            least = min(bounds, key=lambda one: float(np.square(one).sum()))
+            least = min(bounds, key=lambda bound: float(np.square(bound).sum()))
             own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
         else:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
         self._contact_free = int(contact_free.sum())
-        return widen_small_forces([self._estimate(one, False) for one in self._frames])
+        return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
 
     @property
     def notes(self) -> list[str]:
@@ -133,25 +133,25 @@ class Physics:
             return []
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
-        sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
-        own = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
+        sizes = ", ".join(f"{np.sqrt(square.sum(axis=1).mean()):.2g}" for square in np.square(moved))
+        stated = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
         if self._weights.assumed or not self._contact_free:
             known = "only part of a breath" if self._contact_free else "no span"
-            own = f"{'at most, ' * self._weights.assumed}{own}"
-            own = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {own}"
-        return [describe(self._weights, self._scene), own]
+            stated = f"{'at most, ' * self._weights.assumed}{stated}"
+            stated = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {stated}"
+        return [describe(self._weights, self._scene), stated]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        found = infer(self._weights, frame)
+        answer = infer(self._weights, frame)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
-        low, high = size_interval(found.force, gain, cameras)
-        density = np.float32(young) * self._picture(found) if picture else None
-        likely = found.force.times(young).with_gain(TISSUES.gain)
-        return ForceEstimate(young * found.force.mean, density, young * low, young * high, likely)
+        low, high = size_interval(answer.force, gain, cameras)
+        density = np.float32(young) * self._picture(answer) if picture else None
+        likely = answer.force.times(young).with_gain(TISSUES.gain)
+        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely)
 
-    def _picture(self, found: Posterior) -> Field:
+    def _picture(self, answer: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         known, view = basis.lattice, self._view
@@ -159,7 +159,7 @@ class Physics:
         column, row = np.rint(known.nodes / step).astype(int).T
         most = max(column.max(), row.max())
         lattice = np.zeros((2 * most + 1,) * 2)
-        lattice[row + most, column + most] = np.linalg.norm(found.load, axis=1) / known.node_area
+        lattice[row + most, column + most] = np.linalg.norm(answer.load, axis=1) / known.node_area
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
@@ -168,7 +168,7 @@ def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list
 
     A large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
     """
-    size = np.array([one.signal_mm**2 for one in frames])
+    size = np.array([frame.signal_mm**2 for frame in frames])
     order = np.argsort(size, kind="stable")
     count = np.arange(1, len(frames) + 1)
     share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
@@ -205,7 +205,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
     if known != "unknown":
         return np.full(len(tissues), 1 / len(tissues))
-    stiff, intact = np.array([one.membrane > 0 for one in tissues]), TISSUES.intact
+    stiff, intact = np.array([tissue.membrane > 0 for tissue in tissues]), TISSUES.intact
     return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
@@ -213,16 +213,16 @@ def weigh_tissues(
     scene: MethodContext, frames: Sequence[Observation], own_mm: Floats, assumed: bool = False
 ) -> TissueWeights:
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
-    strongest = sorted(frames, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
-    strongest = [one for one in strongest if one.size_mm > 0]
+    strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
+    strongest = [frame for frame in strongest if frame.size_mm > 0]
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
-        return TISSUES.temper * sum(posterior.evidence(basis, one, own_mm) for one in strongest)
+        return TISSUES.temper * sum(posterior.evidence(basis, frame, own_mm) for frame in strongest)
 
     tissues = list(candidate_tissues(scene))
     prior = _prior(tissues, scene.membrane)
-    score = [evidence(one) + np.log(share) for one, share in zip(tissues, prior, strict=True)]
+    score = [evidence(tissue) + np.log(share) for tissue, share in zip(tissues, prior, strict=True)]
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
@@ -244,15 +244,17 @@ def weigh_tissues(
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     """The posterior of a frame's loads, as a mixture over tissues."""
     components, weight = len(weights.own_mm), weights.weight
-    worlds = [(one, weights.own_mm) for one in weights.tissues]
+    worlds = [(tissue, weights.own_mm) for tissue in weights.tissues]
     if weights.assumed:
         worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
         weight = np.append(weight, TISSUES.unlikely)
-    found = [posterior.infer(posterior.load_basis(components, one), frame, own) for one, own in worlds]
+    posteriors = [
+        posterior.infer(posterior.load_basis(components, tissue), frame, modes) for tissue, modes in worlds
+    ]
     return Posterior(
-        float(weight @ [one.evidence for one in found]),
-        mix([one.force for one in found], weight, range(len(found))),
-        sum((share * one.load for share, one in zip(weight, found, strict=True)), np.zeros(())),
+        float(weight @ [answer.evidence for answer in posteriors]),
+        mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
+        sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
     )
 
 

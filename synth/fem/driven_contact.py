@@ -30,13 +30,13 @@ from scipy.optimize import brentq
 from synth.arrays import Floats, Mask
 from synth.fem import tool_gesture
 from synth.fem.equilibrium import ExcessiveLoad, InvertedElement, NoEquilibrium, minimise_energy
+from synth.fem.law_choice import LEAST_JACOBIAN
 from synth.fem.material import Tissue
 from synth.fem.motion import Clock, PronyHistory
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, factorise
 from synth.fem.tangent import linearise
 from synth.fem.tool_gesture import Gesture, ToolMotion
-from synth.job.law_choice import LEAST_JACOBIAN
 
 FIRMNESS = 40.0
 """k0 over E/a: tissue under a flat punch has 0.8 E/a, so that it lags by some 3% of the way."""

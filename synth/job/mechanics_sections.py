@@ -8,7 +8,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, ValidationInfo, model_validator
 
-from synth.job.law_choice import LAWS, LoadRange, check_load_range, choose_law
+from synth.fem.law_choice import LAWS, LoadRange, check_load_range, choose_law
 from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share
 from synth.plugins import STORED
 

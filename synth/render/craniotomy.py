@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape
-from synth.job.schema import Job
 from synth.render import finish, instrument
 from synth.render.anatomy import noise, rim, texture
 from synth.render.anatomy.rim import Rim
-from synth.render.anatomy.surface import CortexSurface, resized
+from synth.render.anatomy.surface import CortexSurface, resize
 from synth.render.appearance import light, reflection
 from synth.render.appearance.family import Appearance
 from synth.render.appearance.reflection import Theatre
@@ -41,29 +41,32 @@ def craniotomy(
     surface: CortexSurface,
     appearance: Appearance,
     camera: Camera,
-    job: Job,
+    opening_mm: float,
     drawn: Sequence[tuple[str, float]] = (),
     idle: Sequence[IdleInstrument] = (),
     how: Randomization | None = None,
+    *,
+    photo: Path | None = None,
+    wear: float = 0.0,
 ) -> SceneContent:
-    """The content of one sequence at rest; UserError: the job's photograph cannot be read.
+    """The content of one sequence at rest; UserError: the photograph cannot be read.
 
-    `drawn`: kind of each acting instrument, `none` for one that is not drawn, and the radius of its contacts
-    [mm]; `idle`: those that touch nothing; `how`: what is randomised.
+    `opening_mm`: radius of the opening; `drawn`: kind of each acting instrument, `none` for one that is not
+    drawn, and the radius of its contacts [mm]; `idle`: those that touch nothing; `how`: what is randomised;
+    `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their steel.
     """
     how = how or Randomization()
     lit = appearance.light.power * light.blackbody(appearance.light.kelvin)
     ambient = appearance.light.ambient * lit
     # Grown and painted in the usual size.
-    patch, px_mm = resized(surface, 1 / how.scale), camera.mm_per_px / how.scale
-    around = rim.build(patch, job.anatomy.craniotomy.radius_mm / how.scale, appearance, px_mm)
+    patch, px_mm = resize(surface, 1 / how.scale), camera.mm_per_px / how.scale
+    around = rim.build(patch, opening_mm / how.scale, appearance, px_mm)
     pixels, texels = (
         min(texture.resolution(extent, one), _MOST_TEXELS if how.scale != 1 else 4096)
         for extent, one in ((patch.chart.extent_mm, px_mm), (around.extent_mm, 2.2 * px_mm))
     )
     if how.pattern is None:
         shade = rim.shade(around, patch) if how.surroundings is None else None
-        photo = job.appearance.photo
         paint = partial(texture.cortex, patch, appearance, pixels, photo, shade)
         coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade)
         wet = appearance.roughness, appearance.dry_roughness
@@ -82,19 +85,18 @@ def craniotomy(
     wound = _wound(patch, around, coat, appearance)
     theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lamps, lit, camera.centre)
     if how.surroundings is not None:
-        sizes = job.anatomy.craniotomy.radius_mm, 2 * camera.mm_per_px * camera.size[0]
+        sizes = opening_mm, 2 * camera.mm_per_px * camera.size[0]
         sheet = surroundings.sheet(how.surroundings, surface.vertices, *sizes, ambient)
         static = [] if how.surroundings.kind == "nothing" else [sheet]
     ground = np.concatenate([surface.vertices, *(one.vertices for one in static)])
     if "retractor" in appearance.scenery and how.surroundings is None:
         static.append(_retractor(how.scale * around.edge, theatre, ground, appearance.rim_seed))
     hand = np.random.default_rng([appearance.rim_seed, 2])
-    strength = job.randomize.get("instruments", 0.0)
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(drawn, theatre, hand, strength, idle, ground),
+        instruments=instrument.build(drawn, theatre, hand, wear, idle, ground),
         spot=appearance.light.even,
     )
 

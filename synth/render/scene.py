@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from synth.arrays import Array, Floats, Map, Mask, Pixels
 from synth.geometry.triangles import Shape, joined, normals
-from synth.job.schema import RenderSection
 from synth.render import truth
 from synth.render.anatomy import noise
 from synth.render.appearance import light
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera import Camera, blur_radius, disparity, right_camera
+from synth.render.camera.camera import Camera, blur_radius, disparity
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.content import SceneContent
 from synth.render.materials import Body, Metal, Wet
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
+
+Variant = Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
@@ -47,7 +47,7 @@ class SceneState:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame and its ground truth. Fields that are not in the job's `store.extra` are None."""
+    """One frame and its ground truth. Optional fields that the renderer was not asked for are None."""
 
     rgb: Pixels
     """(H, W, 3) sRGB."""
@@ -94,9 +94,10 @@ class Renderer:
         content: what is drawn.
         camera: the microscope at rest.
         sensor: its chip and video processor.
-        settings: of them variant, light paths and the right camera's baseline are used.
         extra: names of optional fields of a `RenderedFrame` to fill.
-        right: the right camera of the left one in any pose; by default parallel to it, at that baseline.
+        right: the right camera of the left one in any pose; none if None.
+        spp: light paths per pixel.
+        variant: of Mitsuba; `auto` is llvm_ad_rgb if LLVM works, else scalar_rgb.
 
     Raises:
         UserError: the variant cannot run here.
@@ -108,14 +109,16 @@ class Renderer:
         content: SceneContent,
         camera: Camera,
         sensor: CameraSensor = CameraSensor(),
-        settings: RenderSection = RenderSection(),
         extra: Sequence[str] = (),
         right: Callable[[Camera], Camera] | None = None,
+        *,
+        spp: int = 4,
+        variant: Variant = "auto",
     ) -> None:
         forget()  # earlier renderers
-        self.variant = pick(settings.variant)
+        self.variant = pick(variant)
         self.content, self.camera = content, camera
-        self._sensor, self._settings, self._extra = sensor, settings, extra
+        self._sensor, self._spp, self._extra = sensor, spp, extra
         if not isinstance(content.tissue.material, Wet):
             raise ValueError("the tissue's material must be Wet")
         self._wet = content.tissue.material
@@ -127,9 +130,9 @@ class Renderer:
         self.right: Camera | None = None
         """The right camera at rest, if there is one."""
         self._right_rest: RestFrame | None = None
-        self._right_of = right or partial(right_camera, baseline_mm=settings.stereo_mm)
-        if settings.stereo_mm:
-            self.right = self._right_of(camera)
+        self._right_of = right
+        if right is not None:
+            self.right = right(camera)
             self._right_rest = truth.trace_rest(self.right, content.tissue.shape, self._static)
         self._stage: Stage | None = None
 
@@ -166,7 +169,7 @@ class Renderer:
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, own.depth)
         extra |= self._shading(own.hits, shapes, "")
-        if self._right_rest is not None:
+        if self._right_of is not None and self._right_rest is not None:
             other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
             picture = self.develop(others[0], seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
@@ -246,11 +249,11 @@ class Renderer:
         shots: list[list[Map]] = []
         for k, state in enumerate(states):
             if self._stage is None:
-                self._stage = self.stage(state, self._settings.spp)
+                self._stage = self.stage(state, self._spp)
             else:
                 self.move(self._stage, state)
             cameras = [state.camera or self.camera]
-            if self.right is not None:
+            if self._right_of is not None:
                 cameras.append(self._right_of(cameras[0]))
             shots.append([])
             for side, camera in enumerate(cameras):

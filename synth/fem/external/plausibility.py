@@ -112,23 +112,23 @@ def find_load_doubts(
     f, u = np.asarray(force[k], np.float64), np.asarray(displacement[k], np.float64)
     total_mn, radius = float(size[k].sum()), contact_radius(points, faces, f)
     work, most = float((f * u).sum()), float((size[k] * np.linalg.norm(u, axis=1)).sum())
-    found, low, high = list[str](), *_LOADS
+    doubts, low, high = list[str](), *_LOADS
     if young_kpa is not None and not low <= (load := total_mn / (young_kpa * radius**2)) <= high:
         where = f"a contact of {radius:.2g} mm radius and {young_kpa:g} kPa"
         what = f"{total_mn:.3g} mN on {where} is P = {load:.2g}"
-        found.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
+        doubts.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
     done = np.einsum("snd,snd->s", force, displacement, dtype=np.float64)
     if done.min() < -_LEAST_WORK * np.abs(done).max():
-        at = int(done.argmin())
-        found.append(
-            f"force: does negative work, {done[at] / 2:.2g} mN mm in state {at}: it has to be what acts on "
-            "the tissue, not the reaction; is its sign right?"
+        state = int(done.argmin())
+        doubts.append(
+            f"force: does negative work, {done[state] / 2:.2g} mN mm in state {state}: it has to be "
+            "what acts on the tissue, not the reaction; is its sign right?"
         )
     elif 0 < work < _ALONG * most:
         angle = np.degrees(np.arccos(np.clip(work / max(most, 1e-300), -1, 1)))
-        found.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
+        doubts.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
     elif work <= 0:
-        found.append(
+        doubts.append(
             f"force: {total_mn:.3g} mN act on nodes that don't move; are nodes, faces and force in one order?"
         )
     else:
@@ -137,16 +137,16 @@ def find_load_doubts(
         if not least <= stiff <= largest:
             stated = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
             what = f"load and motion are those of a tissue of {stiff:.2g} kPa, fem.young_kpa is {stated}"
-            found.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
+            doubts.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
         borne = size.sum(axis=1, dtype=np.float64)
         given = done / np.maximum(borne, 1e-30) ** 2  # compliance: mean motion along the load, per load
         late = np.flatnonzero((borne > _LOADED * total_mn) & (given < _GIVES_LESS * given[k]))
         if late.size:
             state, why = int(late[0]), "have force and motion the same times?"
-            found.append(
+            doubts.append(
                 f"force: {borne[state]:.3g} mN in state {state} move the tissue hardly at all; {why}"
             )
-    return found
+    return doubts
 
 
 def find_pull_doubt(force: Map, out: Floats) -> list[str]:

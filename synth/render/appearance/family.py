@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from synth.job.schema import Family
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera_sensor import CameraSensor
 
@@ -34,7 +33,7 @@ class Appearance:
     blood: float  # on the rim, from none (0) to soaked (1)
     dura_albedo: Colour
     surroundings_albedo: Colour  # outside the dura: muscle, or the bone of a specimen
-    scenery: tuple[str, ...]  # shown parts of the job's `render.scenery`
+    scenery: tuple[str, ...]  # parts of `render.scenery` that are shown
     rim_seed: int
     light: Lighting
     sensor: CameraSensor
@@ -66,7 +65,7 @@ class Ranges:
     surroundings_albedo: Colour = (0.40, 0.10, 0.065)
 
 
-FAMILIES: dict[Family, Ranges] = {
+FAMILIES: dict[str, Ranges] = {
     "healthy": Ranges(),
     "hyperaemic": Ranges(
         gyrus_albedo=(0.88, 0.52, 0.35),

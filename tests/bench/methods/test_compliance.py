@@ -12,7 +12,6 @@ from bench.methods.compliance import TO_CAMERA, ElasticBlock, TissueKind, pictur
 from synth.fem.condensation import condense
 from synth.fem.mesh import tetrahedra
 from synth.fem.system import assemble
-from synth.job import schema
 
 Floats = NDArray[np.float64]
 TETS = 500
@@ -23,7 +22,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Compliances of a coarse mesh, which are forgotten afterwards."""
     monkeypatch.setattr(compliance, "_TETS", TETS)
     monkeypatch.setattr(compliance, "SETTINGS", (1.0, 1.2, TETS))
-    caches = compliance._condensed, compliance._geometry, posterior.load_basis
+    caches = compliance._condense, compliance._geometry, posterior.load_basis
     for cache in caches:
         cache.cache_clear()
     yield
@@ -59,7 +58,7 @@ def test_compliances_are_those_of_direct_solutions(coarse: None, tissue: TissueK
 
 
 def test_a_condensed_mesh_moves_as_the_whole() -> None:
-    volume = tetrahedra.block(schema.AnatomySection(), 300)
+    volume = tetrahedra.block(300)
     system = assemble(volume, "linear", 0.45)
     rng = np.random.default_rng(0)
     kept = rng.permutation(np.flatnonzero(~volume.fixed))[:40]

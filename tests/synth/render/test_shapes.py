@@ -65,15 +65,17 @@ def test_what_is_nearly_flat_stays_its_plan() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("radius_mm", [4.0, 30.0])
 def test_every_anatomy_grows(radius_mm: float) -> None:
-    section = AnatomySection.model_validate({"craniotomy": {"radius_mm": radius_mm}, "vertices": 900})
+    section = AnatomySection()
     for seed in range(1 if radius_mm > 5 else 4):
-        made = surface.grow(scenario.draw_relief(section, np.random.default_rng(seed)), section)
+        made = surface.grow(
+            scenario.draw_relief(section, np.random.default_rng(seed)), radius_mm, vertices=900
+        )
         assert np.isfinite(made.vertices).all()
 
 
 def test_vessels_are_joined_thin_out_and_follow_murray() -> None:
     section = AnatomySection()
-    made = surface.grow(scenario.draw_relief(section, np.random.default_rng(3)), section)
+    made = surface.grow(scenario.draw_relief(section, np.random.default_rng(3)))
     for tree in (made.vessels.arteries, made.vessels.veins, made.vessels.deep):
         child = np.flatnonzero(tree.parent >= 0)
         assert (tree.parent[child] < child).all()

@@ -10,9 +10,10 @@ from synth.fem.tool_gesture import trajectory
 from synth.job import reader
 from synth.job.mechanics_sections import DRIVEN_SIZES_MM
 from synth.job.schema import FemSection, Job
+from synth.sequence.draw import draw_scenario
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.rest_scene import RestScene
-from synth.sequence.scenario import draw_gestures, draw_scenario
+from synth.sequence.scenario import draw_gestures
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
