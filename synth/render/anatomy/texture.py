@@ -94,6 +94,7 @@ class Film:
     swell_mm: float = 0.004  # standard deviation of the undulation
     rough: float = 0.09  # standard deviation of slopes where the film is thin
     level: float = 0.9  # share of the pia's slope that a pool takes away
+    pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
 
 
@@ -279,17 +280,19 @@ def _film(
     # Fluid lies in pools, in sulci and along vessels; elsewhere the film mirrors next to nothing.
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
     around = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
-    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(around, 0.25)
+    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 2.4 * np.minimum(around, 0.25)
     wet = wet + 1.6 * appearance.light.glare
     if shade is not None:
         edge = cv2.resize(1 - shade, (coarse, coarse), interpolation=cv2.INTER_AREA)
         wet = wet + 2.0 * edge
         relief = relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
     thin = 3.8 + 1.5 * uneven - 3 * wet
-    dry, pools = np.clip(thin, 0.05, 1.0), np.clip(0.5 - 0.6 * thin, 0, 1).astype(np.float32)
-    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.8 * pools)
+    dry = np.clip(thin, 0.05, 1.0)
+    pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)
+    dry = np.minimum(dry, 1 - pools)
+    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.9 * pools)
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
-    relief = relief * (1 - 0.8 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
+    relief = relief * (1 - 0.97 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
     # A vein's wall is smooth, and its film thin: its crest mirrors the lamp in one broad line.
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
     height = relief + appearance.bump * (1 - 0.9 * on_vein) * swell
