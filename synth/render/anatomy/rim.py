@@ -201,7 +201,9 @@ def build(
     crease, end = _flaps(rng, angle, dura)
     held = rng.random(len(stitches)) < Flap.held
     held &= appearance.family != "calf"  # the dura of a specimen is not sewn back
-    return Rim(Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, skin, cloth)
+    return Rim(
+        Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, skin, cloth
+    )
 
 
 def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Floats, Floats]:
@@ -216,7 +218,9 @@ def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Float
         rng.normal(0, Flap.ragged / (order / 14) ** 0.8) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
         for order in range(9, 60)
     )
-    end = np.maximum(pulled, crease + rng.uniform(0.3, 1) * Flap.beyond * np.abs(_uneven(rng, angle, 0.5, 0.5)))
+    end = np.maximum(
+        pulled, crease + rng.uniform(0.3, 1) * Flap.beyond * np.abs(_uneven(rng, angle, 0.5, 0.5))
+    )
     return crease, np.maximum(end + 0.5 * ragged, crease + 0.15)
 
 
@@ -329,7 +333,9 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     pool = step(4 * full - 0.3) * min(1, 6 * appearance.blood)
     depth = depth * np.clip(0.35 + 1.2 * full, 0.25, 1)
     wiped = np.clip(0.55 * fibres + 0.5 * wide - 0.6 + 0.8 * (appearance.blood - 0.5), 0, 1) * Blood.smear
-    bloody = soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
+    bloody = (
+        soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
+    )
     dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain)
     dura = over(dura, speckled(Flap.albedo, 0.03 * mottle, 0.03 * fibres), 0.75 * inner[..., None])
     section = np.clip(0.6 + 0.3 * wide + 0.2 * mottle, 0, 0.85) * ridge(away, width=CutEdge.width)
@@ -350,8 +356,12 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     )
     wet = np.maximum(pool, drops) * (1 - skin)
     bumps = (folds + 0.025 * mottle + 0.006 * grain) * (1 - 0.75 * wet) + 0.06 * wet
-    bumps = bumps + Flap.height * turned * (step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4))
-    dry = np.clip(0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner, 0.02, 1)
+    bumps = bumps + Flap.height * turned * (
+        step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
+    )
+    dry = np.clip(
+        0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner, 0.02, 1
+    )
     if len(rim.cloth):
         cloth = away - _round(rim.cloth, angle)
         colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)

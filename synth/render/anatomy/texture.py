@@ -18,7 +18,7 @@ from synth.errors import UserError
 from synth.geometry import triangles
 from synth.render.anatomy import noise, tube
 from synth.render.anatomy.chart import places
-from synth.render.anatomy.layers import Rgb, over, ridge, through
+from synth.render.anatomy.layers import Rgb, over, ridge, step, through
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance.family import Appearance
 from synth.render.materials import Coat
@@ -53,12 +53,16 @@ class Sulcus:
 
 
 class Bleeding:
-    """Blood under the arachnoid, ragged and thin at its edges; pairs are ranges."""
+    """Blood on the pia: thin films drawn out over it, and drops; pairs are ranges."""
 
-    count: float = 1.2  # mean on a patch whose rim is soaked with blood
-    radius: tuple[float, float] = 0.3, 1.2
-    depth: tuple[float, float] = 0.5, 1.3  # optical
-    blood: Rgb = (0.2, 1.9, 2.5)  # absorption
+    films: float = 2.2  # mean number on a patch whose rim is soaked with blood
+    drops: float = 5.0
+    radius: tuple[float, float] = 0.5, 1.8
+    drop_mm: tuple[float, float] = 0.08, 0.3
+    long: tuple[float, float] = 1.0, 2.6  # a film's length over its width
+    depth: tuple[float, float] = 0.15, 0.6  # optical, of a film
+    drop_depth: float = 1.4
+    blood: Rgb = (0.12, 1.5, 2.4)  # absorption
 
 
 class Artery:
@@ -92,7 +96,7 @@ class Film:
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
     swell_mm: float = 0.004  # standard deviation of the undulation
-    rough: float = 0.09  # standard deviation of slopes where the film is thin
+    rough: float = 0.17  # standard deviation of slopes where the film is thin
     level: float = 0.9  # share of the pia's slope that a pool takes away
     pool_mm: float = 0.35  # least size of a pool
     rim_mm: float = 0.3  # height that it climbs at the rim
@@ -211,16 +215,23 @@ def _strands(rng: Random, sulci: Map, extent: float) -> Map:
 
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
-    """Optical depth (n, n) of a few small bleedings."""
-    small = 256
+    """Optical depth (n, n) of a few films and drops of blood; a film is thickest at its border, where it dries."""
+    small = 384
     axis = noise.centres(small, extent)
-    ragged = noise.fractal(rng, small, extent, 2.5, 1.7)
+    ragged = noise.fractal(rng, small, extent, 5.0, 3.0)
     total = np.zeros((small, small), np.float32)
-    for _ in range(int(rng.poisson(Bleeding.count * blood))):
-        x, y = rng.uniform(-0.4, 0.4, 2) * extent
-        radius, depth = rng.uniform(*Bleeding.radius), rng.uniform(*Bleeding.depth)
-        away = np.hypot(axis[None] - x, axis[:, None] - y) / radius
-        total += depth * np.clip(2.5 * (1 - away + 0.35 * ragged), 0, 1).astype(np.float32)
+    numbers = rng.poisson([Bleeding.films * blood, Bleeding.drops * blood])
+    for drop, radii in zip([False] * numbers[0] + [True] * numbers[1], rng.random(sum(numbers)), strict=True):
+        (x, y), turn = rng.uniform(-0.4, 0.4, 2) * extent, rng.uniform(0, np.pi)
+        least, most = Bleeding.drop_mm if drop else Bleeding.radius
+        radius = least * (most / least) ** radii
+        long = 1.0 if drop else rng.uniform(*Bleeding.long) ** 0.5
+        u, v = axis[None] - x, axis[:, None] - y
+        along, aside = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
+        inside = 1 - np.hypot(along / long, aside * long) / radius + (0.1 if drop else 0.45) * ragged
+        depth = Bleeding.drop_depth if drop else rng.uniform(*Bleeding.depth)
+        film = step(inside / 0.25 - 0.3) * (1 + (0 if drop else 0.5) * ridge(inside, width=0.15, at=0.22))
+        total += (depth * film).astype(np.float32)
     return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
@@ -285,7 +296,9 @@ def _film(
     if shade is not None:
         edge = cv2.resize(1 - shade, (coarse, coarse), interpolation=cv2.INTER_AREA)
         wet = wet + 2.0 * edge
-        relief = relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
+        relief = (
+            relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
+        )
     thin = 3.8 + 1.5 * uneven - 3 * wet
     dry = np.clip(thin, 0.05, 1.0)
     pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)

@@ -72,12 +72,12 @@ TRIBUTARIES = Growth(spacing=3.4, reach=9.0, near=1.7, step=0.25, straight=0.8, 
 ARTERIOLES = (
     Growth(spacing=2.2, reach=6.0, near=0.9, step=0.16, straight=0.9, end=(0.05, 0.07)),
     Growth(spacing=0.95, reach=2.6, near=0.45, step=0.12, straight=0.7, end=(0.036, 0.055)),
-    Growth(spacing=0.5, reach=1.3, near=0.26, step=0.09, straight=0.5, end=(0.024, 0.04)),
+    Growth(spacing=0.46, reach=1.3, near=0.24, step=0.09, straight=0.5, end=(0.024, 0.04)),
 )
 _TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
 _BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
 _WIDE_MM = 0.18  # radius of such a vein
-_RISE_MM = 4.0  # length over which a trunk that comes up inside is seen below the pia
+_RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
 _THIN_MM = 6.0  # length over which trunks thin to where branches go on
 _TAPER_MM = 0.45  # length over which arterioles and tributaries thin
 _WINDING = 0.07, 1.1  # shift of fine vessels, and over what distance
@@ -109,8 +109,10 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     visible = _finished(visible, len(smooth.nodes), extent_mm, rng)
     distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
     beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
-    free = (~beside * np.clip(0.9 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.35, 1)).astype(np.float32)
-    arteries = main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 0.8))
+    free = (~beside * np.clip(0.9 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.35, 1)).astype(
+        np.float32
+    )
+    arteries = main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 0.8), extent_mm)
     for growth in ARTERIOLES:
         arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
     arteries = _finished(arteries, len(main.nodes), extent_mm, rng)
@@ -139,26 +141,34 @@ def _smooth(tree: Tree, over_mm: float) -> Tree:
     return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
 
 
-def _slender(tree: Tree) -> Tree:
-    """The tree thinned towards its ends, where finer branches go on."""
+def _slender(tree: Tree, extent_mm: float) -> Tree:
+    """The tree thinned towards its ends, where finer branches go on, and where it comes into sight inside."""
     left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
-    return Tree(tree.nodes, tree.parent, tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5)
+    radius = tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5
+    if len(roots := _roots_inside(tree, extent_mm)):
+        radius = radius * np.clip(0.15 + cKDTree(roots).query(tree.nodes)[0] / _RISE_MM, 0, 1)
+    return Tree(tree.nodes, tree.parent, radius)
+
+
+def _roots_inside(tree: Tree, extent_mm: float) -> Floats:
+    """Roots (n, 2) mm that are not at the patch's border."""
+    return tree.nodes[(tree.parent < 0) & (np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)]
 
 
 def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:
     """The vessels below the pia with those by which trunks come up inside the patch, behind their roots."""
     nodes, parent, radius = [deep.nodes], [deep.parent], [deep.radius]
     count, tree = len(deep.nodes), cKDTree(main.nodes)
-    steps = np.arange(0.0, _RISE_MM, 0.2)
-    for root in main.nodes[(main.parent < 0) & (np.abs(main.nodes).max(axis=1) < 0.42 * extent_mm)]:
+    steps = np.arange(0.0, 2 * _RISE_MM, 0.2)
+    for root in _roots_inside(main, extent_mm):
         near = np.array(tree.query_ball_point(root, 2.0))
         ahead = (main.nodes[near] - root).mean(axis=0)
         size = float(np.linalg.norm(ahead))
         if size < 0.2:  # it branches at once to all sides: it comes straight up
             continue
-        nodes.append(root + (1.0 - steps[:, None]) * ahead / size)
+        nodes.append(root + (2.0 - steps[:, None]) * ahead / size)
         parent.append(np.append(-1, count + np.arange(len(steps) - 1)))
-        radius.append(main.radius[near].max() * np.sqrt(1 - steps / _RISE_MM))
+        radius.append(main.radius[near].max() * np.sqrt(1 - steps / (2 * _RISE_MM)))
         count += len(steps)
     return Tree(np.concatenate(nodes), np.concatenate(parent), np.concatenate(radius))
 
@@ -167,12 +177,16 @@ def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator)
     """The tree whose nodes from number `main` on have grown in, made to wind, and thinned to their ends."""
     nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, 6)
     shift, wave = _WINDING
-    winding = np.stack([noise.sample(noise.band(rng, 256, extent_mm, wave, 0.5), nodes, extent_mm) for _ in range(2)], 1)
+    winding = np.stack(
+        [noise.sample(noise.band(rng, 256, extent_mm, wave, 0.5), nodes, extent_mm) for _ in range(2)], 1
+    )
     supple = shift / (1 + (tree.radius / 0.06) ** 2)
     left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
     thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
     # Wide vessels vary over centimetres: shorter waves look like beads.
-    short, long = (noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 11.0))
+    short, long = (
+        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 11.0)
+    )
     wide = np.clip(tree.radius / 0.3, 0, 1)
     radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
     return Tree(nodes + supple[:, None] * winding, tree.parent, radius)
