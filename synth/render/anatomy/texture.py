@@ -90,8 +90,8 @@ class Vein:
 
 
 class Film:
-    """Fluid over everything: it climbs along vessels and at the rim, smooths finer relief, lies level in pools,
-    and undulates a little."""
+    """Fluid over everything: it climbs along vessels and at the rim, smooths finer relief, and undulates a
+    little; in pools it lies level."""
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
@@ -215,7 +215,7 @@ def _strands(rng: Random, sulci: Map, extent: float) -> Map:
 
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
-    """Optical depth (n, n) of a few films and drops of blood; a film is thickest at its border, where it dries."""
+    """Optical depth (n, n) of a few films and drops of blood; films are thickest at their borders."""
     small = 384
     axis = noise.centres(small, extent)
     ragged = noise.fractal(rng, small, extent, 5.0, 3.0)
@@ -280,7 +280,8 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
 def _film(
     rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, shade: Map | None, extent: float
 ) -> tuple[Map, Map, Map]:
-    """Height of the wet surface above the pia [mm], share of it under too thin a film, share of slope it lacks."""
+    """Height of the wet surface above the pia [mm], the share of it under too thin a film, and the share of
+    the pia's slope that it lacks."""
     coarse = 256
     distance, radius = tubes["veins"]
     raised = np.sqrt(np.maximum(radius**2 - distance**2, 0)) - Vein.sunk * radius
