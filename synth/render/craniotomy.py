@@ -28,7 +28,8 @@ from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
+_RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.33
+_SEEN = 1.4  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
 _DULL = Finish((0.15, 0.145, 0.14), 0.4, scattered=0.25)  # a retractor's, darkened against glare
 _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wider than the picture
@@ -60,7 +61,8 @@ def craniotomy(
     ambient = appearance.light.ambient * lit
     # Grown and painted in the usual size.
     patch, px_mm = resize(surface, 1 / how.scale), camera.mm_per_px / how.scale
-    around = rim.build(patch, opening_mm / how.scale, appearance, px_mm)
+    seen_mm = _SEEN * 0.5 * float(np.hypot(*camera.size)) * px_mm
+    around = rim.build(patch, opening_mm / how.scale, appearance, px_mm, seen_mm)
     pixels, texels = (
         min(texture.resolution(extent, one), _MOST_TEXELS if how.scale != 1 else 4096)
         for extent, one in ((patch.chart.extent_mm, px_mm), (around.extent_mm, 2.2 * px_mm))

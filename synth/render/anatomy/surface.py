@@ -111,7 +111,7 @@ def bulge(grown: Vessels, extent_mm: float) -> Map:
     arteries cross them."""
     distance, radius = tube.raster(grown.veins, _RELIEF_PX, extent_mm, 0.1)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    distance, radius = tube.raster(grown.arteries, _RELIEF_PX, extent_mm, 0.1)
+    distance, radius = tube.raster(grown.trunks, _RELIEF_PX, extent_mm, 0.1)
     pressed = _DIP * np.clip(radius / 0.25, 0, 1) * (distance < radius + 0.1)
     return noise.blur((inside * (1 - pressed)).astype(np.float32), 0.2, extent_mm)
 

@@ -13,7 +13,8 @@ from synth.job.schema import AnatomySection
 from synth.render import finish, idle, instrument
 from synth.render.anatomy import surface
 from synth.render.anatomy.chart import Chart, places, unroll
-from synth.render.anatomy.tree import lattice, least_cost, relaxed
+from synth.render.anatomy.colonisation import Growth, fill
+from synth.render.anatomy.tree import Tree, lattice, least_cost, relaxed
 from synth.render.appearance.reflection import Reflectance, Theatre, glow
 from synth.render.materials import Lamp
 from synth.sequence import scenario
@@ -96,6 +97,23 @@ def test_a_vessel_of_least_cost_shares_its_way() -> None:
         made = least_cost(way, np.ones(len(way.points)), near[:1], near[1:], np.array([0.1, 0.2]), sharing)
         assert made.radius.max() == pytest.approx((0.1**3 + 0.2**3) ** (1 / 3))
         assert least < np.ptp(made.nodes[made.radius > 0.201, 0]) < most
+
+
+def test_branches_grow_to_all_that_need_supply() -> None:
+    """All targets get a vessel within the growth's distance, in steps, and r^3 is conserved."""
+    trunk = Tree(np.stack([np.linspace(-5, 5, 60), np.zeros(60)], 1), np.arange(-1, 59), np.full(60, 1e-3))
+    growth = Growth(spacing=1.0, reach=8.0, near=0.4, step=0.1, straight=0.6, end=(0.02, 0.02))
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-5, 5, (80, 2))
+    made = fill(trunk, targets, growth, rng)
+    assert cKDTree(made.nodes).query(targets)[0].max() < growth.near
+    assert (made.parent[1:] < np.arange(1, len(made.parent))).all()
+    assert np.allclose(made.nodes[:60], trunk.nodes)
+    grown = np.linalg.norm(made.nodes[60:] - made.nodes[made.parent[60:]], axis=1)
+    assert grown == pytest.approx(growth.step)
+    tips = np.bincount(made.parent + 1, minlength=len(made.parent) + 1)[1:] == 0
+    ends = np.count_nonzero(tips[60:])
+    assert made.radius[0] == pytest.approx(growth.end[0] * ends ** (1 / 3), rel=1e-3)
 
 
 def test_a_thin_twig_leaves_its_trunk_straight() -> None:
