@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from synth.arrays import Floats, Map
+from synth.arrays import Floats, Indices, Map
 from synth.render.anatomy.layers import over, ridge, step, through
 from synth.render.finish import Finish
 from synth.render.idle import CLOTH
@@ -22,21 +22,23 @@ _PLASTIC = np.full(3, 0.04, np.float32)  # reflectance at right angles, at an in
 _BLOOD = np.array([0.20, 0.006, 0.005], np.float32)  # albedo of a clot
 _FILM = 0.45, 3.2, 3.6  # absorption of a film of blood, passed twice
 _LEAST = 0.1  # of the roughness across by that along
-_WARP = 0.006  # height of a body's unevenness, as a share of its width
+_WARP = 0.02  # height of a blade's unevenness
 _STEEPEST = 1.0  # slope of bumps
 _SERRATION_MM = 0.5, 5.5, 0.38  # of forceps' inner faces: start, end, and period along the tip
 _BORE_RINGS = 5.2  # rings of a tube that are inside
 _MARKS_MM = 6.0, 1.1, 0.14  # etched rings: their distance from each other, that of a pair, width
 
 
-def unfold(rings: int, turn: int) -> Map:
-    """Place (V, 2) in the texture of a closed bar's vertices, from 0 to 1.
+def unfold(profile: Floats, turn: int) -> Map:
+    """Place (V, 2) in the texture of a closed bar's vertices (V, 3), from 0 to 1.
 
-    `turn`: column of the middle row.
+    `turn`: column of the texture's middle row.
     """
-    angle = 2 * np.pi / RING * (np.arange(RING) - turn)
-    across = np.tile(0.5 - np.arcsin(np.clip(np.sin(angle), -1, 1)) / np.pi, rings)
-    return np.column_stack([np.repeat(np.linspace(0, 1, rings), RING), across]).astype(np.float32)
+    rings = profile.reshape(-1, RING, 3)
+    aside = (np.arange(RING) - turn + RING // 2) % RING - RING // 2  # columns from the middle one
+    folded = np.where(np.abs(aside) > RING // 4, np.sign(aside) * RING // 2 - aside, aside)
+    across = np.tile(_share_of_outline(rings[:, _shown(turn)])[RING // 4 - folded], len(rings))
+    return np.column_stack([np.repeat(np.linspace(0, 1, len(rings)), RING), across]).astype(np.float32)
 
 
 def paint(
@@ -62,9 +64,10 @@ def paint(
         along = _texels(inwards[..., None], size)
     else:
         rings = profile.reshape(-1, RING, 3)
-        shown = (turn + np.arange(RING // 4, -RING // 4 - 1, -1)) % RING
-        place = _texels(rings[:, shown].swapaxes(0, 1), size)
-        turned = _texels(_edges(rings)[:, shown].T[..., None], size)
+        shown = _shown(turn)
+        rows = np.interp(np.linspace(0, 1, height), _share_of_outline(rings[:, shown]), np.arange(len(shown)))
+        place = _texels(rings[:, shown].swapaxes(0, 1), size, rows)
+        turned = _texels(_edges(rings)[:, shown].T[..., None], size, rows)
         along = place[..., 2]
     wide = float(np.linalg.norm(place[-1] - place[0], axis=-1)[: size[1] // 3].max())
     blotch = noise(place, 8.0 if sheet_rows else max(2.5, 0.8 * wide), rng)
@@ -78,7 +81,8 @@ def paint(
     coat = step((along - finish.bare_mm) / 0.06) * (1 - worn)
     bumps = 0.07 * step((along - finish.bare_mm) / 0.25) * (1 - worn) + 0.004 * coat * mottle
     bumps = bumps + 0.0012 * (1 - coat) * lines * (1 + 8 * finish.brushed)
-    bumps = bumps + _WARP * min(wide, 8.0) * blotch * (1 - coat)  # no blade is flat
+    if kind == "spatula":  # no blade is flat
+        bumps = bumps + _WARP * blotch * (1 - coat)
 
     rub = np.exp((0.25 + finish.brushed) * lines)
     rough = np.stack([finish.alpha * max(finish.streak, 1.0) * (1 - 0.2 * worn), finish.alpha * rub], axis=-1)
@@ -144,12 +148,26 @@ def noise(at: Floats, wave_mm: float, rng: np.random.Generator) -> Map:
     return np.asarray(np.cos(angle).sum(axis=-1) / np.float32(np.sqrt(8)), np.float32)
 
 
-def _texels(grid: Floats, size: tuple[int, int]) -> Map:
-    """Values of a grid (r, c, n) at the texels (h, w) between its corners: (h, w, n), or (h, w) for n = 1."""
-    rows, columns = (
-        np.linspace(0, n - 1, m, dtype=np.float32) for n, m in zip(grid.shape, size, strict=False)
-    )
-    return cv2.remap(np.ascontiguousarray(grid, np.float32), *np.meshgrid(columns, rows), cv2.INTER_LINEAR)
+def _shown(turn: int) -> Indices:
+    """Columns of a bar's rings in the half that its texture shows, in the order of the texture's rows."""
+    return ((turn + np.arange(RING // 4, -RING // 4 - 1, -1)) % RING).astype(np.int32)
+
+
+def _share_of_outline(half: Floats) -> Floats:
+    """Place, from 0 to 1, of columns (R, n, 3) along the outline of a bar's body: its corners have many."""
+    sides = np.linalg.norm(np.diff(half[len(half) // 3], axis=0), axis=1)
+    return np.asarray(np.append(0, np.cumsum(sides)) / sides.sum())
+
+
+def _texels(grid: Floats, size: tuple[int, int], rows: Floats | None = None) -> Map:
+    """Values of a grid (r, c, n) at texels (h, w): (h, w, n), or (h, w) for n = 1.
+
+    `rows`: (h,) places in the grid of the texels' rows, even if not given.
+    """
+    across = np.linspace(0, len(grid) - 1, size[0]) if rows is None else rows
+    along = np.linspace(0, grid.shape[1] - 1, size[1])
+    x, y = np.meshgrid(along.astype(np.float32), across.astype(np.float32))
+    return np.asarray(cv2.remap(np.ascontiguousarray(grid, np.float32), x, y, cv2.INTER_LINEAR), np.float32)
 
 
 def _lines(size: tuple[int, int], rng: np.random.Generator) -> Map:

@@ -50,7 +50,7 @@ class Part:
     def uv(self) -> Map:
         """(V, 2) place in its maps, see `finish_maps`."""
         if not self.rows:
-            return finish_maps.unfold(len(self.profile) // RING, self.turn)
+            return finish_maps.unfold(self.profile, self.turn)
         sizes = self.rows, len(self.profile) // self.rows
         ends = [np.linspace(0, 1, size, dtype=np.float32) for size in sizes]
         across, along = np.meshgrid(*ends, indexing="ij")

@@ -68,7 +68,7 @@ def build_clips(
             near = np.linalg.norm(ground[:, :2] - away * out[:2], axis=1) < 1.5
             if not near.any():
                 continue
-            middle = away * out + [0, 0, float(np.median(ground[near, 2])) - 0.2 * _CLIP_MM[1]]
+            middle = away * out + [0, 0, float(np.percentile(ground[near, 2], 80)) - 0.1 * _CLIP_MM[1]]
             at = project(camera, middle[None])[0] / size
             if ((at < -_MARGIN) | (at > 1 + _MARGIN)).any():
                 continue

@@ -21,6 +21,7 @@ _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
 _SHADED = 0.75  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
+_GRAZING = 0.4  # rise of steel's reflectance at grazing angles, less what roughness takes
 _TWICE = 1.7  # where light arrives that tissue has scattered before: a power of its colour
 
 
@@ -53,7 +54,8 @@ def glow(shape: Shape, alpha: Floats, theatre: Theatre) -> Floats:
     towards = theatre.lens - shape.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
-    return _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
+    seen = _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
+    return np.asarray(seen * (1 + _GRAZING * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
 
 
 def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:

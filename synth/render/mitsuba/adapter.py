@@ -29,7 +29,6 @@ from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
 
 _REGISTER = 64  # bytes of a vector register
-_GRAZING = 0.6  # share of Fresnel's rise at grazing angles that roughness leaves
 _GLOSS = 0.88  # of a liquid's surface, as of `principled`
 _LAMPS = 2, 6, 12  # numbers of lamps, each with a kernel of its own
 
@@ -157,7 +156,7 @@ def _freeze_modules() -> None:
 def _register_glow(variant: str) -> None:
     """Registers an emitter `sulcus_glow` that is visible but never sampled, in one compiled variant.
 
-    With a texture `mirror` it is a surface of that reflectance at right angles in which the radiance is seen.
+    With a texture `mirror` it is a surface of that reflectance in which the radiance is seen.
 
     Mitsuba's own area light with a sampling weight of 0 is not sampled either, but its sampling would still
     be compiled, with the mesh's number of faces in the code, which takes a kernel for every scene.
@@ -175,12 +174,10 @@ def _register_glow(variant: str) -> None:
             self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
         def eval(self, si: Any, active: Any = True) -> Any:
-            facing = mi.Frame3f.cos_theta(si.wi)
             radiance = self.radiance.eval(si, active)
             if self.mirror is not None:
-                share = self.mirror.eval(si, active)
-                radiance *= share + (1 - share) * _GRAZING * dr.maximum(1 - facing, 0) ** 5
-            return dr.select(facing > 0, radiance, 0)
+                radiance *= self.mirror.eval(si, active)
+            return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, radiance, 0)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
             return dr.zeros(mi.DirectionSample3f), dr.zeros(mi.Color3f)
