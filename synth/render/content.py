@@ -37,8 +37,8 @@ class Instruments(Protocol):
     def glow(self, posed: Shape) -> Floats:
         """Radiance (V, 3) of the surroundings that a mirror in its place shows the camera at rest."""
 
-    def film(self, tips: Floats, surface: Floats) -> Floats:
-        """Height (V,) mm of the liquid that climbs to the tips from a tissue's vertices (V, 3) mm."""
+    def film(self, posed: Shape, surface: Floats) -> Floats:
+        """Height (V,) mm of the liquid that climbs to the mesh from a tissue's vertices (V, 3) mm."""
 
     def shade(self, posed: Shape, surface: Floats) -> Floats:
         """Share (V,) of light that scatters to a tissue's vertices (V, 3) mm past the mesh in its place."""

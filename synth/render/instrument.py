@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
-from synth.geometry.triangles import Shape, grid_faces, joined, lengths
+from synth.geometry.triangles import Shape, grid_faces, joined
 from synth.render import finish, finish_maps
 from synth.render.appearance import reflection
 from synth.render.appearance.reflection import Theatre
@@ -27,7 +27,9 @@ from synth.render.materials import FinishMaps, read_map, stack_maps
 _RINGS = 64
 _LENGTH_MM = 110.0
 _CLIMB_MM, _REACH_MM = 0.55, 0.35  # height to which fluid climbs at a tip, and distance of its fall-off
-_SHADE, _SHADE_MM = 0.5, (0.9, 2.5)  # light that a body takes where it touches, by the distance; its end
+_TOUCH_MM = 0.15  # distance from an instrument's vertices at which its surface is
+_SHADE, _SHADE_MM = 0.5, 0.9  # light that a body takes where it touches, and distance of its fall-off
+_AWAY_MM = 2.5  # distance from which on neither is seen
 _OTHER_SIZES = 0.6, 1.6  # of an acting instrument's tip, at strength 1
 _SHEET_MM, _LAID_MM = 0.4, 0.45  # spacing of a cloth's vertices, its height over what is below
 
@@ -70,7 +72,6 @@ class Part:
 class InstrumentMesh:
     """All instruments of a scene as one mesh; see `content.Instruments`."""
 
-    halves: tuple[float, ...]  # half the width of each one's contact with tissue, mm
     parts: tuple[tuple[Part, ...], ...]  # the parts of each, none where it is not drawn
     faces: Indices  # (F, 3) over all parts
     uv: Map  # (V, 2)
@@ -99,22 +100,29 @@ class InstrumentMesh:
     def glow(self, posed: Shape) -> Floats:
         return reflection.glow(posed, self.alpha, self.theatre)
 
-    def film(self, tips: Floats, surface: Floats) -> Floats:
+    def film(self, posed: Shape, surface: Floats) -> Floats:
+        near, away = _near(posed, surface)
         height = np.zeros(len(surface))
-        for half, parts, ends in zip(self.halves, self.parts, tips.reshape(-1, 2, 3), strict=True):
-            for end in ends if len(parts) == 2 else ends.mean(axis=0, keepdims=True)[: len(parts)]:
-                away = lengths(surface - end) - half
-                height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
+        height[near] = _CLIMB_MM * np.exp(-np.maximum(away - _TOUCH_MM, 0) / _REACH_MM)
         return height
 
     def shade(self, posed: Shape, surface: Floats) -> Floats:
-        low = surface[:, 2].max() + _SHADE_MM[1]
-        ends = posed.vertices[posed.vertices[:, 2] < low]
-        dark = np.zeros(len(surface))
-        if len(ends):
-            away, _ = cKDTree(ends).query(surface, distance_upper_bound=_SHADE_MM[1])
-            dark = np.asarray(_SHADE * np.exp(-((away / _SHADE_MM[0]) ** 2)))
-        return 1 - dark
+        near, away = _near(posed, surface)
+        share = np.ones(len(surface))
+        share[near] = 1 - _SHADE * np.exp(-((away / _SHADE_MM) ** 2))
+        return share
+
+
+def _near(posed: Shape, surface: Floats) -> tuple[Indices, Floats]:
+    """Indices (n,) of points (V, 3) mm that may be near a mesh, and their distances from its vertices."""
+    low, high = surface.min(axis=0) - _AWAY_MM, surface.max(axis=0) + _AWAY_MM
+    ends = posed.vertices[((posed.vertices > low) & (posed.vertices < high)).all(axis=1)]
+    if not len(ends):
+        return np.zeros(0, np.int32), np.zeros(0)
+    low, high = ends.min(axis=0) - _AWAY_MM, ends.max(axis=0) + _AWAY_MM
+    near = np.flatnonzero(((surface > low) & (surface < high)).all(axis=1))
+    away, _ = cKDTree(ends).query(surface[near], distance_upper_bound=_AWAY_MM)
+    return near.astype(np.int32), np.asarray(away)
 
 
 def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
@@ -161,7 +169,7 @@ def build(
         ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
         for one in idle
     ]
-    parts, halves = zip(*made, strict=True) if made else ((), ())
+    parts = tuple(shapes for shapes, _ in made)
     if not any(parts):
         return None
     textures = list[tuple[Map, FinishMaps]]()
@@ -169,7 +177,7 @@ def build(
         skin = finish.draw_finish(strength, rng, kind)
         textures += [(part.uv, part.maps(skin, kind, rng, mm_per_px)) for part in own]
     faces = joined(*(part.shape for own in parts for part in own)).faces
-    return InstrumentMesh(halves, parts, faces, *stack_maps(textures), theatre)
+    return InstrumentMesh(parts, faces, *stack_maps(textures), theatre)
 
 
 def sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:

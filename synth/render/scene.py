@@ -25,6 +25,7 @@ from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
+_UNSHADED = 0.995  # share of the light from which on a contact's shadow is left out
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 _TEXEL = [np.full((1, 1, *shape), 0.5, np.float32) for shape in ((3,), (), (2,), (), (3,), (3,))]
 _NO_METAL = Metal(FinishMaps(*_TEXEL), np.zeros((3, 3)))
@@ -254,7 +255,7 @@ class Renderer:
 
     def _film(self, state: SceneState) -> Floats | None:
         instruments = self.content.instruments
-        return None if instruments is None else instruments.film(state.tips, state.vertices)
+        return None if instruments is None else instruments.film(self._posed(state), state.vertices)
 
     def _contact(self, state: SceneState, posed: Shape) -> Floats | None:
         """Share (V,) of light that instruments leave the tissue's vertices near them; None: all of it."""
@@ -268,13 +269,14 @@ class Renderer:
         Light that would have come to there by scattering in tissue and between tissue and steel, of which the
         renderer has none but a blurred albedo.
         """
-        if shade is None or not (shade < 1).any():
+        if shade is None or shade.min() >= _UNSHADED:
             return radiance
         faces = self.content.tissue.faces
-        dark = np.append((shade < 0.995)[faces].any(axis=1), False)
+        # Of the pixels on tissue, those on a face with a shaded corner.
+        dark = np.append((shade < _UNSHADED)[faces].any(axis=1), False)
         near = np.flatnonzero(dark[np.where(hits.face < len(faces), hits.face, -1)])
-        shaded = radiance.reshape(-1, 3).copy()
         share = truth.blend(faces, hits.face[near], hits.bary[near], shade[:, None])
+        shaded = radiance.reshape(-1, 3).copy()
         shaded[near] *= share.astype(np.float32)
         return shaded.reshape(radiance.shape)
 
