@@ -186,7 +186,7 @@ def _drops(place: Map, along: Map, finish: Finish, rng: np.random.Generator) -> 
     for _ in range(rng.poisson(2.5 * finish.wet_mm) if len(reach) else 0):
         row, column = rng.integers(len(along)), rng.choice(reach)
         radius = float(np.exp(rng.uniform(np.log(0.08), np.log(0.4))))
-        near = slice(*np.searchsorted(along[row], along[row, column] + [-radius, radius]))
+        near = np.flatnonzero(np.abs(along[row] - along[row, column]) < radius)
         away2 = ((place[:, near] - place[row, column]) ** 2).sum(axis=-1) / radius**2
         high[:, near] = np.maximum(high[:, near], 0.4 * radius * np.maximum(1 - away2, 0))
     return high
