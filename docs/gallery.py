@@ -42,7 +42,7 @@ _SCENERY: dict[str, str] = {
     "bone": "forceps",
     "drape": "dissector",
     "retractor": "bayonet",
-    "bone, drape": "suction",
+    "bone, drape, clips": "suction",
 }
 _CAPTION_PX = 24
 
@@ -76,7 +76,7 @@ def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, qua
 
 def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
-    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000}
+    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000, "render.scenery": ()}
     job = changed(
         Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],), "fem.instrument": (kind,)} | settings
     )

@@ -17,7 +17,7 @@ from synth.render.camera import camera_sensor
 from synth.render.camera.camera import Camera, blur_radius, disparity
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.content import SceneContent
-from synth.render.materials import Body, Metal, Wet
+from synth.render.materials import Body, FinishMaps, Metal, Wet, stack_maps
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
@@ -25,8 +25,16 @@ from synth.render.truth import RestFrame
 Variant = Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
 
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
+_UNSHADED = 0.995  # share of the light from which on a contact's shadow is left out
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-_OUT_OF_SIGHT = Shape(np.eye(3) - 1e3, np.array([[0, 1, 2]], np.int32)), Metal(*np.zeros((2, 3, 3)))
+_TEXEL = [np.full((1, 1, *shape), 0.5, np.float32) for shape in ((3,), (), (2,), (), (3,), (3,))]
+_NO_METAL = Metal(FinishMaps(*_TEXEL), np.zeros((3, 3)))
+_OUT_OF_SIGHT = Body(
+    np.eye(3) - 1e3,
+    np.array([[0, 1, 2]], np.int32),
+    np.zeros((3, 2), np.float32),
+    _NO_METAL,
+)
 
 
 @dataclass(frozen=True)
@@ -123,9 +131,11 @@ class Renderer:
             raise ValueError("the tissue's material must be Wet")
         self._wet = content.tissue.material
         self._static = joined(_NOTHING, *(body.shape for body in content.static))
-        metal = [(one.shape, one.material) for one in content.static if isinstance(one.material, Metal)]
+        metal = [(body, body.material) for body in content.static if isinstance(body.material, Metal)]
         # A face of metal at least, if out of sight: with and without instruments kernels are the same.
-        self._static_metal = metal or ([] if content.instruments is not None else [_OUT_OF_SIGHT])
+        self._static_metal = metal or (
+            [] if content.instruments is not None else [(_OUT_OF_SIGHT, _NO_METAL)]
+        )
         self.rest = truth.trace_rest(camera, content.tissue.shape, self._static)
         self.right: Camera | None = None
         """The right camera at rest, if there is one."""
@@ -154,6 +164,8 @@ class Renderer:
         faces = self.content.tissue.faces
         shapes = (Shape(state.vertices, faces), self._static, self._posed(state))
         own = truth.trace_frame(camera, self.rest, *shapes)
+        shade = self._contact(state, shapes[-1])
+        radiance = self._shaded(radiance, own.hits, shade)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
@@ -171,7 +183,7 @@ class Renderer:
         extra |= self._shading(own.hits, shapes, "")
         if self._right_of is not None and self._right_rest is not None:
             other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
-            picture = self.develop(others[0], seed + 1)
+            picture = self.develop(self._shaded(others[0], other.hits, shade), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
             extra |= self._shading(other.hits, shapes, "_right")
@@ -207,16 +219,20 @@ class Renderer:
         bodies = {"tissue": replace(self.content.tissue, vertices=state.vertices, film=self._film(state))}
         wet = (body for body in self.content.static if isinstance(body.material, Wet))
         bodies |= {f"static{k}": body for k, body in enumerate(wet)}
-        shape, metal = self._metal(state)
-        bodies["metal"] = Body(*shape, np.zeros((len(shape.vertices), 2), np.float32), metal)
+        shape, glow = self._metal(state)
+        textures = [(body.uv, metal.maps) for body, metal in self._static_metal]
+        if (instruments := self.content.instruments) is not None:
+            textures.insert(0, (instruments.uv, instruments.maps))
+        uv, maps = stack_maps(textures)
+        bodies["metal"] = Body(*shape, uv, Metal(maps, glow))
         return Stage(self.variant, self.camera, bodies, self.content.lamps, spp, integrator)
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Moves a stage to another state."""
         stage.move("tissue", state.vertices, film=self._film(state))
         if self.content.instruments is not None:
-            shape, metal = self._metal(state)
-            stage.move("metal", shape.vertices, glow=metal.glow)
+            shape, glow = self._metal(state)
+            stage.move("metal", shape.vertices, glow=glow)
 
     def develop(self, radiance: Map, seed: int) -> Pixels:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
@@ -242,7 +258,30 @@ class Renderer:
 
     def _film(self, state: SceneState) -> Floats | None:
         instruments = self.content.instruments
-        return None if instruments is None else instruments.film(state.tips, state.vertices)
+        return None if instruments is None else instruments.film(self._posed(state), state.vertices)
+
+    def _contact(self, state: SceneState, posed: Shape) -> Floats | None:
+        """Share (V,) of light that instruments leave the tissue's vertices near them; None: all of it."""
+        if self.content.instruments is None:
+            return None
+        return self.content.instruments.shade(posed, state.vertices)
+
+    def _shaded(self, radiance: Map, hits: truth.Hits, shade: Floats | None) -> Map:
+        """The radiance (H, W, 3) less the light that contacts take from the tissue.
+
+        Light that would have come to there by scattering in tissue and between tissue and steel, of which the
+        renderer has none but a blurred albedo.
+        """
+        if shade is None or shade.min() >= _UNSHADED:
+            return radiance
+        faces = self.content.tissue.faces
+        # Of the pixels on tissue, those on a face with a shaded corner.
+        dark = np.append((shade < _UNSHADED)[faces].any(axis=1), False)
+        near = np.flatnonzero(dark[np.where(hits.face < len(faces), hits.face, -1)])
+        share = truth.blend(faces, hits.face[near], hits.bary[near], shade[:, None])
+        shaded = radiance.reshape(-1, 3).copy()
+        shaded[near] *= share.astype(np.float32)
+        return shaded.reshape(radiance.shape)
 
     def _gathered(self, states: Sequence[SceneState], seed: int) -> list[Map]:
         """Mean radiance over some states, in the camera and in the right one if there is one."""
@@ -264,14 +303,13 @@ class Renderer:
     def _spot(self, camera: Camera) -> Map:
         return light.spot(camera, self.camera, self.content.spot)
 
-    def _metal(self, state: SceneState) -> tuple[Shape, Metal]:
-        """All metal as one mesh, instruments first."""
-        parts = list(self._static_metal)
+    def _metal(self, state: SceneState) -> tuple[Shape, Floats]:
+        """All metal as one mesh, instruments first, and the surroundings (V, 3) that it mirrors."""
+        parts = [(body.shape, metal.glow) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
             posed = self._posed(state)
-            parts.insert(0, (posed, Metal(instruments.tint, instruments.glow(posed))))
-        tint, glow = ([getattr(metal, name) for _, metal in parts] for name in ("tint", "glow"))
-        return joined(*(shape for shape, _ in parts)), Metal(np.concatenate(tint), np.concatenate(glow))
+            parts.insert(0, (posed, instruments.glow(posed)))
+        return joined(*(shape for shape, _ in parts)), np.concatenate([glow for _, glow in parts])
 
     def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""

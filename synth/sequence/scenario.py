@@ -53,7 +53,12 @@ _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highl
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
-_SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
+_SHOWN = {
+    "retractor": 0.2,
+    "bone": 0.33,
+    "drape": 0.4,
+    "clips": 0.4,
+}  # shares of the sequences that show a part
 
 
 @dataclass(frozen=True)
@@ -410,8 +415,8 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     blur = _uniform(np.random.default_rng([appearance.rim_seed, 5]), job.sensor.blur_px)
     sensor = replace(appearance.sensor, blur=blur * job.render.size[0] / BLUR_WIDTH_PX)
     parts = job.render.scenery
-    shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
-    scenery = tuple(part for part, is_shown in zip(parts, shown, strict=True) if is_shown)
+    chance = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts))
+    scenery = tuple(part for part, drawn in zip(parts, chance, strict=True) if drawn < _SHOWN[part])
     return replace(appearance, sensor=sensor, scenery=scenery)
 
 

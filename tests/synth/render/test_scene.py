@@ -34,7 +34,7 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 def made(
     variant: str, spp: int = 4, extra: tuple[str, ...] = (), tool: bool = True, **render: object
 ) -> tuple[Renderer, np.ndarray]:
-    settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
+    settings = {"size": (96, 72), "spp": spp, "variant": variant, "scenery": (), **render}
     job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(settings))
     surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), vertices=2500)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
@@ -226,7 +226,7 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     bare = reader.load_job("demo", SMALL)
-    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, bone, drape]"])
+    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, bone, drape, clips]"])
     large = []
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
