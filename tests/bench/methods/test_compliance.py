@@ -54,7 +54,9 @@ def test_compliances_are_those_of_direct_solutions(coarse: None, tissue: TissueK
     for components in (2, 3):
         matrix = compliance.solve(tissue, components)
         columns = matrix.reshape(len(matrix), 3, -1)[..., some].reshape(len(matrix), -1)
-        np.testing.assert_allclose(columns, direct[: len(matrix)], atol=1e-9 * np.abs(direct).max(), rtol=0)
+        # What surrounds the window is eliminated in single precision.
+        np.testing.assert_allclose(columns, direct[: len(matrix)], atol=2e-6 * np.abs(direct).max(), rtol=0)
+        assert np.linalg.norm(columns - direct[: len(matrix)]) < 1e-5 * np.linalg.norm(direct[: len(matrix)])
 
 
 def test_a_condensed_mesh_moves_as_the_whole() -> None:
