@@ -58,6 +58,7 @@ class TissueConstants:
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
     steeper: float = 1.2  # slope relative to the last, from which a frame may be solved by its own mechanics
     solved: int = 4  # frames so solved, at most
+    linear: float = 14.4  # largest force over E [mm^2] in the linear range: P = 0.4 of a contact of 6 mm
     unsolved: tuple[float, float] = (0.8, 2.0)
     """Gains of the linear force that hold what it may be where motion is large and not solved: those of nine
     driven contacts of 75 to 260 mN were 0.93 to 1.6."""
@@ -124,7 +125,7 @@ class Physics:
         self._frames.append(observed)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
-        if frame.trusted:
+        if frame.trusted and len(moved) == 3:
             surface = large_motion.seen_motion(moved, spread, self._view.mask, GRID)
             last = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
             if surface.slope > max(large_motion.STEEP, last):
@@ -155,6 +156,9 @@ class Physics:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
         self._gains = find_gains(self._scene, self._weights, self._large)
+        strongest = max(self._frames, key=lambda frame: frame.signal_mm)
+        if len(strongest.moved) == 2:
+            self._gains = find_monocular_gains(self._weights, strongest)
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(one, False) for one in self._frames])
 
@@ -313,7 +317,7 @@ def find_gains(
         size = float(np.linalg.norm(infer(weights, frame).force.mean))
         ends = TISSUES.unsolved
         try:
-            if motion.moved.shape[1] == 3 and size > 0:
+            if size > 0:
                 opening_mm = min(float(radius), large_motion.OPEN_MM)
                 forces = [
                     large_motion.reaction(motion, tissue, opening_mm, a) for a in sorted(set(scene.alpha))
@@ -325,6 +329,15 @@ def find_gains(
         unsolved += ends == TISSUES.unsolved
         rows.append((size, *ends))
     return Gains(*np.array(sorted(rows)).T, unsolved)
+
+
+def find_monocular_gains(weights: TissueWeights, strongest: Observation) -> Gains:
+    """Gains with one camera, to which depth is hidden: what they may be where the linear force is large."""
+    size = float(np.linalg.norm(infer(weights, strongest).force.mean))
+    if size <= TISSUES.linear:
+        return NO_GAIN
+    low, high = TISSUES.unsolved
+    return Gains(np.array([0.0, TISSUES.linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
 
 
 @lru_cache(maxsize=1)

@@ -14,7 +14,6 @@ Of felupe are the law (its Ogden energy, differentiated automatically) and the e
 """
 
 import json
-import sys
 from pathlib import Path
 
 import felupe as fem
@@ -167,11 +166,10 @@ def opening(poisson, alpha, radius, way, middle, fine):
 
 
 if __name__ == "__main__":
-    fine = int(sys.argv[1]) if len(sys.argv) > 1 else 8
     answer = {
         "felupe": fem.__version__,
         "points": points(),
-        "scenes": [scene(*case, fine) for case in SCENES],
-        "openings": [opening(*case, fine) for case in OPENINGS],
+        "scenes": [scene(*case, 8 if case[2] <= 5 else 6) for case in SCENES],
+        "openings": [opening(*case, 6) for case in OPENINGS],
     }
     Path(__file__).with_suffix(".json").write_text(json.dumps(answer))
