@@ -35,6 +35,8 @@ class MethodContext:
     """Whether the tissue may move by heart and breath; False: ex vivo, or a phantom."""
     recovered_by: str = ""
     """Estimator and version of the motion; empty: unknown."""
+    alpha: tuple[float, float] = (-20.0, 2.0)
+    """Range of the exponent of Ogden's law, for motion beyond the linear range."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""

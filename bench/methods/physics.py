@@ -2,6 +2,8 @@
 
 At its end spans without contact give the tissue's own motion, the frames with the largest motion its edge,
 membrane and Poisson's ratio; a force map requested earlier uses the frame with the largest motion so far.
+Where the surface is bent beyond the linear range, some frames are then solved by `large_motion`; those
+between them take the gain over the linear force that these show.
 """
 
 from __future__ import annotations
@@ -14,9 +16,10 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
-from bench.methods import compliance, posterior
+from bench.methods import compliance, large_motion, posterior
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
+from bench.methods.large_motion import SeenMotion
 from bench.methods.method_interface import (
     Field,
     ForceEstimate,
@@ -28,6 +31,7 @@ from bench.methods.posterior import Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
+from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import touches_border
 from synth.job.types import MembraneState
@@ -52,6 +56,12 @@ class TissueConstants:
     quiet: float = 0.2  # least share of the frames, or of a breath, that shows the tissue's own motion
     unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
+    steeper: float = 1.2  # slope relative to the last, from which a frame may be solved by its own mechanics
+    solved: int = 4  # frames so solved, at most
+    linear: float = 14.4  # largest force over E [mm^2] in the linear range: P = 0.4 of a contact of 6 mm
+    unsolved: tuple[float, float] = (0.8, 2.0)
+    """Gains of the linear force that hold what it may be where motion is large and not solved: those of nine
+    driven contacts of 75 to 260 mN were 0.93 to 1.6."""
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
 
 
@@ -68,6 +78,22 @@ class TissueWeights:
     assumed: bool  # whether that is a bound on what is not known, so that it may be 0
 
 
+@dataclass(frozen=True)
+class Gains:
+    """Factors of the linear force where motion is large, by that force: at both ends of what is not known."""
+
+    size: Floats  # (K,) mN/kPa, rising
+    low: Floats  # (K,)
+    high: Floats  # (K,)
+    unsolved: int = 0  # states whose mechanics found no solution, or with one camera
+
+    def at(self, size: float) -> tuple[float, float]:
+        return float(np.interp(size, self.size, self.low)), float(np.interp(size, self.size, self.high))
+
+
+NO_GAIN = Gains(np.zeros(1), np.ones(1), np.ones(1))
+
+
 class Physics:
     """A `Revising` method, see the module; without a force map its estimates are NaN until `revise`."""
 
@@ -81,6 +107,7 @@ class Physics:
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, still = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
+        self._large, self._gains = list[tuple[Observation, SeenMotion]](), NO_GAIN
         self._weights = TissueWeights(first, np.ones(1), still, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
@@ -98,6 +125,11 @@ class Physics:
         self._frames.append(observed)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
+        if frame.trusted and len(moved) == 3:
+            surface = large_motion.seen_motion(moved, spread, self._view.mask, GRID)
+            last = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
+            if surface.slope > max(large_motion.STEEP, last):
+                self._large.append((observed, surface))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
         if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
@@ -123,6 +155,10 @@ class Physics:
         else:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
+        self._gains = find_gains(self._scene, self._weights, self._large)
+        strongest = max(self._frames, key=lambda frame: frame.signal_mm)
+        if len(strongest.moved) == 2:
+            self._gains = find_monocular_gains(self._weights, strongest)
         self._contact_free = int(contact_free.sum())
         return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
 
@@ -141,14 +177,29 @@ class Physics:
             stated = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {stated}"
         return [describe(self._weights, self._scene), stated]
 
+    @property
+    def warnings(self) -> list[str]:
+        """What its result must not be taken for."""
+        if self._scene is None or not self._gains.unsolved:
+            return []
+        why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
+        what = "the surface is bent beyond the range of the linear inverse"
+        return [f"physics: {what}, {why}: its largest forces are out of range, their intervals wide"]
+
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        answer = infer(self._weights, frame)
+        linear = infer(self._weights, frame)
+        least, most = self._gains.at(float(np.linalg.norm(linear.force.mean)))
+        factor = float(np.sqrt(least * most))
+        answer = replace(linear, force=linear.force.times(factor), load=factor * linear.load)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
         low, high = size_interval(answer.force, gain, cameras)
+        low, high = low * least / factor, high * most / factor
         density = np.float32(young) * self._picture(answer) if picture else None
-        likely = answer.force.times(young).with_gain(TISSUES.gain)
+        likely = answer.force.times(young).with_gain(
+            float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
+        )
         return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely)
 
     def _picture(self, answer: Posterior) -> Field:
@@ -256,6 +307,41 @@ def infer(weights: TissueWeights, frame: Observation) -> Posterior:
         mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
         sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
     )
+
+
+def find_gains(
+    scene: MethodContext, weights: TissueWeights, large: Sequence[tuple[Observation, SeenMotion]]
+) -> Gains:
+    """Gains of frames with large motion, of rising slope, on the likeliest tissue; few of them are solved."""
+    tissue, radius = weights.tissues[0], np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
+    if tissue.edge == "free" and touches_border(scene.tissue) <= TISSUES.cut:
+        tissue = replace(tissue, edge="bonded")  # a wide opening, seen whole
+    rows, unsolved = [(0.0, 1.0, 1.0)], 0
+    for frame, motion in large[::-2][: TISSUES.solved]:
+        size = float(np.linalg.norm(infer(weights, frame).force.mean))
+        ends = TISSUES.unsolved
+        try:
+            if size > 0:
+                opening_mm = min(float(radius), large_motion.OPEN_MM)
+                forces = [
+                    large_motion.reaction(motion, tissue, opening_mm, a) for a in sorted(set(scene.alpha))
+                ]
+                sizes = [float(np.linalg.norm(force)) / size for force in forces]
+                ends = min(sizes), max(sizes)
+        except ExcessiveLoad:
+            pass
+        unsolved += ends == TISSUES.unsolved
+        rows.append((size, *ends))
+    return Gains(*np.array(sorted(rows)).T, unsolved)
+
+
+def find_monocular_gains(weights: TissueWeights, strongest: Observation) -> Gains:
+    """Gains with one camera, to which depth is hidden: what they may be where the linear force is large."""
+    size = float(np.linalg.norm(infer(weights, strongest).force.mean))
+    if size <= TISSUES.linear:
+        return NO_GAIN
+    low, high = TISSUES.unsolved
+    return Gains(np.array([0.0, TISSUES.linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
 
 
 @lru_cache(maxsize=1)

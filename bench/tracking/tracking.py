@@ -114,7 +114,8 @@ def track_recording(
         video = track.video
         mm_per_px = scale_mm_per_px * video.rest.shrink
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
-        scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
+        backend = name_motion(settings.backend)
+        scene = MethodContext(video.rest.tissue, mm_per_px, *known, backend, about.alpha)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         turning = SurfaceMotion(video.rest.tissue)
         free = ContactFreeSearch(video.rest.tissue, mm_per_px)

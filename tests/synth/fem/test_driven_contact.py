@@ -86,7 +86,7 @@ def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[t
     tets, surface = flat_block()
     way = np.array(scene["way"])
     length = float(np.linalg.norm(way))
-    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(10.0, 10.0))
+    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(2 * scene["radius"],) * 2)
     tissue = Tissue(1.0, scene["poisson"], "ogden", alpha=scene["alpha"])
     area = surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
