@@ -130,11 +130,22 @@ def pool(
 def init(
     recording: Annotated[Path, Argument(help="Recording folder; it may exist.")],
     protocol: Annotated[bool, Option("--protocol", help="Also write what to record: protocol.md.")] = False,
+    tissue: Annotated[
+        bool, Option("--tissue", help="Only propose a tissue.png for the video, to be edited.")
+    ] = False,
 ) -> None:
     """Writes a recording's meta.yaml with an explanation of every key."""
     from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
+    if tissue:
+        from bench.recording.propose_tissue import propose_tissue
+
+        mask, shown, doubt = propose_tissue(recording)
+        print(f"wrote {mask}: white on all tissue; edit it in any paint program. On the picture: {shown}")
+        if doubt:
+            typer.echo(f"warning: {doubt}", err=True)
+        return
     joins = protocol and (recording / "meta.yaml").exists()
     files = {} if joins else {"meta.yaml": commented()}
     if protocol:

@@ -35,7 +35,7 @@ from synth.system import checked_file
 from synth.system.checked_file import read_picture
 
 KINDS = ("plain", "membrane", "pulse", "two")
-_WORKER = Path(__file__).with_name("worker.py")
+_WORKER = Path(__file__).with_name("foreign_worker.py")
 _FIELD_MM, _SIDE, _TEXELS, _SIZE = 46.0, 220, 1200, (320, 240)
 _DISTANCE_MM, _BASE_MM, _SENSOR_HZ = 300.0, 24.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
