@@ -157,7 +157,8 @@ def _describe(
         out.notes.append(recording.describe_tool(len(out.decoded)))
     doubt = {name: getattr(method, "doubt", ()) for name, method in methods.items()}
     parts = {name: one.parts if isinstance(one, Fusion) else (name,) for name, one in methods.items()}
-    out.uncalibrated = {name for name in methods if any(doubt.get(part) for part in parts[name])}
+    # The interval of a fusion is calibrated with its network as it is, or there is none.
+    out.uncalibrated = {name for name, one in methods.items() if doubt[name] and not isinstance(one, Fusion)}
     leading = parts.get(pictured, ())
     out.doubt = [Finding("warning", part, note) for part in leading for note in doubt.get(part, ())]
     for name, method in methods.items():
@@ -197,6 +198,7 @@ class _Forces:
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: Map | None = None
+        self.motion_mm: list[float] = []  # mean length of the flow over the tissue
         self.stride, self.cameras = 1, 1
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
@@ -216,6 +218,8 @@ class _Forces:
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
             speed = float(lengths.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
+        length = float(np.linalg.norm(frame.flow[inside].astype(np.float64), axis=1).mean())
+        self.motion_mm.append(length * scene.scale_mm_per_px)
         out.confidence.append(float(frame.confidence[inside].mean()))
         out.trusted.append(frame.trusted)
         out.speed.append(speed)
@@ -252,6 +256,9 @@ class _Forces:
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
+                    about_video = np.array(self.motion_mm)[trusted], _stated_share(recording, self.scene)
+                    network = getattr(self.methods[method.parts[0]], "identity", "")
+                    fused = method.bound(fused, tracked, self.scene, self.cameras, *about_video, network)
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate
                 for frame in self.estimates:
@@ -269,6 +276,13 @@ class _Forces:
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2
+
+
+def _stated_share(recording: Recording, scene: MethodContext) -> float:
+    """Share of tissue, instruments, membrane and rest (or ex vivo) that a recording states."""
+    rests = recording.meta.sensor.free_s or recording.meta.pulse.free_s or not scene.living
+    stated = recording.tissue is not None, bool(recording.masks), scene.membrane != "unknown", bool(rests)
+    return sum(stated) / len(stated)
 
 
 def _ratio(width: int) -> float:
