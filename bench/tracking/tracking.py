@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.force_fusion import Fusion
+from bench.methods.force_interval import VideoEstimates
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.footage import as_footage
 from bench.recording.recording_folder import Recording
@@ -76,6 +77,8 @@ class TrackedRecording:
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
     stereo: StereoQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
+    evidence: VideoEstimates | None = None  # from which the interval of the leading fusion is computed
+    stated: tuple[bool, ...] = (False,) * 4  # tissue, instruments, membrane, rest or ex vivo
     pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
 
 
@@ -256,9 +259,11 @@ class _Forces:
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
-                    about_video = np.array(self.motion_mm)[trusted], _stated_share(recording, self.scene)
+                    self.out.stated = _find_stated(recording, self.scene)
+                    stated, moved = float(np.mean(self.out.stated)), np.array(self.motion_mm)[trusted]
                     network = getattr(self.methods[method.parts[0]], "identity", "")
-                    fused = method.bound(fused, tracked, self.scene, self.cameras, *about_video, network)
+                    fused = method.bound(fused, tracked, self.scene, self.cameras, moved, stated, network)
+                    self.out.evidence = method.video
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate
                 for frame in self.estimates:
@@ -278,11 +283,10 @@ class _Forces:
             self.stride *= 2
 
 
-def _stated_share(recording: Recording, scene: MethodContext) -> float:
-    """Share of tissue, instruments, membrane and rest (or ex vivo) that a recording states."""
+def _find_stated(recording: Recording, scene: MethodContext) -> tuple[bool, ...]:
+    """Whether a recording states tissue, instruments, membrane, and rest or that it is ex vivo."""
     rests = recording.meta.sensor.free_s or recording.meta.pulse.free_s or not scene.living
-    stated = recording.tissue is not None, bool(recording.masks), scene.membrane != "unknown", bool(rests)
-    return sum(stated) / len(stated)
+    return recording.tissue is not None, bool(recording.masks), scene.membrane != "unknown", bool(rests)
 
 
 def _ratio(width: int) -> float:
