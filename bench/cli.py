@@ -126,6 +126,23 @@ def pool(
     print(json_.dumps(tree) if json else out / "README.md")
 
 
+@app.command(epilog="Example: bench report monday/* --out monday-report")
+def report(
+    recordings: Annotated[list[Path], Argument(help="Recording folders.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the page, and a report of each.")],
+    json: Json = False,
+) -> None:
+    """Scores several recordings by the pretrained networks: one page, pooled scores, a report of each."""
+    from threadpoolctl import threadpool_limits
+
+    from bench.scoring.session_report import PAGE, report_recordings
+    from learn.training.threads import choose_threads
+
+    threadpool_limits(choose_threads())
+    rows = report_recordings(recordings, out, shlex.join(["bench", *sys.argv[1:]]))
+    print(json_.dumps(rows) if json else out / PAGE)
+
+
 @app.command(epilog="Example: bench init recording")
 def init(
     recording: Annotated[Path, Argument(help="Recording folder; it may exist.")],
