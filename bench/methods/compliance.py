@@ -33,7 +33,7 @@ TO_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 OPENING_MM = 12.0
 """Radius of the opening in the skull, a job's default."""
-_DOME_MM = 70.0  # radius of curvature of the surface, likewise
+DOME_MM = 70.0  # radius of curvature of the surface, likewise
 _OPEN_MM = 40.0  # radius of an opening without skull near
 # By hand; docs/results/fem/pareto has what elements cost and err.
 _POINT_MM = 1.0  # spacing of the points, which reach to the opening's edge
@@ -193,13 +193,13 @@ def _motion(embedding: Embedding, window: Ints) -> Floats:
 
 def _mesh(tets: int, edge: Edge) -> Tets:
     if edge == "free":
-        return tetrahedra.block(tets, [(0.0, 0.0, OPENING_MM)], opening_mm=_OPEN_MM, dome_mm=_DOME_MM)
-    return tetrahedra.block(tets, opening_mm=OPENING_MM, dome_mm=_DOME_MM, slips=edge == "slipping")
+        return tetrahedra.block(tets, [(0.0, 0.0, OPENING_MM)], opening_mm=_OPEN_MM, dome_mm=DOME_MM)
+    return tetrahedra.block(tets, opening_mm=OPENING_MM, dome_mm=DOME_MM, slips=edge == "slipping")
 
 
 def _embed(volume: Tets, xy: Floats) -> Embedding:
     world = xy * np.array([1.0, -1.0])
-    return surface_embedding.embed(volume, np.column_stack([world, tetrahedra.dome(world, _DOME_MM)]))
+    return surface_embedding.embed(volume, np.column_stack([world, tetrahedra.dome(world, DOME_MM)]))
 
 
 def _disc(spacing_mm: float, radius_mm: float) -> Floats:

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.ndimage import gaussian_filter
 
-from bench.methods.compliance import TO_CAMERA, Edge, TissueKind
+from bench.methods.compliance import DOME_MM, TO_CAMERA, Edge, TissueKind
 from learn.data.grid import Grid
 from synth.arrays import Floats, Map
 from synth.fem import surface_embedding
@@ -30,7 +30,6 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import assemble
-from synth.job import schema
 
 STEEP = 0.3
 """Slope of the motion, mm per mm and after smoothing, beyond which it is large."""
@@ -121,9 +120,8 @@ _LEAST_STRETCH = 1.001  # of a membrane at rest: a slack one has no stiffness ac
 def _block(edge: Edge, opening_mm: float, count: int, points: bytes) -> tuple[Tets, Embedding]:
     """The block and the embedding of points (P, 2) mm in its surface."""
     radius = OPEN_MM if edge == "free" else opening_mm
-    anatomy = schema.AnatomySection(craniotomy=schema.CraniotomySection(radius_mm=radius))
     focus = [(0.0, 0.0, opening_mm)] if edge == "free" else []
-    volume = tetrahedra.block(anatomy, _TETS, focus, slips=edge == "slipping")
+    volume = tetrahedra.block(_TETS, focus, opening_mm=radius, dome_mm=DOME_MM, slips=edge == "slipping")
     world = np.frombuffer(points).reshape(count, 2) * [1.0, -1.0]
-    places = np.column_stack([world, tetrahedra.dome(world, anatomy.dome_mm)])
+    places = np.column_stack([world, tetrahedra.dome(world, DOME_MM)])
     return volume, surface_embedding.embed(volume, places)
