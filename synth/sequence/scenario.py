@@ -27,6 +27,7 @@ from synth.render.camera.camera import CameraView
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
+from synth.render.finish_maps import RING
 from synth.render.idle import IdleInstrument
 from synth.render.randomized.surroundings import Randomization
 
@@ -325,7 +326,7 @@ def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
         place = gesture.point_mm + slid * np.asarray(gesture.path_mm)
         tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + away * gesture.shaft
         shapes += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
-    rings = np.concatenate(shapes).reshape(-1, instrument.RING, 3)[::_RINGS]
+    rings = np.concatenate(shapes).reshape(-1, RING, 3)[::_RINGS]
     middles = rings.mean(axis=1)
     return middles, np.linalg.norm(rings - middles[:, None], axis=2).max(axis=1)
 
