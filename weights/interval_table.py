@@ -23,6 +23,7 @@ from bench.methods import force_interval
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
 from bench.methods.force_fusion import Fusion
 from bench.methods.force_interval import CameraModel, IntervalTable, VideoEstimates, describe
+from bench.methods.method_interface import Method
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from bench.recording import recording_scale, recording_writer
@@ -112,7 +113,7 @@ class Example:
     @property
     def features(self) -> Floats:
         """(n, F) of the used frames."""
-        return describe(self.video)[self.used]
+        return np.asarray(describe(self.video)[self.used])
 
 
 def intervals(
@@ -202,7 +203,7 @@ def _score(work: Path, source: Path, make: str, stated: Tree | None, cameras: in
         (folder / "right.mp4").unlink(missing_ok=True)
     recording_writer.write_meta(folder, meta | (stated or {}))
     fusion = Fusion(MAIN, PHYSICS)
-    methods = {FUSION: fusion, MAIN: Model(choose_model(cameras == 2)), PHYSICS: Physics()}
+    methods: dict[str, Method] = {FUSION: fusion, MAIN: Model(choose_model(cameras == 2)), PHYSICS: Physics()}
     recording = open_recording(folder)
     scale = recording_scale.find_scale(recording.meta, folder)
     arrays: dict[str, Any] = {"make": make, "recording": source.name}
@@ -226,12 +227,18 @@ def read_examples(folder: Path) -> list[Example]:
         with np.load(file) as stored:
             if "true_mn" not in stored:
                 continue
-            names = "leading_mn", "network_mn", "physics_mn", "spread_mn", "motion_mm"
-            about = int(stored["cameras"]), float(stored["stated"])
-            video = VideoEstimates(*(stored[name] for name in names), *about)
-            one = Example(str(stored["make"]), str(stored["recording"]), video, stored["true_mn"])
-            if one.used.sum() >= _LEAST_FRAMES:
-                examples.append(one)
+            video = VideoEstimates(
+                leading_mn=stored["leading_mn"],
+                network_mn=stored["network_mn"],
+                physics_mn=stored["physics_mn"],
+                spread_mn=stored["spread_mn"],
+                motion_mm=stored["motion_mm"],
+                cameras=int(stored["cameras"]),
+                stated=float(stored["stated"]),
+            )
+            example = Example(str(stored["make"]), str(stored["recording"]), video, stored["true_mn"])
+            if example.used.sum() >= _LEAST_FRAMES:
+                examples.append(example)
     return examples
 
 
@@ -285,8 +292,8 @@ def _fit_model(examples: Sequence[Example]) -> CameraModel:
     model = fit_error_model(features[:, used], np.abs(error), frames, _LEAST_ERROR, _RIDGE * len(error))
     slopes = np.zeros(features.shape[1])
     slopes[used] = model.slopes
-    ends = (tuple(end(axis=0).tolist()) for end in (features.min, features.max))
-    model = ErrorModel(model.intercept, tuple(slopes.tolist()), *ends, model.least)
+    lowest, highest = tuple(features.min(axis=0).tolist()), tuple(features.max(axis=0).tolist())
+    model = ErrorModel(model.intercept, tuple(slopes.tolist()), lowest, highest, model.least)
     count = sum(map(len, recordings.values()))
     # The new recording is one more of as many; of few, their own quantile has to do.
     known = count / (count + 1) if count >= _GUARANTEED else 1.0
