@@ -72,7 +72,7 @@ def is_silent(row: Mapping[str, Any]) -> bool:
 
 def is_vague(row: Mapping[str, Any]) -> bool:
     """Whether a force is stated with an interval that is wider than the peak."""
-    return row["width"] is not None and row["width"] > _VAGUE
+    return row.get("width") is not None and row["width"] > _VAGUE
 
 
 def count_caught(points: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
@@ -191,10 +191,10 @@ def page(found: Mapping[str, Any]) -> report.Page:
     ways = len(report.grouped(points, "change"))
     verdict = f"**In {len(silent)} of {len(points)} recordings, degraded in {ways} ways, {_VERDICT}"
     caught, faults = count_caught(points)
-    stated_rows = [row for row in points if row["width"] is not None]
-    vague = sum(map(is_vague, stated_rows))
-    verdict += f" Named or held back in every recording: {caught} of {faults} faults. Of {len(stated_rows)} "
-    verdict += f"stated forces {vague} have an interval wider than the peak."
+    verdict += f" Named or held back in every recording: {caught} of {faults} faults."
+    if stated_rows := [row for row in points if row.get("width") is not None]:
+        vague = sum(map(is_vague, stated_rows))
+        verdict += f" Of {len(stated_rows)} stated forces {vague} have an interval wider than the peak."
     others = [f"*{outcome}*: {'; '.join(some)}." for outcome, some in names.items()]
     sections = [
         report.Section("Wrong without its cause", table),

@@ -16,7 +16,7 @@ _OWN = {
     "tapvid": "tapvid:write_tracks",
     "flow-pairs": "flow_pairs:write_pairs",
     "hdf5": "plain:write_hdf5",
-    "d2fnet-npz": "d2fnet:write_npz",
+    "d2fnet-npz": "d2fnet_layout:write_npz",
     "vtu": "vtu:write_meshes",
 }
 _PLACES = {name: f"synth.publish.export.{place}" for name, place in _OWN.items()}
