@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import UserError, as_user_error
+from synth.job.mechanics_sections import LARGEST_MESH, is_mesh_name
 from synth.job.schema import Job, MechanicsSection, table_of
 from synth.system import camera_file, checked_file
 
@@ -45,10 +46,36 @@ def identify_job(job: Job) -> str:
     del described["sequences"], described["card"]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
+    for at in find_meshes(described):
+        place: Any = described
+        for step in at[:-1]:
+            place = place[step]
+        file = Path(place[at[-1]])
+        place[at[-1]] = [file.name, _digest_file(file, LARGEST_MESH)]
     if job.mechanics.source is not None:
         files = list_files(job.mechanics)
         described["mechanics"]["source"] = [_digest_file(file, LARGEST_STATE) for file in files]
     return digest(described)
+
+
+def find_meshes(values: dict[str, Any]) -> list[tuple[str | int, ...]]:
+    """Places of the files of instruments in a job's values, as read or as dumped."""
+    found, fem = list[tuple[str | int, ...]](), values.get("fem")
+    if not isinstance(fem, dict):
+        return found
+    tools, lines = fem.get("instrument"), fem.get("instrument_list")
+    each: list[tuple[tuple[str | int, ...], Any]] = [(("fem", "instrument"), tools)]
+    if isinstance(tools, list | tuple):
+        each = [(("fem", "instrument", k), tool) for k, tool in enumerate(tools)]
+    for k, line in enumerate(lines if isinstance(lines, list | tuple) else ()):
+        if isinstance(line, dict):
+            each.append((("fem", "instrument_list", k, "instrument"), line.get("instrument")))
+    for at, tool in each:
+        if is_mesh_name(tool):
+            found.append(at)
+        elif isinstance(tool, dict) and isinstance(tool.get("file"), str):
+            found.append((*at, "file"))
+    return found
 
 
 def list_sources(mechanics: MechanicsSection) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape
 from synth.job.schema import Job
-from synth.render import finish, instrument
+from synth.render import finish, instrument, own_instrument
 from synth.render.anatomy import noise, rim, texture
 from synth.render.anatomy.rim import Rim
 from synth.render.anatomy.surface import CortexSurface, resized
@@ -89,12 +89,12 @@ def craniotomy(
     if "retractor" in appearance.scenery and how.surroundings is None:
         static.append(_retractor(how.scale * around.edge, theatre, ground, appearance.rim_seed))
     hand = np.random.default_rng([appearance.rim_seed, 2])
-    strength = job.randomize.get("instruments", 0.0)
+    strength, own = job.randomize.get("instruments", 0.0), own_instrument.read_own_instruments(job.fem)
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(drawn, theatre, hand, strength, idle, ground),
+        instruments=instrument.build(drawn, theatre, hand, strength, idle, ground, own),
         spot=appearance.light.even,
     )
 

@@ -5,9 +5,10 @@ Sizes in mm are those of common neurosurgical instruments, chosen by eye, not fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -36,12 +37,32 @@ class Part:
     profile: Floats  # (V, 3) mm
     side: int  # tip of the instrument that it follows: 1, -1; 0: their middle
     rows: int = 0  # of a sheet of cloth; 0: closed rings
+    faces: Indices | None = None  # of a mesh of one's own; None: a grid's
+
+    @property
+    def columns(self) -> int:
+        """Vertices of each ring as `finish.reflectance` takes it; 1 of a mesh without rings."""
+        return 0 if self.rows else RING if self.faces is None else 1
 
     @property
     def shape(self) -> Shape:
+        if self.faces is not None:
+            return Shape(self.profile, self.faces)
         rows = self.rows or len(self.profile) // RING
         faces = grid_faces(rows, len(self.profile) // rows, "" if self.rows else "columns")
         return Shape(self.profile, faces.reshape(-1, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMesh:
+    """An instrument of one's own; see `own_instrument`."""
+
+    part: Part
+    half: float  # half the width of its tip, mm
+    outline: Part  # rings around it, for its distance from other instruments
+
+
+NO_OWN: Mapping[str, OwnMesh] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -97,11 +118,16 @@ def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
     return placed
 
 
-def shape_of(kind: str, footprint_mm: float, size: float = 1.0) -> tuple[tuple[Part, ...], float]:
+def shape_of(
+    kind: str, footprint_mm: float, size: float = 1.0, own: Mapping[str, OwnMesh] = NO_OWN
+) -> tuple[tuple[Part, ...], float]:
     """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip; both times
-    `size`."""
+    `size`. `own`: meshes of further kinds, which have the size of their files."""
     if kind == "none":
         return (), 0.0
+    if kind in own:
+        part = own[kind].part
+        return (replace(part, profile=size * part.profile),), size * own[kind].half
     make, share, least, most = SHAPES[kind]
     half = size * float(np.clip(share * footprint_mm, least, most))
     return make(half), half
@@ -114,14 +140,15 @@ def build(
     strength: float = 0.0,
     idle: Sequence[IdleInstrument] = (),
     ground: Floats = np.zeros((1, 3)),
+    own: Mapping[str, OwnMesh] = NO_OWN,
 ) -> InstrumentMesh | None:
     """Instruments in a theatre, with finishes drawn for each; None if there is none.
 
     `drawn`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
-    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on.
+    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `own`: as of `shape_of`.
     """
     sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
-    made = [shape_of(kind, a, size) for (kind, a), size in zip(drawn, sizes, strict=True)]
+    made = [shape_of(kind, a, size, own) for (kind, a), size in zip(drawn, sizes, strict=True)]
     made += [
         ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
         for one in idle
@@ -130,11 +157,11 @@ def build(
     if not any(parts):
         return None
     surfaces = list[Reflectance]()
-    for own, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
+    for each, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
         skin = finish.draw_finish(strength, rng, kind)
-        surfaces += [finish.reflectance(skin, part.profile, 0 if part.rows else RING, rng) for part in own]
+        surfaces += [finish.reflectance(skin, part.profile, part.columns, rng) for part in each]
     whole = Reflectance(*(np.concatenate(part) for part in zip(*surfaces, strict=True)))
-    faces = joined(*(part.shape for own in parts for part in own)).faces
+    faces = joined(*(part.shape for each in parts for part in each)).faces
     return InstrumentMesh(halves, parts, faces, whole, theatre)
 
 

@@ -96,7 +96,7 @@ class RestScene:
         idle = [("idle", one.kind, one.radius_mm) for one in self.scenario.idle]
         if self.series is None:
             return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures] + idle
-        kinds, radius = self.job.fem.instrument or ("probe",), self.job.fem.footprint_mm[0]
+        kinds, radius = self.job.fem.names or ("probe",), self.job.fem.footprint_mm[0]
         return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])] + idle
 
     @property

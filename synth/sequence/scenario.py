@@ -18,7 +18,7 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection
+from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection, name_of
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
@@ -31,6 +31,8 @@ from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
 from synth.render.idle import IdleInstrument, draw_idle
+from synth.render.instrument import OwnMesh
+from synth.render.own_instrument import read_own_instruments
 from synth.render.randomized.surroundings import Randomization
 from synth.sequence.randomization import draw_randomization, randomized, vary_appearance, vary_view
 
@@ -105,6 +107,7 @@ def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenar
     job = as_job(job)
     if index < 0:
         raise UserError(f"index {index}: sequences are numbered from 0")
+    read_own_instruments(job.fem)  # those that can't be drawn are refused before anything is computed
     job, how = randomized(job, index), draw_randomization(job, index)
     family = job.appearance.families[index % len(job.appearance.families)]
     generator = partial(_generator, job, _SEQUENCE, index)
@@ -200,7 +203,7 @@ def draw_gestures(
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 hides = trial.shaft @ sight > least and trial.instrument != "none"
-                if fits and not hides and all(_apart(trial, other) for other in found.values()):
+                if fits and not hides and all(_apart(trial, other, fem) for other in found.values()):
                     found[k] = trial
                     break
             else:
@@ -234,7 +237,7 @@ def draw_gesture(
     choices = fem.choices(given)
     kind = drawn if drawn in choices else list(choices)[int(own.integers(len(choices)))]
     tools = choices[kind]
-    tool = str(own.choice(list(tools), p=list(tools.values())))
+    tool = name_of(list(tools)[int(own.choice(len(tools), p=list(tools.values())))])
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
@@ -294,9 +297,10 @@ def draw_driven_gesture(
     kinds = [kind for kind in fem.gestures if kind in choices] or list(choices)
     kind = kinds[int(rng.integers(len(kinds)))]
     tools = choices[kind]
-    tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
-    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[tool])
-    if tool in _ROUND:
+    chosen = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
+    tool, sized = name_of(chosen), chosen if isinstance(chosen, str) else "none"
+    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[sized])
+    if sized in _ROUND:
         width = length
     elif kind in ("push", "tap"):
         length = min(length, _TIP_LENGTH * width)  # it presses with its end
@@ -351,19 +355,20 @@ def draw_driven_gesture(
     )
 
 
-def _apart(one: Gesture, other: Gesture) -> bool:
+def _apart(one: Gesture, other: Gesture, fem: FemSection) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
     if tool_gesture.clearance(one, other) < 0:
         return False
-    (here, wide), (there, broad) = _rings(one), _rings(other)
+    own = read_own_instruments(fem)
+    (here, wide), (there, broad) = (_rings(each, own.get(each.instrument)) for each in (one, other))
     gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
     return float(gap.min(initial=np.inf)) >= _APART_MM
 
 
 @lru_cache(maxsize=64)
-def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
+def _rings(gesture: Gesture, own: OwnMesh | None = None) -> tuple[Floats, Floats]:
     """Middles (N, 3) mm and radii (N,) mm of the instrument's rings before, at the start and at the end."""
-    parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
+    parts, _ = ((own.outline,), 0) if own else instrument.shape_of(gesture.instrument, gesture.footprint_mm)
     found = [np.zeros((0, 3))]
     for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
         place = gesture.point_mm + slid * np.asarray(gesture.path_mm)

@@ -27,7 +27,7 @@ def read_job_series(job: Job, index: int) -> MeshSeries:
     source = given.model_copy(update={"source": sources[index % len(sources)]})
     out, radius, fem = job.anatomy.craniotomy.direction, job.fem.footprint_mm[0], job.fem
     young = fem.young_kpa[0] if fem.young_kpa[0] == fem.young_kpa[1] else None
-    pulls = bool(_PULLING.intersection(fem.instrument))
+    pulls = bool(_PULLING.intersection(fem.names) or fem.own_instruments)
     return _read(source, radius, young, None if pulls else out, _state_of(source))
 
 
