@@ -198,7 +198,7 @@ class PulseSection(Section):
     """Amplitude of the respiratory motion [mm]."""
 
 
-_SINGLE = str | dict | OwnInstrument
+_SINGLE = (str, dict, OwnInstrument)
 _OneOrMore = BeforeValidator(lambda value: (value,) if isinstance(value, _SINGLE) else value)
 Skulls = Annotated[tuple[Literal["bonded", "slip"], ...], Field(min_length=1), _OneOrMore]
 
@@ -347,7 +347,7 @@ class FemSection(Section):
         named = self.instrument if one.instrument is None else (one.instrument,)
         found: dict[Kind, dict[Tool, float]] = {}
         for kind in self.gestures if one.gesture is None else (one.gesture,):
-            shares: dict[Tool, float] = dict(INSTRUMENTS[kind].items())
+            shares: dict[Tool, float] = {name: share for name, share in INSTRUMENTS[kind].items()}
             if named:
                 takes = {*shares, "none", *(() if kind == "grasp" else self.own_instruments.values())}
                 shares = {name: float(named.count(name)) for name in named if name in takes}
