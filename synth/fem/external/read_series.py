@@ -67,7 +67,7 @@ def doubt_load(series: MeshSeries, young_kpa: float | None) -> list[str]:
     if series.force is None or any(one.startswith("nodes") for one in series.cautions):
         return []  # nor of false motion
     motion = series.points, series.faces, series.displacement, series.force
-    return plausibility.find_load_doubts(*motion, young_kpa)
+    return plausibility.find_load_doubts(*motion, young_kpa) + plausibility.find_mirror_doubt(*motion)
 
 
 def read_series(

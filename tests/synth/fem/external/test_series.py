@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from synth.arrays import Floats, Ints
 from synth.errors import UserError
+from synth.fem.external import plausibility
 from synth.fem.external.plausibility import contact_radius, is_rigid
 from synth.fem.external.read_series import doubt_load, read_series
 from synth.fem.external.series import MeshSeries, Units
@@ -303,6 +304,8 @@ DOUBTFUL: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "y and z of the motion swapped": ("80 degrees", arrays(displacement=lambda u: u[..., [0, 2, 1]])),
     "load on other nodes": ("don't move", arrays(contact=lambda f: f[:, ::-1])),
     "load a state late": ("state 4", arrays(contact=lambda f: np.stack([0 * f[0], *f[:3], f[1]]))),
+    "x of the motion mirrored": ("mirrored", arrays(displacement=lambda u: u * [-1, 1, 1])),
+    "y of the motion mirrored": ("mirrored", arrays(displacement=lambda u: u * [1, -1, 1])),
     "ms taken for s": (r"over 400 s", arrays(times=lambda t: 1000 * t)),
     "s taken for ms": (r"over 0\.0004 s", arrays(times=lambda t: t / 1000)),
     "two nodes": (
@@ -323,6 +326,25 @@ def test_what_is_unlikely_of_tissue_is_said(what: str, tmp_path: Path) -> None:
     doubts = no_doubts(made(tmp_path))
     assert len([one for one in doubts if re.search(named, one)]) == 1
     assert not any("\n" in one for one in doubts)
+
+
+def press(states: int) -> tuple[Floats, Floats]:
+    """Displacement (S, N, 3) of a press that grows, moves sideways, holds and ends, and its times [s]."""
+    time = np.linspace(0, 1, states)
+    size = np.interp(time, [0.1, 0.4, 0.6, 0.9], [0, 1, 1, 0])
+    size = size**2 * (3 - 2 * size)
+    aside = np.roll(solve().u, 1, axis=1)
+    return size[:, None, None] * (solve().u + 0.3 * time[:, None, None] * aside), time
+
+
+@pytest.mark.parametrize("states", [6, 8, 12, 30])
+def test_two_states_that_changed_places_are_named(states: int) -> None:
+    u, time = press(states)
+    assert plausibility.find_exchanged_states(u, time) == []
+    one, other = states // 4, states // 2
+    u[[one, other]] = u[[other, one]]
+    (doubt,) = plausibility.find_exchanged_states(u, time)
+    assert f"states {one} and {other} " in doubt
 
 
 @pytest.mark.parametrize("form", FORMS)
