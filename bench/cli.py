@@ -126,15 +126,43 @@ def pool(
     print(json_.dumps(tree) if json else out / "README.md")
 
 
+@app.command(epilog="Example: bench report monday/* --out monday-report")
+def report(
+    recordings: Annotated[list[Path], Argument(help="Recording folders.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the page, and a report of each.")],
+    json: Json = False,
+) -> None:
+    """Scores several recordings by the pretrained networks: one page, pooled scores, a report of each."""
+    from threadpoolctl import threadpool_limits
+
+    from bench.scoring.session_report import PAGE, report_recordings
+    from learn.training.threads import choose_threads
+
+    threadpool_limits(choose_threads())
+    rows = report_recordings(recordings, out, shlex.join(["bench", *sys.argv[1:]]))
+    print(json_.dumps(rows) if json else out / PAGE)
+
+
 @app.command(epilog="Example: bench init recording")
 def init(
     recording: Annotated[Path, Argument(help="Recording folder; it may exist.")],
     protocol: Annotated[bool, Option("--protocol", help="Also write what to record: protocol.md.")] = False,
+    tissue: Annotated[
+        bool, Option("--tissue", help="Only propose a tissue.png for the video, to be edited.")
+    ] = False,
 ) -> None:
     """Writes a recording's meta.yaml with an explanation of every key."""
     from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
+    if tissue:
+        from bench.recording.propose_tissue import propose_tissue
+
+        mask, shown, doubt = propose_tissue(recording)
+        print(f"wrote {mask}: white on all tissue; edit it in any paint program. On the picture: {shown}")
+        if doubt:
+            typer.echo(f"warning: {doubt}", err=True)
+        return
     joins = protocol and (recording / "meta.yaml").exists()
     files = {} if joins else {"meta.yaml": commented()}
     if protocol:

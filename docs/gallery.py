@@ -10,10 +10,9 @@ import numpy as np
 from synth.arrays import Pixels
 from synth.job.reader import load_job
 from synth.job.schema import Family, Job
-from synth.publish.contact_sheet import poised
+from synth.publish.contact_sheet import pose_touching
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
-from synth.sequence import scenario
 from synth.sequence.rest_scene import RestScene, at_rest
 from synth.tune.search import changed
 
@@ -43,7 +42,7 @@ _SCENERY: dict[str, str] = {
     "bone": "forceps",
     "drape": "dissector",
     "retractor": "bayonet",
-    "bone, drape": "suction",
+    "bone, drape, clips": "suction",
 }
 _CAPTION_PX = 24
 
@@ -77,14 +76,15 @@ def draw(out: Path = Path(__file__).parent, seed: int = 7, width: int = 640, qua
 
 def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, caption: str) -> Pixels:
     """One frame before its load, below its caption."""
-    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000}
+    usual = {"render.size": size, "render.spp": 16, "anatomy.vertices": 20_000, "render.scenery": ()}
     job = changed(
         Job(seed=seed), usual | {"fem.gestures": (_GESTURES[kind],), "fem.instrument": (kind,)} | settings
     )
     rest = at_rest(job)
     case = rest.scenario
     appearance = replace(case.appearance, scenery=job.render.scenery)
-    shot = _ready(replace(rest, scenario=replace(case, appearance=appearance, gestures=case.gestures[:1])))
+    case = replace(case, appearance=appearance, gestures=case.gestures[:1])
+    shot = _ready(replace(rest, draw=replace(rest.draw, scenario=case)))
     band = np.full((_CAPTION_PX, size[0], 3), 255, np.uint8)
     cv2.putText(band, caption, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([band, shot])
@@ -93,10 +93,9 @@ def _tile(settings: Settings, kind: str, size: tuple[int, int], seed: int, capti
 def _ready(scene: RestScene) -> Pixels:
     """The picture of a scene whose instruments touch the tissue."""
     case, surface = scene.scenario, scene.surface
-    ends, shafts = zip(*(poised(gesture, surface) for gesture in case.gestures), strict=True)
+    ends, shafts = zip(*(pose_touching(gesture, surface) for gesture in case.gestures), strict=True)
     poses = with_idle(case.idle, 0.0, np.concatenate(ends), np.concatenate(shafts))
-    seed = scenario.frame_seeds(scene.job, scene.index)[0]
-    return scene.renderer.render(SceneState(surface.vertices, *poses), seed).rgb
+    return scene.renderer.render(SceneState(surface.vertices, *poses), scene.draw.frame_seeds[0]).rgb
 
 
 def _save(file: Path, rows: list[list[Pixels]], quality: int) -> None:

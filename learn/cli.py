@@ -81,7 +81,7 @@ def train_command(
     settings = change_preset(preset, given)
     begin = read_model(find_model(start)) if start else None
     with made_folder(out, disk_needed(out, settings)):
-        clips, split = _divided([dataset, *(also or [])], labels or [], settings, cache)
+        clips, split = _divide([dataset, *(also or [])], labels or [], settings, cache)
         log = (lambda numbers: None) if json else _log
         with counting("Training") as progress:
             card = train(clips, split, settings, out, start=begin, device=device, report=progress, log=log)
@@ -117,13 +117,13 @@ def _read(datasets: Iterable[Path], grid: Grid, wanted: Sequence[str], cache: Pa
     from learn.data.clips import load_clips
 
     clips: list[Clip] = []
-    for one in datasets:
+    for dataset in datasets:
         with counting("Reading sequences") as progress:
-            clips += load_clips(one, grid, wanted, cache=cache, report=progress)
+            clips += load_clips(dataset, grid, wanted, cache=cache, report=progress)
     return clips
 
 
-def _divided(
+def _divide(
     datasets: Sequence[Path], labels: Sequence[Path], settings: TrainingSettings, cache: Path | None
 ) -> tuple[list[Clip], Split]:
     """The sequences of datasets and of those for labels, and what each is for."""
@@ -142,8 +142,9 @@ def _divided(
     return clips, split
 
 
-def _describe(found: Intervals) -> str:
-    return f"Intervals from {found.sequences} sequences of {found.units} brains, for {found.source} motion."
+def _describe(intervals: Intervals) -> str:
+    basis = f"{intervals.sequences} sequences of {intervals.units} brains"
+    return f"Intervals from {basis}, for {intervals.source} motion."
 
 
 def _log(numbers: Mapping[str, float]) -> None:
@@ -175,22 +176,22 @@ def eval_command(
     from learn.training.threads import choose_threads
 
     predictor = load_model(model, threads=choose_threads(threads))
-    source = predictor.readable(input or scored_source(predictor.card.settings.input))
+    source = predictor.check_source(input or scored_source(predictor.card.settings.input))
     clips = _read([dataset], predictor.grid, (source,), cache)
     if find_unit(predictor.card) != "anatomy":
         _console.print("Training and test share brains: these scores don't apply to other brains.")
     chosen = choose_unseen(clips, dataset, predictor.card, _console.print)
     recovered_by = {clip.recovered_by if source in RECOVERED else "" for clip in chosen}
-    for note in {note for one in recovered_by for note in predictor.card.doubt(one)}:
+    for note in {note for source in recovered_by for note in predictor.card.doubt(source)}:
         _note(note)
     with counting("Evaluating") as progress:
         report = evaluate(predictor, chosen, source, progress)
     covered = cover(predictor, chosen, source) if predictor.card.intervals and (all or json) else []
     if json:
-        found = {"model": str(model), "input": source, **report.as_dict()}
+        printed = {"model": str(model), "input": source, **report.as_dict()}
         if covered:
-            found["coverage"] = [one.as_dict() for one in covered]
-        print(json_.dumps(found))
+            printed["coverage"] = [coverage.as_dict() for coverage in covered]
+        print(json_.dumps(printed))
         return
     screen = Console(markup=False)  # "[mN]" is a unit
     title = f"{len(chosen)} unseen sequences, {source} flow; mean over sequences"
@@ -239,19 +240,20 @@ def predict_command(
     kind, files = read_choice(masks)
     settings = RecordingFlowSettings(flow, shrink, rate or None, pulse, kind)
     options = VideoOptions(read_scale(scale), tissue, settings, files)
-    found = []
+    predicted = []
     opened = open_source(source, named, options, input, choose_threads(threads))
-    for one in predict_files(*opened, source, out, young, membrane, overlay):
-        found.append(one)
+    for file in predict_files(*opened, source, out, young, membrane, overlay):
+        predicted.append(file)
         if not json:
-            for note in one.notes:
-                _note(f"{one.name}: {note}")
-            what = "no frame has a force" if one.peak_mn is None else f"peak force {one.peak_mn:.3g} mN"
-            _console.print(f"{one.name}: {one.frames} frames, {what}")
+            for note in file.notes:
+                _note(f"{file.name}: {note}")
+            what = "no frame has a force" if file.peak_mn is None else f"peak force {file.peak_mn:.3g} mN"
+            _console.print(f"{file.name}: {file.frames} frames, {what}")
     if json:
-        notes, peaks = {one.name: one.notes for one in found}, {one.name: one.peak_mn for one in found}
+        notes = {file.name: file.notes for file in predicted}
+        peaks = {file.name: file.peak_mn for file in predicted}
         print(json_.dumps({"out": str(out), "notes": notes, "peak_force_mn": peaks}))
-    if all(one.peak_mn is None for one in found):
+    if all(file.peak_mn is None for file in predicted):
         raise typer.Exit(2)
 
 
@@ -269,10 +271,10 @@ def calibrate_command(
     from learn.inference.video_motion import motions
     from learn.training.threads import choose_threads
 
-    if wrong := [one for one in data if one.suffix not in (".npz", ".zarr")]:
+    if wrong := [path for path in data if path.suffix not in (".npz", ".zarr")]:
         raise UserError(f"{wrong[0]}: not a press (.zarr or .npz); intervals are fitted by `learn train`")
     predictor = load_model(model, threads=choose_threads(threads))
-    presses = [motion for one in data for motion in motions(one, predictor.stored(input))]
+    presses = [motion for path in data for motion in motions(path, predictor.choose_source(input))]
     young = {press.name: calibrate(predictor, press) for press in presses}
     if json:
         print(json_.dumps({"young_kpa": young}))
@@ -301,16 +303,16 @@ def models_command(json: Json = False) -> None:
     from learn.inference.shipped_networks import LICENCE, MODELS, NAMES, describe, hash_data
     from synth.system.checked_file import folder_bytes
 
-    found = {name: (MODELS / name, read_card(MODELS / name)) for name in NAMES}
+    cards = {name: (MODELS / name, read_card(MODELS / name)) for name in NAMES}
     if json:
         rows = [
             {"name": name, "folder": str(folder), "bytes": folder_bytes(folder), "data": hash_data(card)}
             | {"licence": LICENCE}
             | {"cameras": 2 if card.settings.arch.depth else 1, "select_r2": card.score}
-            for name, (folder, card) in found.items()
+            for name, (folder, card) in cards.items()
         ]
         print(json_.dumps(rows))
         return
-    for name, (folder, card) in found.items():
+    for name, (folder, card) in cards.items():
         print(f"{name}: {describe(card)}, {folder_bytes(folder) / 1e6:.1f} MB ({folder / 'README.md'})")
     print(f"licence of the weights: {LICENCE}")

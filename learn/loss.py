@@ -42,7 +42,7 @@ class Frames:
     spread: float  # mN/mm²
     progress: float = 1.0  # point 0..1 of the run
 
-    def squared(self) -> Tensor:
+    def square_errors(self) -> Tensor:
         """Squared error of each cell over `spread`, summed over components, (B, 1, N, N)."""
         return ((self.prediction - self.target) / self.spread * self.mask).square().sum(1, keepdim=True)
 
@@ -53,12 +53,14 @@ class Frames:
 
 def mse(frames: Frames) -> Tensor:
     """Squared error."""
-    return frames.mean(frames.squared(), frames.prediction.shape[1])
+    return frames.mean(frames.square_errors(), frames.prediction.shape[1])
 
 
 def mse_frame(frames: Frames) -> Tensor:
     """Squared error and 1 − R² of each frame, in equal parts."""
-    by_frame = unexplained(frames.prediction, frames.target, frames.mask, frames.spread, by_frame=True)
+    by_frame = measure_unexplained(
+        frames.prediction, frames.target, frames.mask, frames.spread, by_frame=True
+    )
     return 0.5 * mse(frames) + 0.5 * by_frame
 
 
@@ -67,9 +69,11 @@ def antighost(frames: Frames) -> Tensor:
     three tenths of 1 − R² of the batch."""
     true = _length(frames.target)
     over_predicted = (true < LOW * frames.unit) & (_length(frames.prediction.detach()) > true)
-    weighed = frames.squared() * (1 + (FALSE_POSITIVE - 1) * over_predicted)
+    weighed = frames.square_errors() * (1 + (FALSE_POSITIVE - 1) * over_predicted)
     error = frames.mean(weighed, frames.prediction.shape[1])
-    return 0.7 * error + 0.3 * unexplained(frames.prediction, frames.target, frames.mask, frames.spread)
+    return 0.7 * error + 0.3 * measure_unexplained(
+        frames.prediction, frames.target, frames.mask, frames.spread
+    )
 
 
 def off_target(frames: Frames) -> Tensor:
@@ -98,7 +102,7 @@ LOSSES = {
 """All losses by their names in the settings of a training."""
 
 
-def full(name: str, progress: float) -> bool:
+def is_full(name: str, progress: float) -> bool:
     """Whether a loss has its full weights at a point 0..1 of the run."""
     return progress >= LOSSES[name].full_from
 
@@ -121,7 +125,7 @@ def loss(
     return LOSSES[name].of(Frames(prediction, target, mask, unit, spread, progress))
 
 
-def unexplained(
+def measure_unexplained(
     prediction: Tensor, target: Tensor, mask: Tensor, spread: float, *, by_frame: bool = False
 ) -> Tensor:
     """1 − R² = SSE/SST over the batch's masked cells, each component about its own mean.

@@ -44,25 +44,30 @@ def divide(
     test) are used. `seed`: of `keep_back`. UserError for too few groups to split, or an empty fit or select
     part.
     """
-    splits, where = [read_split(one) for one in datasets], " ".join(map(str, datasets))
-    if shared := {one.by == "opening" for one in splits if one.share_anatomy}:
+    splits, where = [read_split(dataset) for dataset in datasets], " ".join(map(str, datasets))
+    if shared := {dataset_split.by == "opening" for dataset_split in splits if dataset_split.share_anatomy}:
         clips = regroup(clips, "opening" if shared == {True} else "sequence")
         note("Brains may be on several sides of the split: scores don't apply to other brains.")
     names = [clip.content_hash for clip in clips]
-    DatasetSplit(sides={k: v for one in splits for k, v in one.sides.items()}).find(names, where)
-    own = [{SIDES.index(one.sides[name]) for one in splits if name in one.sides} for name in names]
+    DatasetSplit(sides={k: v for dataset_split in splits for k, v in dataset_split.sides.items()}).find(
+        names, where
+    )
+    sides = [
+        {SIDES.index(dataset_split.sides[name]) for dataset_split in splits if name in dataset_split.sides}
+        for name in names
+    ]
     number, last = groups(clips), dict[int, int]()
-    for group, found in zip(number, own, strict=True):
-        last[group] = max(last.get(group, 0), *found)
+    for group, group_sides in zip(number, sides, strict=True):
+        last[group] = max(last.get(group, 0), *group_sides)
     fit, select, test = (
-        tuple(k for k, group in enumerate(number) if own[k] == {part} == {last[group]}) for part in range(3)
+        tuple(k for k, group in enumerate(number) if sides[k] == {part} == {last[group]}) for part in range(3)
     )
     if left := len(clips) - len(fit) - len(select) - len(test):
         note(f"{left} sequences are left out: another dataset has their brain on another side.")
     for side, part in zip(SIDES, (fit, select), strict=False):
         if not part:
             raise UserError(f"{where}: the {side} side is empty; change it with `synth split --shares`")
-    split = Split(fit, select, test, hashes=tuple(one.hash for one in splits))
+    split = Split(fit, select, test, hashes=tuple(dataset_split.hash for dataset_split in splits))
     return clips, keep_back(clips, split, seed)
 
 
@@ -85,7 +90,7 @@ def add_labels(clips: Sequence[Clip], split: Split, labels: Sequence[Clip]) -> t
     UserError: none of them is left.
     """
     known = {clip.content_hash for clip in clips}
-    new = [one for one in labels if one.content_hash not in known]
+    new = [label for label in labels if label.content_hash not in known]
     if labels and not new:
         raise UserError("--labels: holds the training data itself; give a dataset of other sequences")
     every = [*clips, *regroup(new, _unit(clip.group for clip in clips))]
@@ -121,7 +126,7 @@ def choose_unseen(
     known = {name for part in card.split.values() for name in part}
     if split.sides and any(clip.content_hash in known for clip in clips):
         candidates = [clip for clip in clips if split.sides.get(clip.content_hash) == "test"]
-    chosen = unseen(candidates, card)
+    chosen = keep_unseen(candidates, card)
     if not chosen:
         raise UserError(
             f"{dataset}: the model was trained on the brains of all {len(candidates)} test sequences; use "
@@ -132,7 +137,7 @@ def choose_unseen(
     return chosen
 
 
-def unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
+def keep_unseen(clips: Sequence[Clip], card: ModelCard) -> list[Clip]:
     """Clips that share neither sequence nor anatomy with the parts `USED` of the model's split."""
     brains, used = {name for part in USED for name in card.groups.get(part, ())}, card.used
     grouped = zip(clips, regroup(clips, find_unit(card)), strict=True)
@@ -146,10 +151,10 @@ def find_obstacle(selection: Sequence[Clip], calibration: Sequence[Clip]) -> str
         ("left for intervals", calibration, least),
         ("left to choose the epoch and to fit the error model", selection, LEAST_SELECTED),
     ):
-        if (found := len(set(groups(part)))) < needed:
-            brains = "brain is" if found == 1 else "brains are"
+        if (held := len(set(groups(part)))) < needed:
+            brains = "brain is" if held == 1 else "brains are"
             return (
-                f"{found} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
+                f"{held} {brains} {what}; {LEVELS[0]:.0%} intervals need {needed}, and {2 * least} on the "
                 "validation side, half of which are used (more sequences, or `synth split --shares`)"
             )
     return ""

@@ -8,12 +8,12 @@ from .engine.run import open_dataset as open_dataset
 from .engine.run import render_job as render_job
 from .errors import UserError as UserError
 from .fem.deformation import Deformation as Deformation
+from .fem.law_choice import Law as Law
+from .fem.law_choice import add_law as add_law
 from .fem.tool_gesture import ToolMotion as ToolMotion
 from .flow.estimator import Estimator as Estimator
 from .flow.track import Track as Track
 from .flow.track import recover_flow as recover_flow
-from .job.law_choice import Law as Law
-from .job.law_choice import add_law as add_law
 from .job.reader import load_job as load_job
 from .job.schema import Job as Job
 from .render.camera.camera import Camera as Camera
@@ -27,11 +27,11 @@ from .render.materials import Wet as Wet
 from .render.scene import RenderedFrame as RenderedFrame
 from .render.scene import Renderer as Renderer
 from .render.scene import SceneState as SceneState
+from .sequence.draw import draw_scenario as draw_scenario
 from .sequence.mechanics import Mechanics as Mechanics
 from .sequence.pipeline import write_scene as write_scene
 from .sequence.rest_scene import Frame as Frame
 from .sequence.rest_scene import RestScene as RestScene
 from .sequence.rest_scene import Scene as Scene
 from .sequence.scenario import Scenario as Scenario
-from .sequence.scenario import draw_scenario as draw_scenario
 from .sequence.simulation import simulate as simulate

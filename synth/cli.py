@@ -141,9 +141,9 @@ def preview(
     For the surface of a brain: draws the best places for a craniotomy and prints them as lines of a job.
     """
     from synth.dataset.size_forecast import amount, estimate
-    from synth.fem.external.read_series import read_job_series
     from synth.job import reader
     from synth.publish import contact_sheet, openings
+    from synth.sequence.job_series import read_job_series
     from synth.system.checked_file import write_picture
     from synth.system.terminal import counting
 
@@ -179,7 +179,7 @@ def _read_series(job: Job) -> tuple[str, ...]:
     """Reads the first series of a job with `mechanics.source`, says what it is, and what is doubtful."""
     if job.mechanics.source is None:
         return ()
-    from synth.fem.external.read_series import forget, read_job_series
+    from synth.sequence.job_series import forget, read_job_series
 
     series = read_job_series(job, 0)
     print(f"mechanics.source: {series.summary}", file=sys.stderr)

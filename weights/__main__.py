@@ -5,11 +5,13 @@ import typer
 
 from learn.training.threads import set_threads
 from weights import chain
+from weights.interval_table import intervals
 from weights.pack import pack
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
 app.command()(chain.make)
 app.command()(pack)
+app.command()(intervals)
 
 
 @app.callback()

@@ -17,6 +17,7 @@ _FEW = 0.02  # share of the frames lost, from which it is a warning; by hand
 _MASKS_READ, _INVERTED = 5, 0.5  # masks looked at; median white share that no instrument has; by hand
 _SPARE_S, _SPARE_STEPS = 0.5, 5  # by which a stated length may exceed the last time; by hand
 _MANY = 0.2  # share of the tissue masked, from which to check the recording; by hand
+_LEAST_TISSUE = 0.05  # share of the picture; by hand
 _NO_YOUNG = (
     "Young's modulus unknown: forces are those of tissue of 1 kPa, so only scores that are independent of a "
     "factor are reported, and those after the gain of a separate press if there is one"
@@ -88,6 +89,20 @@ def check_scale(recording: Recording) -> list[Finding]:
         return [Finding("error", "scale", str(error))]
     message = f"{found.mm_per_px:.4g} mm/px ± {100 * found.uncertainty:.2g}% ({found.source})"
     return [Finding("ok", "scale", message)]
+
+
+def check_tissue(recording: Recording, tracked: TrackedRecording) -> list[Finding]:
+    """Findings on a stated tissue that is too small to be one."""
+    if recording.tissue is None or not tracked.decoded:
+        return []
+    try:
+        share = float(recording.tissue_mask(tracked.size).mean())
+    except UserError:  # tracking reports it
+        return []
+    if share >= _LEAST_TISSUE:
+        return []
+    message = f"tissue.png is white on {100 * share:.2g}% of the picture: draw all of the tissue"
+    return [Finding("warning", "tissue", message)]
 
 
 def check_field_of_view(recording: Recording, tracked: TrackedRecording) -> list[Finding]:

@@ -22,6 +22,7 @@ RECORDING_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
 TRACKED_CHECKS: tuple[Callable[[Recording, TrackedRecording], list[Finding]], ...] = (
     files.check_pictures,
     files.check_tool,
+    files.check_tissue,
     files.check_tracking,
     files.check_field_of_view,
     camera_pair.check_pairing,

@@ -1,8 +1,8 @@
 """Fusion of network and physics, each weighted by its stated error.
 
 The network's estimate is a further observation of the force of which physics gives a mixture over contacts
-and tissues: it shifts each component, and components that contradict it lose weight. As it knows no more of
-the tissue, the interval of physics stays in that of the fusion.
+and tissues: it shifts each component, and components that contradict it lose weight. Its interval is the
+calibrated one of `force_interval`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.methods.force_mixture import size_interval
-from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext, widen_small_forces
+from bench.methods.force_interval import VideoEstimates, find_spread, read_table
+from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from synth.arrays import Floats
 from synth.errors import UserError
 
 # Chosen on even sequences of mission-ood and on foreign recordings of seed 600; results are of others.
-_COMMON = 0.3  # relative standard deviation of the two methods' common error
 _MOST = 100.0  # largest factor of an interval that fails where the force is known
 # Factor of the network's stated deviation by number of cameras: recordings differ from its training data, but
 # force along the optical axis hardly shows in one camera's motion, of which physics is too sure.
@@ -31,7 +30,9 @@ class Fusion:
     def __init__(self, network: str, physics: str) -> None:
         """Names of the two methods; the network's `density` is shown."""
         self.parts = network, physics
-        self._share, self._alone = 0.0, 0
+        self._share, self._alone, self._reason = 0.0, 0, ""
+        self.video: VideoEstimates | None = None
+        """What the last video's interval is computed from; None: a method stated no error."""
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
         """Raises UserError: a fusion needs the estimates of its parts."""
@@ -48,32 +49,58 @@ class Fusion:
 
         `known_mn`: (T,) where it is known (free spans, press), else NaN: what fails there loses weight.
         """
-        gain = float(np.hypot(_COMMON, scene.young_uncertainty))
         known = np.full(len(estimates), np.nan) if known_mn is None else known_mn
         cautions = [_widening([frame[name] for frame in estimates], known) for name in self.parts]
-        found, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
+        fused, pulled, apart, self._alone = list[ForceEstimate](), 0.0, 0.0, 0
         for frame in estimates:
             network, physics = (frame[name] for name in self.parts)
             if network.likely is None or physics.likely is None:
-                found.append(replace(network, likely=None))
+                fused.append(ForceEstimate(network.force_mn))
                 self._alone += 1
                 continue
             spread = (_CAUTION[cameras] * cautions[0]) ** 2 * network.likely.covariance[0]
             prior = replace(physics.likely, covariance=cautions[1] ** 2 * physics.likely.covariance)
             both = prior.observe(network.likely.mean, spread)
-            low, high = size_interval(both, gain, cameras)
             off = network.force_mn - physics.force_mn
             square = float(off @ off)
             # The weight is in 0..1: components that lose weight must not move the estimate beyond both.
             share = float((both.mean - physics.force_mn) @ off) / max(square, 1e-12)
             weight = min(max(share, 0.0), 1.0)
-            force = both.mean + (weight - share) * off
-            size = float(np.linalg.norm(force))
-            low, high = min(low, physics.low_mn, size), max(high, physics.high_mn, size)
-            found.append(ForceEstimate(force, None, low, high))
+            fused.append(ForceEstimate(both.mean + (weight - share) * off))
             pulled, apart = pulled + weight * square, apart + square
         self._share = pulled / apart if apart else 0.0
-        return widen_small_forces(found)
+        return fused
+
+    def bound(
+        self,
+        fused: Sequence[ForceEstimate],
+        estimates: Sequence[Mapping[str, ForceEstimate]],
+        scene: MethodContext,
+        cameras: int,
+        motion_mm: Floats,
+        stated: float,
+        network: str,
+    ) -> list[ForceEstimate]:
+        """The forces of `fuse` with the calibrated interval, without one if it has no calibration.
+
+        `motion_mm`: (T,) mean length of the flow; `stated`: as of `VideoEstimates`; `network`: its identity.
+        """
+        self.video, self._reason = None, ""
+        if self._alone or not fused:
+            return list(fused)
+        parts = [np.array([frame[name].force_mn for frame in estimates]) for name in self.parts]
+        spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
+        leading = np.array([one.force_mn for one in fused])
+        self.video = VideoEstimates(leading, *parts, spread, motion_mm, cameras, stated)
+        table = read_table()
+        self._reason = table.find_reason(self.video, network)
+        if self._reason:
+            return list(fused)
+        ends = table.bound(self.video, scene.young_uncertainty)
+        return [
+            replace(one, low_mn=float(low), high_mn=float(high))
+            for one, low, high in zip(fused, *ends, strict=True)
+        ]
 
     @property
     def notes(self) -> list[str]:
@@ -83,16 +110,20 @@ class Fusion:
 
     @property
     def warnings(self) -> list[str]:
-        """Frames without a fusion."""
+        """Frames without a fusion, and why there is no interval."""
         alone = f"{self._alone} frames use {self.parts[0]} alone: one of the two methods states no error"
-        return [alone] if self._alone else []
+        return [*([alone] if self._alone else []), *([self._reason] if self._reason else [])]
 
 
 def _widening(estimates: Sequence[ForceEstimate], known_mn: Floats) -> float:
     """Factor of at least 1 by which a method's 90% intervals hold 90% of the known forces (T,) [mN]."""
     needed = []
-    for one, true in zip(estimates, known_mn, strict=True):
-        side = one.high_mn - one.size_mn if true > one.size_mn else one.size_mn - one.low_mn
+    for estimate, true in zip(estimates, known_mn, strict=True):
+        side = (
+            estimate.high_mn - estimate.size_mn
+            if true > estimate.size_mn
+            else estimate.size_mn - estimate.low_mn
+        )
         if np.isfinite(true) and np.isfinite(side):
-            needed.append(abs(true - one.size_mn) / max(side, 1e-9))
+            needed.append(abs(true - estimate.size_mn) / max(side, 1e-9))
     return float(np.clip(np.quantile(needed, 0.9), 1, _MOST)) if needed else 1.0

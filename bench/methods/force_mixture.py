@@ -63,33 +63,33 @@ class ForceMixture:
 def mix(parts: Sequence[ForceMixture], weight: Floats, worlds: Sequence[int]) -> ForceMixture:
     """The mixture of distributions with weights of sum 1, each under an assumption `worlds`."""
     return ForceMixture(
-        np.concatenate([share * one.weight for share, one in zip(weight, parts, strict=True)]),
-        np.concatenate([one.force for one in parts]),
-        np.concatenate([one.covariance for one in parts]),
-        world=np.repeat(worlds, [len(one.weight) for one in parts]),
+        np.concatenate([share * part.weight for share, part in zip(weight, parts, strict=True)]),
+        np.concatenate([part.force for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        world=np.repeat(worlds, [len(part.weight) for part in parts]),
     )
 
 
-def size_interval(found: ForceMixture, gain: float, cameras: int = 2) -> tuple[float, float]:
+def size_interval(force: ForceMixture, gain: float, cameras: int = 2) -> tuple[float, float]:
     """90% interval of the force's magnitude, in its unit, by reproducible draws.
 
     It holds the interval under each assumption on the tissue, as evidence between them is not reliable.
     `gain`: relative standard deviation of all forces. It starts at 0 if 0 is in the 90% region; with one
     camera it then ends at the 98th percentile, as pressing along the optical axis hardly shows.
     """
-    if found.world is not None and len(worlds := np.unique(found.world)) > 1:
-        size = float(np.linalg.norm(found.mean))
-        ends = [size_interval(found.within(one), gain, cameras) for one in worlds]
+    if force.world is not None and len(worlds := np.unique(force.world)) > 1:
+        size = float(np.linalg.norm(force.mean))
+        ends = [size_interval(force.within(world), gain, cameras) for world in worlds]
         return min(size, *(low for low, _ in ends)), max(size, *(high for _, high in ends))
-    size = float(np.linalg.norm(found.mean))  # may be less than most drawn magnitudes
-    weight = found.weight / found.weight.sum()
+    size = float(np.linalg.norm(force.mean))  # may be less than most drawn magnitudes
+    weight = force.weight / force.weight.sum()
     drawn = np.searchsorted(np.cumsum(weight), (np.arange(_DRAWS) + 0.5) / _DRAWS)
-    root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(3))
+    root = np.linalg.cholesky(force.covariance + 1e-12 * np.eye(3))
     normal, factor = _normals()
-    forces = found.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)
+    forces = force.force[drawn] + np.einsum("nab,nb->na", root[drawn], normal)
     sizes = np.linalg.norm(forces, axis=1) * np.exp(gain * factor)
     spread = np.cov(forces.T) + 1e-12 * np.eye(3)
-    if found.mean @ np.linalg.solve(spread, found.mean) < _SURELY:
+    if force.mean @ np.linalg.solve(spread, force.mean) < _SURELY:
         return 0.0, max(float(np.quantile(sizes, 0.9 if cameras == 2 else 0.98)), size)
     low, high = np.quantile(sizes, (0.05, 0.95))
     return min(float(low), size), max(float(high), size)

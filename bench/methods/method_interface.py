@@ -35,6 +35,8 @@ class MethodContext:
     """Whether the tissue may move by heart and breath; False: ex vivo, or a phantom."""
     recovered_by: str = ""
     """Estimator and version of the motion; empty: unknown."""
+    alpha: tuple[float, float] = (-20.0, 2.0)
+    """Range of the exponent of Ogden's law, for motion beyond the linear range."""
 
     def __post_init__(self) -> None:
         """Makes `tissue` read-only: methods share it."""
@@ -68,10 +70,12 @@ def widen_small_forces(estimates: Sequence[ForceEstimate], share: float = 0.05) 
     After a press tissue creeps without a force, and a slight touch moves it less than flow resolves. The
     share is set by hand; docs/results/learn/foreign has the coverage on videos of other simulators.
     """
-    least = share * max((one.size_mn for one in estimates), default=0.0)
+    least = share * max((estimate.size_mn for estimate in estimates), default=0.0)
     return [
-        replace(one, low_mn=0.0, high_mn=max(one.high_mn, least)) if one.size_mn < least else one
-        for one in estimates
+        replace(estimate, low_mn=0.0, high_mn=max(estimate.high_mn, least))
+        if estimate.size_mn < least
+        else estimate
+        for estimate in estimates
     ]
 
 

@@ -45,7 +45,7 @@ class Plugged:
             estimates = list(self._method.revise(contact_free.copy()))
             if len(estimates) != len(contact_free):
                 raise TypeError(f"revises {len(estimates)} frames of {len(contact_free)}")
-        return [self._checked(one, None) for one in estimates]
+        return [self._checked(estimate, None) for estimate in estimates]
 
     def _checked(self, estimate: Any, size: tuple[int, ...] | None) -> ForceEstimate:
         """`size`: height and width that a density must have; None: a density is dropped."""
@@ -64,7 +64,7 @@ class Plugged:
         return replace(estimate, force_mn=force, density=density)
 
 
-def installed() -> dict[str, Method]:
+def list_installed() -> dict[str, Method]:
     """New methods of installed packages, by name. UserError if one can't be loaded or called."""
     methods: dict[str, Method] = {}
     for name in METHODS.names():

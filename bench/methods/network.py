@@ -67,13 +67,13 @@ class Model:
         if self._estimator is None or self._estimator[0] is not scene:
             about = scene.tissue, scene.scale_mm_per_px, scene.young_kpa, scene.membrane
             self._estimator = scene, ForceEstimator(self.predictor, *about)
-        found = self._estimator[1].estimate(frame)
-        estimate = ForceEstimate(found.force_mn, found.map.to_image() if picture else None)
-        if not found.bands:
+        force = self._estimator[1].estimate(frame)
+        estimate = ForceEstimate(force.force_mn, force.map.to_image() if picture else None)
+        if not force.bands:
             return estimate
-        band = found.bands[LEVEL]
+        band = force.bands[LEVEL]
         likely = None
-        if np.isfinite(found.force_mn).all():
+        if np.isfinite(force.force_mn).all():
             deviation = (band.axes_high[0] - band.axes_low[0]) / (2 * ndtri(0.5 + LEVEL / 2))
-            likely = ForceMixture(np.ones(1), found.force_mn[None], np.diag(deviation**2)[None])
+            likely = ForceMixture(np.ones(1), force.force_mn[None], np.diag(deviation**2)[None])
         return replace(estimate, low_mn=float(band.low[0]), high_mn=float(band.high[0]), likely=likely)

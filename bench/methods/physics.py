@@ -2,6 +2,8 @@
 
 At its end spans without contact give the tissue's own motion, the frames with the largest motion its edge,
 membrane and Poisson's ratio; a force map requested earlier uses the frame with the largest motion so far.
+Where the surface is bent beyond the linear range, some frames are then solved by `large_motion`; those
+between them take the gain over the linear force that these show.
 """
 
 from __future__ import annotations
@@ -14,9 +16,10 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.special import softmax
 
-from bench.methods import compliance, posterior
+from bench.methods import compliance, large_motion, posterior
 from bench.methods.compliance import OPENING_MM, Edge, TissueKind
 from bench.methods.force_mixture import mix, size_interval
+from bench.methods.large_motion import SeenMotion
 from bench.methods.method_interface import (
     Field,
     ForceEstimate,
@@ -28,6 +31,7 @@ from bench.methods.posterior import Observation, Posterior
 from learn.data.clips import UNKNOWN_YOUNG_KPA
 from learn.data.grid import Grid, GridView, to_image
 from synth.arrays import Floats, Mask
+from synth.fem.equilibrium import ExcessiveLoad
 from synth.flow.confidence import deviation
 from synth.flow.recording.find_tissue import touches_border
 from synth.job.types import MembraneState
@@ -52,6 +56,12 @@ class TissueConstants:
     quiet: float = 0.2  # least share of the frames, or of a breath, that shows the tissue's own motion
     unlikely: float = 1e-6  # least weight of an assumption that the interval is to hold
     breath_hz: float = 0.2  # slowest breath; a shorter span without motion may be where it turns
+    steeper: float = 1.2  # slope relative to the last, from which a frame may be solved by its own mechanics
+    solved: int = 4  # frames so solved, at most
+    linear: float = 14.4  # largest force over E [mm^2] in the linear range: P = 0.4 of a contact of 6 mm
+    unsolved: tuple[float, float] = (0.8, 2.0)
+    """Gains of the linear force that hold what it may be where motion is large and not solved: those of nine
+    driven contacts of 75 to 260 mN were 0.93 to 1.6."""
     gain: float = 0.25  # relative deviation of force from relief, pose and the law at large strain
 
 
@@ -68,6 +78,22 @@ class TissueWeights:
     assumed: bool  # whether that is a bound on what is not known, so that it may be 0
 
 
+@dataclass(frozen=True)
+class Gains:
+    """Factors of the linear force where motion is large, by that force: at both ends of what is not known."""
+
+    size: Floats  # (K,) mN/kPa, rising
+    low: Floats  # (K,)
+    high: Floats  # (K,)
+    unsolved: int = 0  # states whose mechanics found no solution, or with one camera
+
+    def at(self, size: float) -> tuple[float, float]:
+        return float(np.interp(size, self.size, self.low)), float(np.interp(size, self.size, self.high))
+
+
+NO_GAIN = Gains(np.zeros(1), np.ones(1), np.ones(1))
+
+
 class Physics:
     """A `Revising` method, see the module; without a force map its estimates are NaN until `revise`."""
 
@@ -81,6 +107,7 @@ class Physics:
         self._contact_free, self._weighed_mm = 0, 0.0  # frames; motion at the last weighting
         first, still = candidate_tissues(scene)[:1], np.zeros((components, 6, 0))
         self._times, self._trusted = list[float](), list[bool]()
+        self._large, self._gains = list[tuple[Observation, SeenMotion]](), NO_GAIN
         self._weights = TissueWeights(first, np.ones(1), still, False)
 
     def __call__(self, frame: FrameMotion, scene: MethodContext, picture: bool) -> ForceEstimate:
@@ -98,6 +125,11 @@ class Physics:
         self._frames.append(observed)
         self._times.append(frame.time_s or 0.0)
         self._trusted.append(frame.trusted)
+        if frame.trusted and len(moved) == 3:
+            surface = large_motion.seen_motion(moved, spread, self._view.mask, GRID)
+            last = self._large[-1][1].slope * TISSUES.steeper if self._large else 0.0
+            if surface.slope > max(large_motion.STEEP, last):
+                self._large.append((observed, surface))
         if not picture:
             return ForceEstimate(np.full(3, np.nan))
         if observed.signal_mm > max(TISSUES.stronger * self._weighed_mm, posterior.MODEL.least_mm):
@@ -118,13 +150,17 @@ class Physics:
             bounds = [factor * posterior.own_motion(basis, [frames[k] for k in quiet], correlated=False)]
             if breaths > TISSUES.quiet:
                 bounds.append(turning_factor(breaths) * posterior.own_motion(basis, free, correlated=False))
-            least = min(bounds, key=lambda one: float(np.square(one).sum()))
+            least = min(bounds, key=lambda bound: float(np.square(bound).sum()))
             own_mm = least.clip(-TISSUES.living_mm, TISSUES.living_mm)
         else:
             own_mm = posterior.own_motion(basis, free)
         self._weights = weigh_tissues(self._scene, self._frames, own_mm, bounded and bool(own_mm.any()))
+        self._gains = find_gains(self._scene, self._weights, self._large)
+        strongest = max(self._frames, key=lambda frame: frame.signal_mm)
+        if len(strongest.moved) == 2:
+            self._gains = find_monocular_gains(self._weights, strongest)
         self._contact_free = int(contact_free.sum())
-        return widen_small_forces([self._estimate(one, False) for one in self._frames])
+        return widen_small_forces([self._estimate(frame, False) for frame in self._frames])
 
     @property
     def notes(self) -> list[str]:
@@ -133,25 +169,40 @@ class Physics:
             return []
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         moved = posterior.polynomials(basis.lattice.points) @ self._weights.own_mm  # (C, P, M)
-        sizes = ", ".join(f"{np.sqrt(one.sum(axis=1).mean()):.2g}" for one in np.square(moved))
-        own = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
+        sizes = ", ".join(f"{np.sqrt(square.sum(axis=1).mean()):.2g}" for square in np.square(moved))
+        stated = f"the tissue's own motion is {sizes} mm along {', '.join('xyz'[: len(moved)])}"
         if self._weights.assumed or not self._contact_free:
             known = "only part of a breath" if self._contact_free else "no span"
-            own = f"{'at most, ' * self._weights.assumed}{own}"
-            own = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {own}"
-        return [describe(self._weights, self._scene), own]
+            stated = f"{'at most, ' * self._weights.assumed}{stated}"
+            stated = f"{known} without contact is known in video time (sensor.free_s, pulse.free_s): {stated}"
+        return [describe(self._weights, self._scene), stated]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What its result must not be taken for."""
+        if self._scene is None or not self._gains.unsolved:
+            return []
+        why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
+        what = "the surface is bent beyond the range of the linear inverse"
+        return [f"physics: {what}, {why}: its largest forces are out of range, their intervals wide"]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None
         young = self._scene.young_kpa or UNKNOWN_YOUNG_KPA
-        found = infer(self._weights, frame)
+        linear = infer(self._weights, frame)
+        least, most = self._gains.at(float(np.linalg.norm(linear.force.mean)))
+        factor = float(np.sqrt(least * most))
+        answer = replace(linear, force=linear.force.times(factor), load=factor * linear.load)
         gain, cameras = float(np.hypot(TISSUES.gain, self._scene.young_uncertainty)), len(frame.moved) - 1
-        low, high = size_interval(found.force, gain, cameras)
-        density = np.float32(young) * self._picture(found) if picture else None
-        likely = found.force.times(young).with_gain(TISSUES.gain)
-        return ForceEstimate(young * found.force.mean, density, young * low, young * high, likely)
+        low, high = size_interval(answer.force, gain, cameras)
+        low, high = low * least / factor, high * most / factor
+        density = np.float32(young) * self._picture(answer) if picture else None
+        likely = answer.force.times(young).with_gain(
+            float(np.hypot(TISSUES.gain, 0.3 * np.log(most / least)))
+        )
+        return ForceEstimate(young * answer.force.mean, density, young * low, young * high, likely)
 
-    def _picture(self, found: Posterior) -> Field:
+    def _picture(self, answer: Posterior) -> Field:
         """The force density over E, (H, W), on the rest frame's pixels."""
         basis = posterior.load_basis(len(self._weights.own_mm), self._weights.tissues[0])
         known, view = basis.lattice, self._view
@@ -159,7 +210,7 @@ class Physics:
         column, row = np.rint(known.nodes / step).astype(int).T
         most = max(column.max(), row.max())
         lattice = np.zeros((2 * most + 1,) * 2)
-        lattice[row + most, column + most] = np.linalg.norm(found.load, axis=1) / known.node_area
+        lattice[row + most, column + most] = np.linalg.norm(answer.load, axis=1) / known.node_area
         return to_image(lattice, view.shape, view.centre_px, view.scale_mm_per_px, float(step))
 
 
@@ -168,7 +219,7 @@ def quietest_frames(time_s: Floats, frames: Sequence[Observation]) -> tuple[list
 
     A large share of frames without motion excludes slow and fast pulsation, a short span only fast one.
     """
-    size = np.array([one.signal_mm**2 for one in frames])
+    size = np.array([frame.signal_mm**2 for frame in frames])
     order = np.argsort(size, kind="stable")
     count = np.arange(1, len(frames) + 1)
     share = count / len(frames) * min(float(np.ptp(time_s)) * TISSUES.breath_hz, 1.0)
@@ -205,7 +256,7 @@ def candidate_tissues(scene: MethodContext) -> tuple[TissueKind, ...]:
 def _prior(tissues: Sequence[TissueKind], known: MembraneState) -> Floats:
     if known != "unknown":
         return np.full(len(tissues), 1 / len(tissues))
-    stiff, intact = np.array([one.membrane > 0 for one in tissues]), TISSUES.intact
+    stiff, intact = np.array([tissue.membrane > 0 for tissue in tissues]), TISSUES.intact
     return np.asarray(np.where(stiff, intact / stiff.sum(), (1 - intact) / (~stiff).sum()), np.float64)
 
 
@@ -213,16 +264,16 @@ def weigh_tissues(
     scene: MethodContext, frames: Sequence[Observation], own_mm: Floats, assumed: bool = False
 ) -> TissueWeights:
     """Weighs tissues by the frames with the largest motion, then Poisson's ratios of the most likely one."""
-    strongest = sorted(frames, key=lambda one: -one.signal_mm)[: 3 * TISSUES.strongest : 3]
-    strongest = [one for one in strongest if one.size_mm > 0]
+    strongest = sorted(frames, key=lambda frame: -frame.signal_mm)[: 3 * TISSUES.strongest : 3]
+    strongest = [frame for frame in strongest if frame.size_mm > 0]
 
     def evidence(tissue: TissueKind) -> float:
         basis = posterior.load_basis(len(own_mm), tissue)
-        return TISSUES.temper * sum(posterior.evidence(basis, one, own_mm) for one in strongest)
+        return TISSUES.temper * sum(posterior.evidence(basis, frame, own_mm) for frame in strongest)
 
     tissues = list(candidate_tissues(scene))
     prior = _prior(tissues, scene.membrane)
-    score = [evidence(one) + np.log(share) for one, share in zip(tissues, prior, strict=True)]
+    score = [evidence(tissue) + np.log(share) for tissue, share in zip(tissues, prior, strict=True)]
     best = int(np.argmax(score))
     low, high = scene.poisson
     others = [nu for nu in TISSUES.poisson if low <= nu <= high and nu != tissues[best].poisson]
@@ -244,16 +295,53 @@ def weigh_tissues(
 def infer(weights: TissueWeights, frame: Observation) -> Posterior:
     """The posterior of a frame's loads, as a mixture over tissues."""
     components, weight = len(weights.own_mm), weights.weight
-    worlds = [(one, weights.own_mm) for one in weights.tissues]
+    worlds = [(tissue, weights.own_mm) for tissue in weights.tissues]
     if weights.assumed:
         worlds.append((weights.tissues[0], weights.own_mm[..., :0]))
         weight = np.append(weight, TISSUES.unlikely)
-    found = [posterior.infer(posterior.load_basis(components, one), frame, own) for one, own in worlds]
+    posteriors = [
+        posterior.infer(posterior.load_basis(components, tissue), frame, modes) for tissue, modes in worlds
+    ]
     return Posterior(
-        float(weight @ [one.evidence for one in found]),
-        mix([one.force for one in found], weight, range(len(found))),
-        sum((share * one.load for share, one in zip(weight, found, strict=True)), np.zeros(())),
+        float(weight @ [answer.evidence for answer in posteriors]),
+        mix([answer.force for answer in posteriors], weight, range(len(posteriors))),
+        sum((share * answer.load for share, answer in zip(weight, posteriors, strict=True)), np.zeros(())),
     )
+
+
+def find_gains(
+    scene: MethodContext, weights: TissueWeights, large: Sequence[tuple[Observation, SeenMotion]]
+) -> Gains:
+    """Gains of frames with large motion, of rising slope, on the likeliest tissue; few of them are solved."""
+    tissue, radius = weights.tissues[0], np.sqrt(scene.tissue.sum() / np.pi) * scene.scale_mm_per_px
+    if tissue.edge == "free" and touches_border(scene.tissue) <= TISSUES.cut:
+        tissue = replace(tissue, edge="bonded")  # a wide opening, seen whole
+    rows, unsolved = [(0.0, 1.0, 1.0)], 0
+    for frame, motion in large[::-2][: TISSUES.solved]:
+        size = float(np.linalg.norm(infer(weights, frame).force.mean))
+        ends = TISSUES.unsolved
+        try:
+            if size > 0:
+                opening_mm = min(float(radius), large_motion.OPEN_MM)
+                forces = [
+                    large_motion.reaction(motion, tissue, opening_mm, a) for a in sorted(set(scene.alpha))
+                ]
+                sizes = [float(np.linalg.norm(force)) / size for force in forces]
+                ends = min(sizes), max(sizes)
+        except ExcessiveLoad:
+            pass
+        unsolved += ends == TISSUES.unsolved
+        rows.append((size, *ends))
+    return Gains(*np.array(sorted(rows)).T, unsolved)
+
+
+def find_monocular_gains(weights: TissueWeights, strongest: Observation) -> Gains:
+    """Gains with one camera, to which depth is hidden: what they may be where the linear force is large."""
+    size = float(np.linalg.norm(infer(weights, strongest).force.mean))
+    if size <= TISSUES.linear:
+        return NO_GAIN
+    low, high = TISSUES.unsolved
+    return Gains(np.array([0.0, TISSUES.linear, size]), np.array([1, 1, low]), np.array([1, 1, high]), 1)
 
 
 @lru_cache(maxsize=1)

@@ -110,7 +110,7 @@ class Posterior:
 @lru_cache(maxsize=32)
 def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     """The reduced compliance of a tissue, observed in 2 or 3 components: from this user's cache, or computed
-    (half a CPU-second, and two for each block and Poisson's ratio) and stored there."""
+    (half a CPU-second, and one for each block and Poisson's ratio) and stored there."""
     kept = MODEL.rank, MODEL.smooth_mm, MODEL.radii_mm, MODEL.reach_mm
     key = f"{MESH} {COMPLIANCE} {components} {tissue} {compliance.SETTINGS} {kept}".encode()
     faults = ValueError, EOFError, KeyError, BadZipFile  # of files that were cut off: they are computed again
@@ -136,7 +136,7 @@ def load_basis(components: int, tissue: TissueKind) -> LoadBasis:
     )
 
 
-_WAIT = "physics: computing how tissue yields under loads, once on this machine (some 20 s of a processor)"
+_WAIT = "physics: computing how tissue yields under loads, once on this machine (some 15 s of a processor)"
 _STORED = 128  # bases in the cache, of some 1.5 MB: those of five recordings about which nothing is stated
 
 
@@ -149,21 +149,21 @@ def _reduce(components: int, tissue: TissueKind) -> dict[str, Any]:
     root = np.linalg.cholesky(kernel + 1e-6 * np.trace(kernel) / count * np.eye(count))
     root /= np.linalg.norm(root.sum(axis=0))
     smooth = (matrix.reshape(-1, count) @ root).reshape(len(matrix), 3 * count)
-    values, vectors = eigh(smooth.T @ smooth)
-    vectors = vectors[:, ::-1]
-    size = np.sqrt(values[: -rank - 1 : -1])
-    motion = smooth @ (vectors[:, :rank] / size)
-    loads = root @ vectors.reshape(3, count, -1)  # (3, K, 3 K)
+    values, vectors = eigh(smooth.T @ smooth, subset_by_index=[3 * count - rank, 3 * count - 1])
+    vectors, size = vectors[:, ::-1], np.sqrt(values[::-1])
+    motion = smooth @ (vectors / size)
+    loads = root @ vectors.reshape(3, count, rank)  # (3, K, R)
     total = loads.sum(axis=1)
     by_load = (motion.T @ matrix).reshape(rank, 3, count)
     contacts = by_load @ _contact_shares(lattice)  # (R, 3, H): each axis is contiguous
     return {
         "motion": motion.astype(np.float32),
         "size": size,
-        "force": total[:, :rank] / size,
-        "omitted": np.square(total[:, rank:]).sum(axis=1),
+        "force": total / size,
+        # Of loads of unit size, along all directions, the total's variance is 1.
+        "omitted": 1 - np.square(total).sum(axis=1),
         "contacts": contacts.astype(np.float32),
-        "loads": (loads[..., :rank] / size).transpose(1, 0, 2).reshape(3 * count, rank).astype(np.float32),
+        "loads": (loads / size).transpose(1, 0, 2).reshape(3 * count, rank).astype(np.float32),
     }
 
 

@@ -16,10 +16,18 @@ from synth.job.types import MembraneState, Section
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Mistake
 
+
+def _must_not_vanish(value: float) -> float:
+    if value == 0:
+        raise ValueError("0 is no exponent of Ogden's law")
+    return value
+
+
 Share = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Positive = Annotated[FiniteFloat, Field(ge=1e-6, le=1e6)]
 Number = Annotated[FiniteFloat, Field(ge=-1e10, le=1e10)]  # also times since 1970
 Point = tuple[Number, Number]
+OgdenExponent = Annotated[FiniteFloat, Field(ge=-40, le=40), AfterValidator(_must_not_vanish)]
 PoissonsRatio = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 Corners = Annotated[int, Field(ge=2, le=1000)]
 Row = tuple[Number, Number, Number]
@@ -212,6 +220,9 @@ class Meta(Section):
     """Whether the tissue still has its membrane (pia, arachnoid): `intact`, `stripped` or `unknown`."""
     poisson: Annotated[tuple[PoissonsRatio, PoissonsRatio], AfterValidator(_must_not_fall)] = (0.4, 0.49)
     """Range of the tissue's Poisson's ratio."""
+    alpha: Annotated[tuple[OgdenExponent, OgdenExponent], AfterValidator(_must_not_fall)] = (-20.0, 2.0)
+    """Range of the exponent of Ogden's law, by which tissue stiffens where two cameras see it strained beyond
+    some 30%: of swine -4.7, of human brain about -20 (docs/howto/law.md), of soft gels about 2."""
     fps: Positive | None = None
     """Frames per second, for frames/*.png without frames.csv."""
     start: Literal["picture", "file"] = "picture"

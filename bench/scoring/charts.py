@@ -27,7 +27,7 @@ def draw_force(result: Result, others: bool = False) -> str:
     """Force over time: the sensor, the main method with its uncertainty, and thinner the `others`.
 
     Lost frames are shaded gaps. The axis covers the sensor, networks and the dotted lengths of flow; without
-    the others the main method's interval, up to twice its largest force.
+    the others the main method's interval.
     """
     time_s, (sensor, curves, label) = result.time_s, scale_curves(result)
     main, method = curves[result.main], result.methods[result.main]
@@ -55,7 +55,7 @@ def draw_force(result: Result, others: bool = False) -> str:
             axes.plot(time_s, curve, line, color=colour, linewidth=1.1, label=name)
         held = [curve for name, curve in thin.items() if name in sizes or name in networks]
         if not others and result.absolute and method.high_mn is not None:
-            held.append(np.minimum(method.high_mn, 2 * _largest(main)))
+            held.append(method.high_mn)
         shown = np.concatenate([main, *held, *([] if sensor is None else [sensor])])
         if np.isfinite(shown).any():
             low, high = min(np.nanmin(shown), 0.0), _largest(shown)

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.scoring import charts
+from bench.scoring.answers import answer
 from bench.scoring.force_metrics import METRICS
 from bench.scoring.headline import headline
 from bench.scoring.result import Result
@@ -56,6 +57,7 @@ def render_report(result: Result, title: str = "") -> str:
         first={key: metric for key, metric in columns.items() if key in _NARROW},
         more={key: metric for key, metric in columns.items() if key not in _NARROW},
         headline=headline(result),
+        answers=answer(result),
         better=better,
         in_hindsight=in_hindsight,
         origin=result.settings.get("networks", {}).get(result.main, {}).get("origin", ""),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.force_fusion import Fusion
+from bench.methods.force_interval import VideoEstimates
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.footage import as_footage
 from bench.recording.recording_folder import Recording
@@ -76,6 +77,8 @@ class TrackedRecording:
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
     stereo: StereoQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
+    evidence: VideoEstimates | None = None  # from which the interval of the leading fusion is computed
+    stated: tuple[bool, ...] = (False,) * 4  # tissue, instruments, membrane, rest or ex vivo
     pulse: list[dict[str, float]] = field(default_factory=list)  # rate_hz, amplitude_mm of removed rhythms
 
 
@@ -114,7 +117,8 @@ def track_recording(
         video = track.video
         mm_per_px = scale_mm_per_px * video.rest.shrink
         known = about.young_kpa, about.membrane, about.poisson, about.young_uncertainty, about.may_pulsate
-        scene = MethodContext(video.rest.tissue, mm_per_px, *known, name_motion(settings.backend))
+        backend = name_motion(settings.backend)
+        scene = MethodContext(video.rest.tissue, mm_per_px, *known, backend, about.alpha)
         forces = _Forces(methods, pictured, watch, video.rest, scene)
         turning = SurfaceMotion(video.rest.tissue)
         free = ContactFreeSearch(video.rest.tissue, mm_per_px)
@@ -157,7 +161,8 @@ def _describe(
         out.notes.append(recording.describe_tool(len(out.decoded)))
     doubt = {name: getattr(method, "doubt", ()) for name, method in methods.items()}
     parts = {name: one.parts if isinstance(one, Fusion) else (name,) for name, one in methods.items()}
-    out.uncalibrated = {name for name in methods if any(doubt.get(part) for part in parts[name])}
+    # The interval of a fusion is calibrated with its network as it is, or there is none.
+    out.uncalibrated = {name for name, one in methods.items() if doubt[name] and not isinstance(one, Fusion)}
     leading = parts.get(pictured, ())
     out.doubt = [Finding("warning", part, note) for part in leading for note in doubt.get(part, ())]
     for name, method in methods.items():
@@ -197,6 +202,7 @@ class _Forces:
         self.out.tissue = _shrunk(scene.tissue.astype(np.uint8) * 255) > 127
         self.estimates: list[dict[str, ForceEstimate]] = []
         self.last: Map | None = None
+        self.motion_mm: list[float] = []  # mean length of the flow over the tissue
         self.stride, self.cameras = 1, 1
 
     def add(self, frame: FrameMotion, time_s: float) -> None:
@@ -216,6 +222,8 @@ class _Forces:
         if self.last is not None and out.time_s:
             lengths = np.linalg.norm(frame.flow - self.last, axis=-1)[inside]
             speed = float(lengths.mean()) * scene.scale_mm_per_px / (time_s - out.time_s[-1])
+        length = float(np.linalg.norm(frame.flow[inside].astype(np.float64), axis=1).mean())
+        self.motion_mm.append(length * scene.scale_mm_per_px)
         out.confidence.append(float(frame.confidence[inside].mean()))
         out.trusted.append(frame.trusted)
         out.speed.append(speed)
@@ -252,6 +260,11 @@ class _Forces:
             if isinstance(method, Fusion):
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
+                    self.out.stated = _find_stated(recording, self.scene)
+                    stated, moved = float(np.mean(self.out.stated)), np.array(self.motion_mm)[trusted]
+                    network = getattr(self.methods[method.parts[0]], "identity", "")
+                    fused = method.bound(fused, tracked, self.scene, self.cameras, moved, stated, network)
+                    self.out.evidence = method.video
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate
                 for frame in self.estimates:
@@ -269,6 +282,12 @@ class _Forces:
         if len(self.out.snapshots) >= _MOST_SNAPSHOTS:
             self.out.snapshots = self.out.snapshots[::2]
             self.stride *= 2
+
+
+def _find_stated(recording: Recording, scene: MethodContext) -> tuple[bool, ...]:
+    """Whether a recording states tissue, instruments, membrane, and rest or that it is ex vivo."""
+    rests = recording.meta.sensor.free_s or recording.meta.pulse.free_s or not scene.living
+    return recording.tissue is not None, bool(recording.masks), scene.membrane != "unknown", bool(rests)
 
 
 def _ratio(width: int) -> float:

@@ -16,9 +16,9 @@ from sklearn.linear_model import RidgeCV
 from sklearn.model_selection import PredefinedSplit
 
 from learn.data.clips import Clip
-from learn.data.grid import settled
+from learn.data.grid import settle
 from learn.inference.predict import Predictor, total_force
-from learn.network.channels import turned as turned_tensors
+from learn.network.channels import rotate as rotate_tensors
 from synth.arrays import Array, Floats, Map
 
 _FOLDS = 4
@@ -41,7 +41,7 @@ def turned(clip: Clip) -> list[Clip]:
     """The clip in four rotations by quarter turns and their reflections, with all arrays and the force."""
 
     def each(fields: Array, turn: int) -> Array:
-        return turned_tensors(torch.from_numpy(np.array(fields)), turn).numpy()
+        return rotate_tensors(torch.from_numpy(np.array(fields)), turn).numpy()
 
     return [
         replace(
@@ -89,7 +89,7 @@ def coarser(clip: Clip, times: int = 2) -> Clip:
         mask=mask,
         displacement={name: mean(np.asarray(moved)) for name, moved in clip.displacement.items()},
         confidence=mean(np.asarray(clip.confidence)),
-        density=np.stack([settled(d, mask) for d in blocks(np.asarray(clip.density))]),
+        density=np.stack([settle(d, mask) for d in blocks(np.asarray(clip.density))]),
     )
 
 

@@ -22,6 +22,7 @@ from synth.fem.material import Tissue
 from synth.fem.mesh import tetrahedra
 from synth.geometry.triangles import Shape
 from synth.job import schema
+from synth.sequence.draw import read_scheme
 
 Row = dict[str, Any]
 
@@ -117,9 +118,9 @@ def sequence(law: str) -> Row:
     fem = schema.FemSection(gestures=("pull",), load=(load, load))
     gesture, tissue = fem_case.pull(fem), Tissue(1.0, 0.4, law)
     start = time.process_time()
-    volume = tetrahedra.block(fem_case.ANATOMY, fem.tets, gesture.focus)
+    volume = tetrahedra.block(fem.tets, gesture.focus)
     meshed = time.process_time()
-    solver.deform(fem, tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
+    solver.deform(read_scheme(fem), tissue, [gesture], volume, Shape(on.vertices, on.faces), _FRAMES, 25.0)
     spent = 1e3 * (time.process_time() - meshed) / _FRAMES
     # The kernel's high-water mark; getrusage would include the parent's memory before exec.
     status = Path("/proc/self/status").read_text("utf-8")

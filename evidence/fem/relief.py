@@ -36,7 +36,7 @@ def measure_scene(index: int, count: int) -> Row:
     case, surface = rest.scenario, rest.surface
     gesture, height = case.gestures[0], HeightMap(surface.pia, surface.extent_mm)
     row: Row = {"index": index, "tets": count, "kind": gesture.kind, "load": gesture.load}
-    volume = tetrahedra.block(_JOB.anatomy, count, gesture.focus, height)
+    volume = tetrahedra.block(count, gesture.focus, height)
     moved = tool_gesture.trajectory(gesture, _JOB.frames)
     full = int(moved.load.argmax())
     moved = tool_gesture.ToolMotion(np.ones(1), moved.away[[full]], moved.shift[[full]])

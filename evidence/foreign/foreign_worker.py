@@ -1,7 +1,7 @@
 """Mechanics by felupe and images by Blender's Cycles, for `evidence.foreign.recordings`.
 
-    worker.py mechanics FOLDER   in a Python that has felupe and pypardiso
-    worker.py pictures FOLDER    in a Python that has bpy
+    foreign_worker.py mechanics FOLDER   in a Python that has felupe and pypardiso
+    foreign_worker.py pictures FOLDER    in a Python that has bpy
 
 It imports nothing of this project. `mechanics` reads `mechanics.json` and writes `mechanics.npz`: positions
 of the surface's nodes, and their displacement under every contact at rising shares of its force and at the

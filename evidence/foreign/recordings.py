@@ -35,7 +35,7 @@ from synth.system import checked_file
 from synth.system.checked_file import read_picture
 
 KINDS = ("plain", "membrane", "pulse", "two")
-_WORKER = Path(__file__).with_name("worker.py")
+_WORKER = Path(__file__).with_name("foreign_worker.py")
 _FIELD_MM, _SIDE, _TEXELS, _SIZE = 46.0, 220, 1200, (320, 240)
 _DISTANCE_MM, _BASE_MM, _SENSOR_HZ = 300.0, 24.0, 100.0
 _STILL_S, _CONTACTS, _HOVER_MM = 2.0, 4, 45.0
@@ -99,7 +99,7 @@ def record(
     """
     seconds, fps, spp = video
     times = np.arange(0, seconds, 1 / fps)
-    young = float(np.exp(rng.uniform(np.log(0.8), np.log(3.0))))
+    young = float(np.exp(rng.uniform(np.log(0.8), np.log(6.0))))
     contacts = [_tools(young, 1 + (kind == "two"), rng) for _ in range(_CONTACTS)]
     specimen = {
         "block_mm": (90.0, 50.0),
@@ -180,9 +180,9 @@ def _tools(young: float, count: int, rng: np.random.Generator) -> list[dict[str,
 
 
 def _contact(young: float, rng: np.random.Generator) -> dict[str, Any]:
-    """A press, a lateral push or a pull near the centre of the field; P = F/(E a²) of 0.06 to 0.25."""
-    radius = float(rng.uniform(3, 5))
-    size = float(rng.uniform(0.06, 0.25)) * young * radius**2
+    """A press, a lateral push or a pull near the centre of the field; P = F/(E a²) of 0.06 to 0.3."""
+    radius = float(rng.uniform(3, 6))
+    size = float(rng.uniform(0.06, 0.3)) * young * radius**2
     tilt, turn = np.deg2rad(rng.uniform(0, 55)), rng.uniform(0, 2 * np.pi)
     way = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     if rng.random() < 0.7:

@@ -53,6 +53,7 @@ _PICTURES: dict[str, list[str]] = {
         "seed=3",
         "render.stereo_mm=24",
         "render.drift_mm=[0.8,0.8]",
+        "render.scenery=[]",
         "store.extra=[shadow]",
         "fem.load=[0.1,0.3]",
     ],

@@ -14,7 +14,7 @@ from learn.evaluation.coverage import cover
 from learn.evaluation.evaluate import evaluate
 from learn.inference import shipped_networks
 from learn.inference.predict import Predictor, load_model
-from learn.split import unseen as held_out
+from learn.split import keep_unseen as held_out
 from synth.errors import UserError
 
 _LEVEL = 0.9

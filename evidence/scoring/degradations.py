@@ -122,6 +122,67 @@ def _swap_cameras(folder: Path) -> None:
         (folder / name).rename(folder / new)
 
 
+def _drift(share: float) -> Change:
+    """The sensor's zero rises by a share of the largest force over the recording."""
+
+    def change(t: Any, f: Any) -> Any:
+        most = np.linalg.norm(f, axis=1).max()
+        return t, f + share * most * np.outer((t - t[0]) / np.ptp(t), [0.6, 0.0, 0.8])
+
+    return _sensor(change)
+
+
+def _offset(folder: Path) -> None:
+    """A sensor's offset, and no span without contact by which to know it."""
+    _sensor(lambda t, f: (t, f + 2 * np.linalg.norm(f, axis=1).max() * np.array([0.3, -0.5, 0.8])))(folder)
+    about = {key: value for key, value in read_meta(folder)["sensor"].items() if key != "free_s"}
+    _stated(sensor=about)(folder)
+
+
+def _free_under_load(folder: Path) -> None:
+    """The span without contact holds the whole recording."""
+    end_s = float(read_table(folder / "force.csv")[-1, 0])
+    _stated(sensor=read_meta(folder)["sensor"] | {"free_s": [[0.0, end_s]]})(folder)
+
+
+def _draw_tissue(radius: float, inside: bool) -> Change:
+    """Writes tissue.png: a disc of a share of the picture's height, or all but it."""
+
+    def apply(folder: Path) -> None:
+        height, width = _read(sorted((folder / "frames").iterdir())[0]).shape[:2]
+        disc = np.zeros((height, width), np.uint8)
+        cv2.circle(disc, (width // 2, height // 2), round(radius * height), 255, -1)
+        cv2.imwrite(str(folder / "tissue.png"), disc if inside else 255 - disc)
+
+    return apply
+
+
+def _invert_masks(folder: Path) -> None:
+    height, width = _read(sorted((folder / "frames").iterdir())[0]).shape[:2]
+    (folder / "masks").mkdir(exist_ok=True)
+    for k in range(FRAMES):
+        file = folder / "masks" / f"{k:06d}.png"
+        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.exists() else np.zeros((height, width))
+        cv2.imwrite(str(file), (255 - mask).astype(np.uint8))
+
+
+def _damage(cut: bool) -> Change:
+    """A video that is cut off at 60%, or has bytes overwritten in its second half."""
+
+    def apply(folder: Path) -> None:
+        time_s = read_table(folder / "frames.csv")[:, 1]
+        pictures = (_read(file) for file in sorted((folder / "frames").iterdir()))
+        recording_writer.write_video(folder / "video.mp4", pictures, time_s, crf=18)
+        shutil.rmtree(folder / "frames")
+        data = bytearray((folder / "video.mp4").read_bytes())
+        rng = np.random.default_rng(0)
+        for start in [] if cut else rng.integers(len(data) // 2, int(0.85 * len(data)), 40):
+            data[start : start + 8] = rng.bytes(8)
+        (folder / "video.mp4").write_bytes(bytes(data[: int(0.6 * len(data))] if cut else data))
+
+    return apply
+
+
 def _compress(folder: Path) -> None:
     time_s = read_table(folder / "frames.csv")[:, 1]
     for name, video in (("frames", "video.mp4"), ("right", "right.mp4")):
@@ -169,6 +230,15 @@ MONOCULAR: dict[str, tuple[Change, str]] = {
     "sensor: saturated": (_sensor(lambda t, f: (t, f.clip(f.min() / 2, f.max() / 2))), "^sensor"),
     "sensor: clock 8% fast": (_sensor(lambda t, f: (t * 1.08, f)), "^clocks"),
     "sensor: clock 0.6 s off": (_sensor(lambda t, f: (t - 0.6, f)), "^clocks"),
+    "sensor: drift of a fifth": (_drift(0.2), "drift"),
+    "sensor: offset without a tare": (_offset, "^sensor|^rest frame"),
+    "sensor: free_s under load": (_free_under_load, "free_s"),
+    "sensor: stamped as 30 for 25": (_sensor(lambda t, f: (t * 25 / 30, f)), "^clocks"),
+    "tissue.png: a blob": (_draw_tissue(0.06, True), "^tissue|tissue.png"),
+    "tissue.png: inverted": (_draw_tissue(0.4, False), "^tissue|tissue.png"),
+    "masks: inverted": (_invert_masks, "^tool"),
+    "video: cut off": (_damage(True), "cut off|damaged|cannot be read|unreadable|not readable"),
+    "video: corrupt packets": (_damage(False), "damaged|cut off|cannot be read|unreadable|not readable"),
     "white balance": (_each(lambda rgb, k: rgb * [1.2, 1, 0.7]), ""),
     "gauze at rest": (_later(lambda rgb: _cover(rgb, (225, 220, 212), 0, 0.2), 0), ""),
     "grey": (_each(lambda rgb, k: rgb @ np.full((3, 3), 1 / 3)), ""),
@@ -184,6 +254,8 @@ STEREO: dict[str, tuple[Change, str]] = {
         "^stereo|right camera",
     ),
     "right camera out of focus": (_later(_blur, 0, "right"), "^stereo"),
+    "right camera of another site": (_later(lambda rgb: rgb[::-1], 0, "right"), "^stereo|mirrored|match"),
+    "right camera's gain: half": (_later(lambda rgb: 0.5 * rgb, 0, "right"), ""),
     "cameras swapped": (_swap_cameras, "swapped"),
     "baseline 2 times too long": (_stated(stereo=_PAIR), "^scale"),
 }  # fmt: skip

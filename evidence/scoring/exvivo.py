@@ -29,6 +29,7 @@ from synth.job import schema as jobs
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.scene import SceneState
 from synth.sequence import scenario
+from synth.sequence.draw import read_scheme
 from synth.sequence.rest_scene import at_rest
 from synth.system import checked_file
 from synth.system.terminal import counting
@@ -180,9 +181,11 @@ def _moved(
     """Deformation from no load to full load, by a gesture that only rises."""
     rising = tool_gesture.Gesture(**{**vars(gesture), "timing": (0.02, 1.0, 2.0, 3.0)})
     height = HeightMap(surface.pia, surface.extent_mm)
-    tets = tetrahedra.block(job.anatomy, job.fem.tets, gesture.focus, height)
+    opening_mm, dome_mm = job.anatomy.craniotomy.radius_mm, job.anatomy.dome_mm
+    sizes = job.fem.tets, gesture.focus, height
+    tets = tetrahedra.block(*sizes, opening_mm=opening_mm, dome_mm=dome_mm)
     shape = Shape(surface.vertices, surface.faces)
-    return solver.deform(job.fem, case.tissue, [rising], tets, shape, job.frames, job.fps)
+    return solver.deform(read_scheme(job.fem), case.tissue, [rising], tets, shape, job.frames, job.fps)
 
 
 def _course(plan: Plan, rng: np.random.Generator) -> _Course:

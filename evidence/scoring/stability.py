@@ -4,7 +4,8 @@ Each change is applied to a described recording with two cameras (tissue, instru
 stated) and to a bare one with one camera (scale and E only); plain, covered and pulsating tissue take turns.
 A row is *silent* if its force errs by a tenth of the peak more than that of the undegraded recording, is not
 held back, and no finding names the cause: a finding of another kind clears nothing, nor does an interval
-that is wide enough to hold any force. Undegraded recordings show what each further statement gains.
+that is wide enough to hold any force. It is *vague* if it is stated with an interval wider than the peak, of
+which nobody can act. Undegraded recordings show what each further statement gains.
 """
 
 import re
@@ -43,6 +44,7 @@ _CASES = (2, 2), (0, 1)  # of degraded recordings: how much is stated, of `_GIVE
 _CLEAN = 4  # undegraded recordings of each kind
 _SENSOR_HZ, _SENSOR_NOISE = 100.0, 0.005
 _WRONG = 0.1  # of the peak
+_VAGUE = 1.0  # width of the interval over the peak, from which it says nothing
 
 
 def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_TISSUE)) -> dict[str, Any]:
@@ -66,6 +68,22 @@ def measure(work: Path, seed: int = 35, only: str = "", kinds: str = ",".join(_T
 def is_silent(row: Mapping[str, Any]) -> bool:
     """Whether a force is wrong, not held back, and no finding names the cause."""
     return row["named"] is False and (row["error"] or 0.0) > _WRONG + (row.get("usual") or 0.0)
+
+
+def is_vague(row: Mapping[str, Any]) -> bool:
+    """Whether a force is stated with an interval that is wider than the peak."""
+    return row["width"] is not None and row["width"] > _VAGUE
+
+
+def count_caught(points: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """Number of ways to degrade whose cause is named or whose force is held back in every recording, of all
+    that have a cause to name."""
+    caught = [
+        all(row["named"] or row["error"] is None for row in rows)
+        for _, rows in report.grouped(points, "change").items()
+        if rows[0]["named"] is not None
+    ]
+    return sum(caught), len(caught)
 
 
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -172,6 +190,11 @@ def page(found: Mapping[str, Any]) -> report.Page:
     ]
     ways = len(report.grouped(points, "change"))
     verdict = f"**In {len(silent)} of {len(points)} recordings, degraded in {ways} ways, {_VERDICT}"
+    caught, faults = count_caught(points)
+    stated_rows = [row for row in points if row["width"] is not None]
+    vague = sum(map(is_vague, stated_rows))
+    verdict += f" Named or held back in every recording: {caught} of {faults} faults. Of {len(stated_rows)} "
+    verdict += f"stated forces {vague} have an interval wider than the peak."
     others = [f"*{outcome}*: {'; '.join(some)}." for outcome, some in names.items()]
     sections = [
         report.Section("Wrong without its cause", table),

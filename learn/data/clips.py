@@ -13,7 +13,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from learn.data.grid import Grid, GridView, certainty, settled
+from learn.data.grid import Grid, GridView, certainty, settle
 from synth.arrays import Array, Floats, Map
 from synth.dataset.sequence_split import name_anatomy
 from synth.dataset.store import Dataset, Sequence
@@ -125,7 +125,7 @@ def read_clip(sequence: Sequence, grid: Grid, wanted: Iterable[str]) -> Clip:
     if "motion" in wanted:
         spatial = on_grid("motion_deviation", certainty)
     loads = (traction.transpose(2, 0, 1) * area for traction in sequence.read_sealed("traction"))
-    density = np.stack([settled(view.sum(load), view.mask) for load in loads])
+    density = np.stack([settle(view.sum(load), view.mask) for load in loads])
     density /= np.float32(grid.pitch_mm**2 * young)
     return Clip(
         **_plain(sequence),
@@ -143,8 +143,8 @@ def check_readable(sequence: Sequence, wanted: Iterable[str]) -> None:
     for source in wanted:
         if FIELDS[source] not in sequence:
             what = "stereo motion" if has_depth(source) else f"{source} flow"
-            alike = (one for one in FIELDS if has_depth(one) is has_depth(source))
-            others = [f"use --input {one}" for one in alike if FIELDS[one] in sequence]
+            alike = (name for name in FIELDS if has_depth(name) is has_depth(source))
+            others = [f"use --input {name}" for name in alike if FIELDS[name] in sequence]
             hint = ", or ".join([_CURE[source], *others[:1]])
             raise UserError(f"{sequence.path}: holds no {what} (field {FIELDS[source]}); {hint}")
     if sequence.attrs.get("scale_mm_per_px") is None:
@@ -185,13 +185,13 @@ def load_clips(
     clips = []
     for i, sequence in enumerate(dataset):
         report(i, len(dataset))
-        packed = cache and _packed(sequence, grid, wanted, cache)
+        packed = cache and _pack(sequence, grid, wanted, cache)
         clips.append(packed or read_clip(sequence, grid, wanted))
     report(len(dataset), len(dataset))
     return clips
 
 
-def _packed(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
+def _pack(sequence: Sequence, grid: Grid, wanted: tuple[str, ...], cache: Path) -> Clip:
     # A forged content hash can't fill the cache: opening a store checks the hash against the attributes, and
     # reading a field checks its values.
     key = [sequence.attrs["content_hash"], grid.size, grid.extent_mm, *wanted, CLIPS]
@@ -230,10 +230,10 @@ def unpack(file: Path) -> Clip:
 
 
 def _checksum(arrays: Mapping[str, Array]) -> int:
-    found = 0
+    checksum = 0
     for name in sorted(arrays):
-        found = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, found)
-    return found
+        checksum = zlib.crc32(arrays[name].reshape(-1).view(np.uint8).data, checksum)
+    return checksum
 
 
 def target(clip: Clip, frame: int, components: int) -> Map:

@@ -130,7 +130,7 @@ def to_image(
     return np.where((np.abs(cells) <= middle + 0.5).all(axis=0), shown, 0).astype(np.float32)
 
 
-def settled(amount: Map, mask: Map) -> Map:
+def settle(amount: Map, mask: Map) -> Map:
     """Moves amounts outside the mask to the nearest cell inside, which preserves the total.
 
     `amount`: (C, N, N) per cell; `mask`: (N, N) 0/1, not empty. Returns (C, N, N), 0 outside the mask.

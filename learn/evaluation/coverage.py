@@ -38,19 +38,19 @@ class Coverage:
 
 def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Coverage]:
     """Coverage at every level, of a model with intervals."""
-    found = predictor.card.intervals
-    assert found is not None
+    intervals = predictor.card.intervals
+    assert intervals is not None
     rows: dict[float, list[dict[str, float]]] = {level: [] for level in LEVELS}
     far = [np.zeros(0)]
     for clip in clips:
         predicted = predict_clip(predictor, clip, source)
-        for level, own in rows.items():
-            own.append(_cover_clip(found, predicted, clip, level))
-        far.append(found.distribution.relative_distance(predicted.motion)[is_moving(predicted.motion)])
+        for level, clip_rows in rows.items():
+            clip_rows.append(_cover_clip(intervals, predicted, clip, level))
+        far.append(intervals.distribution.relative_distance(predicted.motion)[is_moving(predicted.motion)])
     moved, out = np.concatenate(far), []
-    for level, own in rows.items():
+    for level, clip_rows in rows.items():
         rng = np.random.default_rng(0)
-        columns = {name: np.array([row[name] for row in own]) for name in own[0]}
+        columns = {name: np.array([row[name] for row in clip_rows]) for name in clip_rows[0]}
         shares = {name: interval(columns.pop(name), rng) for name in ("size", *"xyz")}
         values = {k: float(np.nanmean(v)) if np.isfinite(v).any() else math.nan for k, v in columns.items()}
         values["out_of_distribution"] = float((moved > 1).mean()) if len(moved) else math.nan
@@ -59,9 +59,9 @@ def cover(predictor: Predictor, clips: Sequence[Clip], source: str) -> list[Cove
     return out
 
 
-def _cover_clip(found: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:
+def _cover_clip(intervals: Intervals, predicted: Prediction, clip: Clip, level: float) -> dict[str, float]:
     """One sequence's coverages and widths, by the names of `Coverage`."""
-    band, young = found.bound(predicted, level), clip.young_kpa
+    band, young = intervals.bound(predicted, level), clip.young_kpa
     force = clip.force / young
     size = np.linalg.norm(force, axis=1)
     axes = ((force >= band.axes_low) & (force <= band.axes_high)).mean(0)

@@ -55,7 +55,7 @@ def score(clip: Clip, predicted: Map, card: ModelCard) -> ClipScore:
     true_mn: Floats = np.linalg.norm(amount(clip, parts, pitch) * young, axis=1)
     low = true_mn < LOW * card.scales.force * young
     centres = [contact_mm(size[t], pitch) - contact_mm(true_size[t], pitch) for t in np.flatnonzero(~low)]
-    off = [d for d in (float(np.linalg.norm(one)) for one in centres) if math.isfinite(d)]
+    off = [d for d in (float(np.linalg.norm(centre)) for centre in centres) if math.isfinite(d)]
     peak = float(true_mn.max())
     others = {}
     if parts == 3:
@@ -105,12 +105,12 @@ class EvaluationReport:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready; NaN as null."""
-        found = {
+        values = {
             "sequences": [{"name": c.name, "young_kpa": c.young_kpa} | c.as_row() for c in self.clips],
             "summary": self.summary(),
             "intervals": {k: {"low": i.low, "high": i.high} for k, i in self.intervals().items()},
         }
-        return dict(as_plain(found))
+        return dict(as_plain(values))
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -35,12 +35,12 @@ def add_intervals(
     the factors. UserError if nothing moves.
     """
     selection, calibration = ([clips[i] for i in part] for part in (split.select, split.intervals))
-    why, found = find_obstacle(selection, calibration), None
+    why, intervals = find_obstacle(selection, calibration), None
     if not why:
         source = scored_source(predictor.card.settings.input)
         fitted = [clips[i] for i in split.fit if source in clips[i].displacement]
-        found = _fit(predictor, (fitted, selection, calibration), source, report)
-    card = replace(predictor.card, intervals=found, no_intervals=why)
+        intervals = _fit(predictor, (fitted, selection, calibration), source, report)
+    card = replace(predictor.card, intervals=intervals, no_intervals=why)
     write_card(folder, card)
     return card
 
@@ -64,7 +64,7 @@ def _fit(
     if distribution is None:
         raise UserError("nothing moves in the sequences that the intervals are to be fitted on")
     # A recording's distance doesn't depend on errors: all sequences but the training ones count.
-    distribution = distribution.calibrated([one.motion for one in examples])
+    distribution = distribution.calibrated([example.motion for example in examples])
     return fit(first, second, distribution, motion_names(card.settings.arch.depth), unit, source)
 
 

@@ -56,7 +56,7 @@ def pooled_r2(moments: Floats, rng: np.random.Generator, draws: int = _DRAWS) ->
     sequences; NaN with fewer than three."""
 
     def r2(*sums: Floats, axis: int) -> Floats:
-        return agreements(np.stack([one.sum(axis) for one in sums], axis=-1))["r2"]
+        return agreements(np.stack([moment.sum(axis) for moment in sums], axis=-1))["r2"]
 
     return _bootstrap(r2, tuple(np.asarray(moments, np.float64).T), rng, draws)
 
@@ -92,8 +92,8 @@ def _bootstrap(
     if n >= least and np.isfinite(value):
         with warnings.catch_warnings(), np.errstate(invalid="ignore"):
             warnings.simplefilter("ignore", stats.DegenerateDataWarning)  # equal values: NaN
-            found = stats.bootstrap(
+            result = stats.bootstrap(
                 data, statistic, paired=True, vectorized=True, n_resamples=draws, method=method, rng=rng
             ).confidence_interval
-        low, high = float(found.low), float(found.high)
+        low, high = float(result.low), float(result.high)
     return Interval(value, low, high, n)

@@ -28,9 +28,9 @@ def score_table(report: EvaluationReport, title: str, all: bool) -> Table:
 
 def coverage_table(covered: Sequence[Coverage]) -> Table:
     """Coverage and width of the model's intervals."""
-    table = open_table("intervals", *(f"{one.level:.0%}" for one in covered))
+    table = open_table("intervals", *(f"{coverage.level:.0%}" for coverage in covered))
     for key in covered[0].shares:
-        shares = [one.shares[key] for one in covered]
+        shares = [coverage.shares[key] for coverage in covered]
         name = "force" if key == "size" else key
         table.add_row(f"{name} within", *(f"{s.mean:.0%} [{s.low:.0%}, {s.high:.0%}]" for s in shares))
     for name, key, spec in (
@@ -38,7 +38,7 @@ def coverage_table(covered: Sequence[Coverage]) -> Table:
         ("the same over the peak", "width_of_peak", ".0%"),
         ("moving frames out of distribution", "out_of_distribution", ".0%"),
     ):
-        table.add_row(name, *(format(one.values[key], spec) for one in covered))
+        table.add_row(name, *(format(coverage.values[key], spec) for coverage in covered))
     return table
 
 

@@ -89,8 +89,8 @@ def open_source(
     `threads`: of a model that is given by its name.
     """
     named = model or choose_model(has_right_camera(source))
-    found = named if isinstance(named, Predictor) else load_model(named, threads=threads)
-    return found, motions(source, found.stored(input), options)
+    predictor = named if isinstance(named, Predictor) else load_model(named, threads=threads)
+    return predictor, motions(source, predictor.choose_source(input), options)
 
 
 def apply(
@@ -104,20 +104,20 @@ def apply(
     young = young_kpa if young_kpa is not None else motion.young_kpa
     young = young if motion.scale_known else None
     estimator = ForceEstimator(predictor, motion.tissue, motion.scale_mm_per_px, young, membrane)
-    rows, found = [], list[FrameForce]()
+    rows, forces = [], list[FrameForce]()
     for frame in motion.frames():
         rows.append((frame.index, math.nan if frame.time_s is None else frame.time_s, frame.trusted))
-        found.append(estimator.estimate(frame))
+        forces.append(estimator.estimate(frame))
     findings = problems([*judge_young(young), *motion.findings])
     fault = first_fault(findings)
     numbers, times, followed = map(np.array, zip(*rows, strict=True))
     trusted = followed & (not fault)
-    force = np.where(trusted[:, None], [each.force_mn for each in found], np.nan)
-    last = found[-1].map
+    force = np.where(trusted[:, None], [each.force_mn for each in forces], np.nan)
+    last = forces[-1].map
     # Pixel coordinates are of pixel centres: a picture begins at -0.5.
-    centres = motion.shrink * (np.array([each.map.view.centre_px for each in found]) + 0.5) - 0.5
+    centres = motion.shrink * (np.array([each.map.view.centre_px for each in forces]) + 0.5) - 0.5
     out: dict[str, Any] = {
-        "density": np.stack([one.map.density for one in found]),
+        "density": np.stack([each.map.density for each in forces]),
         "total_force_mn": np.where(trusted, force_size(force), np.nan),
         "trusted": trusted,
         "mask": last.view.mask,
@@ -138,7 +138,7 @@ def apply(
     notes = [*doubt, *warned, *motion.notes, *estimator.notes]
     if motion.scale_known:
         notes += estimator.interval_notes
-        out |= _ends(found, trusted)
+        out |= _ends(forces, trusted)
         if "low_mn" in out and not doubt:
             out["level"] = np.array(LEVELS)
     if fault:
@@ -149,14 +149,14 @@ def apply(
     return out
 
 
-def _ends(found: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
+def _ends(forces: Sequence[FrameForce], trusted: Mask) -> dict[str, Floats]:
     """Ends of the intervals by field, (T,) or (T, 3) mN, NaN where not `trusted` (T,)."""
-    if not found[0].bands:
+    if not forces[0].bands:
         return {}
-    wide, narrow = ([vars(one.bands[level]) for one in found] for level in LEVELS)
+    wide, narrow = ([vars(force.bands[level]) for force in forces] for level in LEVELS)
     names = {"low": "low_mn", "high": "high_mn", "axes_low": "force_low_mn", "axes_high": "force_high_mn"}
-    out = {name: [one[end] for one in wide] for end, name in names.items()}
-    out |= {f"{end}68_mn": [one[end] for one in narrow] for end in ("low", "high")}
+    out = {name: [band[end] for band in wide] for end, name in names.items()}
+    out |= {f"{end}68_mn": [band[end] for band in narrow] for end in ("low", "high")}
     sure = np.where(trusted, 1.0, np.nan)
     return {name: (np.concatenate(ends).T * sure).T for name, ends in out.items()}
 

@@ -50,13 +50,13 @@ def examples(card: ModelCard, batch: int, seed: int = 0) -> list[Tensor]:
     basis = np.stack([np.ones_like(x), x, y, x * y, np.cos(3 * x), np.sin(3 * y)])
     moved = np.einsum("bck,kyx->bcyx", a, basis) * card.scales.displacement_mm / 3
     mask = np.broadcast_to(x**2 + y**2 < 0.7, (batch, 1, n, n))
-    found = {
+    inputs = {
         "displacement": moved,
         "mask": mask,
         "confidence": rng.uniform(size=(batch, parts - 1, n, n)),
         "membrane": rng.integers(-1, 2, batch),
     }
-    return [torch.from_numpy(np.array(found[name], np.float32)) for name in input_names(card)]
+    return [torch.from_numpy(np.array(inputs[name], np.float32)) for name in input_names(card)]
 
 
 @torch.no_grad()
@@ -90,8 +90,8 @@ def to_onnx(network: nn.Module, card: ModelCard, gain: float = 1.0) -> tuple[byt
         expected = module(*inputs)
         largest = max(card.scales.target, float(expected.abs().max()))
         named = {name: value.numpy() for name, value in zip(names, inputs, strict=True)}
-        found = torch.from_numpy(session.run(None, named)[0])
-        worst = max(worst, float((found - expected).abs().max()) / largest)
+        output = torch.from_numpy(session.run(None, named)[0])
+        worst = max(worst, float((output - expected).abs().max()) / largest)
     if not worst <= TOLERANCE:
         raise UserError(f"in ONNX the network differs from PyTorch by {worst:.1e} of full scale: too much")
     return data, worst

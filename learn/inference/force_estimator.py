@@ -54,15 +54,15 @@ def predict_force(
         raise UserError(f"tissue: expected an array (H, W), got {size}")
     inside = check_answer("predict_force", "tissue", tissue, size) != 0
     estimator = ForceEstimator(model, inside, scale_mm_per_px, young_kpa, membrane)
-    sure, found = np.ones(size, np.float32), list[Floats]()
-    pairs = ((one, sure) for one in flow) if confidence is None else zip_longest(flow, confidence)
+    sure, forces = np.ones(size, np.float32), list[Floats]()
+    pairs = ((step, sure) for step in flow) if confidence is None else zip_longest(flow, confidence)
     for moved, weight in pairs:
         if moved is None or weight is None:
             raise UserError("confidence: has another number of frames than flow")
         moved = check_answer("predict_force", "flow", moved, (*size, 2))
         weight = check_answer("predict_force", "confidence", weight, size, (0.0, 1.0))
-        found.append(estimator.estimate(FrameMotion(moved, weight)).force_mn)
-    return np.array(found).reshape(-1, 3)
+        forces.append(estimator.estimate(FrameMotion(moved, weight)).force_mn)
+    return np.array(forces).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,17 @@ class ForceEstimator:
     def estimate(self, frame: FrameMotion) -> FrameForce:
         """The force of a frame. Raises as `Predictor`."""
         place = self.placement.place(frame.flow, frame.confidence)
-        found = self._predict(frame, place)
+        force_map = self._predict(frame, place)
         if place not in self._at_rest:
             motion = frame.motion and Moved(0 * frame.motion.motion, 0 * frame.motion.deviation)
             still = FrameMotion(np.zeros_like(frame.flow), self._tissue.astype(np.float32), motion=motion)
             self._at_rest[place] = self._predict(still, place)
         # In a lost frame no pixel reaches the confidence of tracked tissue.
-        if found.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
-            self._tracked.append(found.motion)
-        density, at_rest = found.density[None], self._at_rest[place].density[None]
-        force = net_force(density, at_rest, found.grid)[0]
-        return FrameForce(force, found, self._bound(force, found))
+        if force_map.motion is not None and frame.confidence.max() >= LOW_CONFIDENCE:
+            self._tracked.append(force_map.motion)
+        density, at_rest = force_map.density[None], self._at_rest[place].density[None]
+        force = net_force(density, at_rest, force_map.grid)[0]
+        return FrameForce(force, force_map, self._bound(force, force_map))
 
     @property
     def notes(self) -> list[str]:
@@ -128,30 +128,30 @@ class ForceEstimator:
     @property
     def interval_notes(self) -> list[str]:
         """Warnings about the intervals, complete after the last frame."""
-        found = self._predictor.card.intervals
-        if found is None:
+        intervals = self._predictor.card.intervals
+        if intervals is None:
             return []
         ideal = ["intervals were fitted on true motion: for recovered motion they are too narrow"]
-        notes = ideal if found.source in ("ideal", "motion-ideal") else []
+        notes = ideal if intervals.source in ("ideal", "motion-ideal") else []
         if self._tracked:
             motion = np.stack(self._tracked)
-            notes = notes + describe_out_of_distribution(found.distribution, found.features, motion)
+            notes = notes + describe_out_of_distribution(intervals.distribution, intervals.features, motion)
         return notes
 
     def _predict(self, frame: FrameMotion, place: Point) -> ForceMap:
         given = frame.flow, self._tissue, self._scale, self._young_kpa, frame.confidence, frame.motion
-        found = self._predictor(*given, centre_px=place, membrane=self._membrane)
-        if found.young_known:
-            return found
-        part = np.float32(UNKNOWN_YOUNG_KPA / found.young_kpa)
-        return replace(found, density=part * found.density, young_kpa=UNKNOWN_YOUNG_KPA)
+        force_map = self._predictor(*given, centre_px=place, membrane=self._membrane)
+        if force_map.young_known:
+            return force_map
+        part = np.float32(UNKNOWN_YOUNG_KPA / force_map.young_kpa)
+        return replace(force_map, density=part * force_map.density, young_kpa=UNKNOWN_YOUNG_KPA)
 
-    def _bound(self, force: Floats, found: ForceMap) -> dict[float, Band]:
+    def _bound(self, force: Floats, force_map: ForceMap) -> dict[float, Band]:
         """Intervals of a frame's force, as `FrameForce.bands`."""
-        if found.motion is None:
+        if force_map.motion is None:
             return {}
-        intervals, young, motion = self._predictor.card.intervals, found.young_kpa, found.motion[None]
+        intervals, young, motion = self._predictor.card.intervals, force_map.young_kpa, force_map.motion[None]
         assert intervals is not None, "only a model with intervals gives a map its motion"
-        magnitude = found.magnitude[None] / np.float32(young)
-        predicted = Prediction(motion, force[None] / young, magnitude, found.grid.pitch_mm)
+        magnitude = force_map.magnitude[None] / np.float32(young)
+        predicted = Prediction(motion, force[None] / young, magnitude, force_map.grid.pitch_mm)
         return {level: intervals.bound(predicted, level).times(young) for level in LEVELS}

@@ -41,9 +41,9 @@ class GridPlacement:
         power = np.square(flow.astype(np.float32)).sum(-1) * usable
         if float(np.quantile(power[self._tissue][::7], 0.98)) < _STILL_PX**2:
             return self.centre_px
-        found = self._within(self._strongest(power))
-        if max(abs(a - b) for a, b in zip(found, self.centre_px, strict=True)) > _OFF_CENTRE * 2 * self._half:
-            self.centre_px, self.moves = found, self.moves + 1
+        place = self._within(self._strongest(power))
+        if max(abs(a - b) for a, b in zip(place, self.centre_px, strict=True)) > _OFF_CENTRE * 2 * self._half:
+            self.centre_px, self.moves = place, self.moves + 1
         return self.centre_px
 
     def _strongest(self, power: Map) -> Point:

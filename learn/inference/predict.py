@@ -80,7 +80,7 @@ class Predictor:
             raise UserError("network.onnx: its inputs are not those of config.json")
         self._view: GridView | None = None
 
-    def readable(self, source: str) -> str:
+    def check_source(self, source: str) -> str:
         """The source of displacement as given. Raises UserError if this model can't use it."""
         fit = [name for name in FIELDS if has_depth(name) == self.card.settings.arch.depth]
         if source not in fit:
@@ -88,9 +88,9 @@ class Predictor:
             raise UserError(f"{what} input {source!r}: one of {', '.join(fit)}")
         return source
 
-    def stored(self, source: str | None) -> str:
-        """The source to read from a store; the recovered one if none is given. Raises as `readable`."""
-        return self.readable(source or ("motion" if self.card.settings.arch.depth else "recovered"))
+    def choose_source(self, source: str | None) -> str:
+        """The source to read from a store; the recovered one if none is given. Raises as `check_source`."""
+        return self.check_source(source or ("motion" if self.card.settings.arch.depth else "recovered"))
 
     @checked
     def __call__(
@@ -195,8 +195,8 @@ class Predictor:
             if settings.arch.membrane:
                 known["membrane"] = np.full(len(moved), membrane_code(membrane), np.float32)
             with as_user_error("the network"):
-                (found,) = self._network.run(["density"], known)
-            maps.append(_check_shape(found, (len(moved), settings.arch.components, n, n)))
+                (output,) = self._network.run(["density"], known)
+            maps.append(_check_shape(output, (len(moved), settings.arch.components, n, n)))
         with np.errstate(over="ignore", invalid="ignore"):  # checked below
             density = np.concatenate(maps) * np.float32(self.card.force_gain * young_kpa)
         if not np.isfinite(density).all():
@@ -204,11 +204,11 @@ class Predictor:
         return density
 
 
-def _check_shape(found: Array, shape: tuple[int, ...]) -> Map:
+def _check_shape(output: Array, shape: tuple[int, ...]) -> Map:
     """A network's output. UserError if it is of another shape."""
-    if found.shape != shape:
-        raise UserError(f"network.onnx: its output is {found.shape}, expected {shape}")
-    return np.asarray(found, np.float32)
+    if output.shape != shape:
+        raise UserError(f"network.onnx: its output is {output.shape}, expected {shape}")
+    return np.asarray(output, np.float32)
 
 
 @dataclass(frozen=True)
@@ -248,8 +248,8 @@ class ForceMap:
 
 def length(density: Map) -> Map:
     """Length over the component axis (..., C, N, N); the value itself if there is one component."""
-    one = density.shape[-3] == 1
-    return density.squeeze(-3) if one else np.asarray(np.sqrt(np.square(density).sum(-3)))
+    is_scalar = density.shape[-3] == 1
+    return density.squeeze(-3) if is_scalar else np.asarray(np.sqrt(np.square(density).sum(-3)))
 
 
 def total_force(density: Map, grid: Grid) -> Floats:

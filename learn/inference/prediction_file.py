@@ -95,67 +95,75 @@ def predict_files(
         stem = out / motion.name
         if (file := stem.with_name(f"{stem.name}.npz")).exists() and file.samefile(source):
             raise UserError(f"{file}: is the input and would be overwritten; choose another --out")
-        found = apply(predictor, motion, young_kpa, membrane)
-        write_prediction(found, stem)
+        prediction = apply(predictor, motion, young_kpa, membrane)
+        write_prediction(prediction, stem)
         if overlay:
-            write_overlay(found, source if alone else source / f"{motion.name}.zarr", stem)
-        size = found["total_force_mn"][found["trusted"]]
+            write_overlay(prediction, source if alone else source / f"{motion.name}.zarr", stem)
+        size = prediction["total_force_mn"][prediction["trusted"]]
         peak = float(size.max()) if len(size) else None
-        yield PredictedFile(motion.name, len(found["trusted"]), peak, found["notes"].tolist())
+        yield PredictedFile(motion.name, len(prediction["trusted"]), peak, prediction["notes"].tolist())
 
 
-def write_prediction(found: dict[str, Any], stem: Path) -> None:
+def write_prediction(prediction: dict[str, Any], stem: Path) -> None:
     """Writes `stem`.npz and `stem`.force.csv, each atomically, from the fields that `apply` returns."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     with checked_file.part_of(stem.with_name(f"{stem.name}.npz")) as part, part.open("wb") as file:
-        np.savez_compressed(file, **{name: found[name] for name in FIELDS if name in found})
+        np.savez_compressed(file, **{name: prediction[name] for name in FIELDS if name in prediction})
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
-    for t, number in enumerate(found["frame"]):
-        time = found["time_s"][t] if "time_s" in found else np.nan
-        force = found["force_mn"][t] if "force_mn" in found else (np.nan,) * 3
-        ends = [found[name][t] if name in found else np.nan for name in _ENDS]
-        numbers = (time, found["total_force_mn"][t], *force, *ends)
+    for t, number in enumerate(prediction["frame"]):
+        time = prediction["time_s"][t] if "time_s" in prediction else np.nan
+        force = prediction["force_mn"][t] if "force_mn" in prediction else (np.nan,) * 3
+        ends = [prediction[name][t] if name in prediction else np.nan for name in _ENDS]
+        numbers = (time, prediction["total_force_mn"][t], *force, *ends)
         values = [f"{value:.6g}" if np.isfinite(value) else "" for value in numbers]
-        table.writerow([int(number), values[0], int(found["trusted"][t]), *values[1:]])
+        table.writerow([int(number), values[0], int(prediction["trusted"][t]), *values[1:]])
     write_whole(stem.with_name(f"{stem.name}.force.csv"), text.getvalue(), durable=False)
 
 
-def write_overlay(found: dict[str, Any], source: Path, stem: Path) -> Path | None:
+def write_overlay(prediction: dict[str, Any], source: Path, stem: Path) -> Path | None:
     """Writes `stem`.force.mp4: the processed frames with the rest frame's force map and the curve below.
 
     `found`: of `apply`; `source`: a video or a sequence's store. None, without a file, if it has no pictures.
     """
-    wanted = {int(number) for number in found["frame"]}
+    wanted = {int(number) for number in prediction["frame"]}
     if video.is_video(source):
-        pictures = (one.rgb for one in video.read_frames(source, video.FPS) if one.index in wanted)
+        pictures = (frame.rgb for frame in video.read_frames(source, video.FPS) if frame.index in wanted)
     elif source.suffix == ".zarr":
         sequence = open_sequence(source)
         pictures = (sequence["rgb"][t] for t in sorted(wanted))
     else:
         return None
-    times = found.get("time_s", np.arange(len(found["frame"])) / video.FPS)
+    times = prediction.get("time_s", np.arange(len(prediction["frame"])) / video.FPS)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     fps = float(np.clip(1 / step, 1, 120)) if step > 0 else video.FPS
-    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(found, times, pictures), fps)
+    return encode_video(stem.with_name(f"{stem.name}.force.mp4"), _drawn(prediction, times, pictures), fps)
 
 
-def _drawn(found: dict[str, Any], times: Floats, pictures: Iterator[Pixels]) -> Iterator[Pixels]:
-    force, size = found["total_force_mn"], length(found["density"])
+def _drawn(prediction: dict[str, Any], times: Floats, pictures: Iterator[Pixels]) -> Iterator[Pixels]:
+    force, size = prediction["total_force_mn"], length(prediction["density"])
     largest, curve = float(np.max(size, initial=0.0)), None
     for t, rgb in enumerate(pictures):
         shrink = max(1, -(-rgb.shape[1] // _WIDEST_PX))
         small = cv2.resize(rgb, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
         small = picture.legible(np.asarray(small, np.uint8))
-        place = found["centres_px"][t], float(found["scale_mm_per_px"]), float(found["pitch_mm"])
+        place = (
+            prediction["centres_px"][t],
+            float(prediction["scale_mm_per_px"]),
+            float(prediction["pitch_mm"]),
+        )
         values = to_image(size[t], (rgb.shape[0], rgb.shape[1]), *place)
         values = cv2.resize(values, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_LINEAR)
         if curve is None:
             curve = sequence_video.draw_curve(times, force, small.shape[1])
-        known = "" if found["young_known"] else f", if E is {found['young_kpa']:.3g} kPa"
-        ends = f" [{found['low_mn'][t]:.1f}, {found['high_mn'][t]:.1f}]" if "low_mn" in found else ""
-        text = f"{force[t]:.1f} mN{ends}{known}" if found["trusted"][t] else "could not be followed"
-        shown = sequence_video.glow(small, values, largest) if found["trusted"][t] else small
+        known = "" if prediction["young_known"] else f", if E is {prediction['young_kpa']:.3g} kPa"
+        ends = (
+            f" [{prediction['low_mn'][t]:.1f}, {prediction['high_mn'][t]:.1f}]"
+            if "low_mn" in prediction
+            else ""
+        )
+        text = f"{force[t]:.1f} mN{ends}{known}" if prediction["trusted"][t] else "could not be followed"
+        shown = sequence_video.glow(small, values, largest) if prediction["trusted"][t] else small
         shown = picture.caption(shown, f"{times[t]:.2f} s  {text}")
         yield np.vstack([shown, sequence_video.mark(curve, t, len(force))])

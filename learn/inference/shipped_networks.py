@@ -26,8 +26,8 @@ def choose_model(stereo: bool) -> Path:
 
 def find_name(card: ModelCard) -> str:
     """The name of the pretrained network with the same weights; empty if there is none."""
-    found = {checkpoint.read_card(MODELS / name).weights_hash: name for name in NAMES}
-    return found.get(card.weights_hash, "")
+    names = {checkpoint.read_card(MODELS / name).weights_hash: name for name in NAMES}
+    return names.get(card.weights_hash, "")
 
 
 def hash_data(card: ModelCard) -> str:

@@ -68,7 +68,7 @@ def motions(path: Path | Array, source: str, options: VideoOptions | None = None
         yield _arrays(path)
     else:
         for sequence in _sequences(path):
-            yield _stored(sequence, source)
+            yield _read_stored(sequence, source)
 
 
 def has_right_camera(path: Path | Array) -> bool:
@@ -82,11 +82,11 @@ def has_right_camera(path: Path | Array) -> bool:
 
 
 def _sequences(path: Path) -> Iterator[Sequence]:
-    one = path.name.endswith((".zarr", ".zarr.part"))
-    yield from [open_sequence(path)] if one else Dataset(path)
+    is_sequence = path.name.endswith((".zarr", ".zarr.part"))
+    yield from [open_sequence(path)] if is_sequence else Dataset(path)
 
 
-def _stored(sequence: Sequence, source: str) -> Motion:
+def _read_stored(sequence: Sequence, source: str) -> Motion:
     check_readable(sequence, [source])
     scale = float(sequence.attrs["scale_mm_per_px"])
     time_s, tissue = map(sequence.read_whole, ("time", "tissue"))
@@ -142,7 +142,7 @@ def _video(source: Path | Array, options: VideoOptions) -> Motion:
     rest, findings = track.video.rest, track.video.findings
     scale = pixel_mm(options.scale_mm_per_px, rest.size[1])
     removed = [] if track.removed is None else [track.removed.describe(scale * rest.shrink)]
-    missing = [found.message for found in findings if found.severity == "missing"]
+    missing = [finding.message for finding in findings if finding.severity == "missing"]
     return Motion(
         name=path.stem,
         frames=lambda: (replace(frame, time_s=frame.time_s or 0.0) for frame in track.frames()),
@@ -171,11 +171,11 @@ def _mask(what: str, given: Array, index: int, size: Size) -> Mask:
 
 
 def _arrays(path: Path) -> Motion:
-    found = checked_file.read_arrays(path)
-    names = ("motion", "deviation") if "motion" in found else ("flow",)
-    if missing := {*names, "tissue", "scale_mm_per_px"} - found.keys():
+    arrays = checked_file.read_arrays(path)
+    names = ("motion", "deviation") if "motion" in arrays else ("flow",)
+    if missing := {*names, "tissue", "scale_mm_per_px"} - arrays.keys():
         raise UserError(f"{path}: needs {', '.join(sorted(missing))}")
-    tissue, count = found["tissue"].astype(bool), found[names[0]].shape[:1]
+    tissue, count = arrays["tissue"].astype(bool), arrays[names[0]].shape[:1]
     if not count or not count[0]:
         raise UserError(f"{path}: {names[0]} holds no frames")
     if tissue.ndim != 2:
@@ -183,14 +183,14 @@ def _arrays(path: Path) -> Motion:
     wanted = {name: (*count, *tissue.shape, len(names) + 1) for name in names}
     wanted |= {"confidence": (*count, *tissue.shape), "force_mn": count}
     for name, shape in wanted.items():
-        if name in found and found[name].shape != shape:
-            raise UserError(f"{path}: {name} is {found[name].shape}, expected {shape} like the tissue")
-    scale, force = _positive(path, found, "scale_mm_per_px"), found.get("force_mn")
+        if name in arrays and arrays[name].shape != shape:
+            raise UserError(f"{path}: {name} is {arrays[name].shape}, expected {shape} like the tissue")
+    scale, force = _positive(path, arrays, "scale_mm_per_px"), arrays.get("force_mn")
 
     def frames() -> Iterator[FrameMotion]:
-        confidence = found.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
+        confidence = arrays.get("confidence", np.broadcast_to(np.float32(1), (*count, *tissue.shape)))
         for t in range(count[0]):
-            first, *rest = (found[name][t].astype(np.float32) for name in names)
+            first, *rest = (arrays[name][t].astype(np.float32) for name in names)
             motion = Moved(first, rest[0]) if rest else None
             flow = first[..., :2] / scale if rest else first
             yield FrameMotion(flow, confidence[t].astype(np.float32), motion=motion, index=t)
@@ -200,11 +200,13 @@ def _arrays(path: Path) -> Motion:
         frames=frames,
         tissue=tissue,
         scale_mm_per_px=scale,
-        young_kpa=_positive(path, found, "young_kpa") if "young_kpa" in found else None,
+        young_kpa=_positive(path, arrays, "young_kpa") if "young_kpa" in arrays else None,
         force_mn=None if force is None else force.astype(np.float64),
     )
 
 
-def _positive(path: Path, found: dict[str, Array], name: str) -> float:
+def _positive(path: Path, arrays: dict[str, Array], name: str) -> float:
     """The number under a name. UserError unless it is one and positive."""
-    return as_positive(f"{path}: {name}", found[name].item() if found[name].size == 1 else found[name].shape)
+    return as_positive(
+        f"{path}: {name}", arrays[name].item() if arrays[name].size == 1 else arrays[name].shape
+    )

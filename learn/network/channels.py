@@ -41,7 +41,7 @@ def channels(
     return torch.cat(parts, dim=1)
 
 
-def turned(values: Tensor, turn: int) -> Tensor:
+def rotate(values: Tensor, turn: int) -> Tensor:
     """Fields (B, C, N, N) turned by `turn` % 4 × 90° counter-clockwise, and mirrored first if `turn` ≥ 4; two
     or three channels begin with x, y components, a single one is a scalar."""
     vector = values.shape[1] > 1

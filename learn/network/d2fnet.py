@@ -155,7 +155,7 @@ class Heads(nn.Module):
         squash = torch.tanh if self.signed else torch.sigmoid
         maps = [squash(head(x)) * bound for head, bound in zip(self.ranges, self.bounds, strict=True)]
         weights = torch.softmax(self.mix(torch.cat(maps, dim=1)), dim=1)
-        low, middle, high = (one * weights[:, i : i + 1] for i, one in enumerate(maps))
+        low, middle, high = (level * weights[:, i : i + 1] for i, level in enumerate(maps))
         return low + middle + high
 
     def begin_small(self) -> None:

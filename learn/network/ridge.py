@@ -28,12 +28,12 @@ class LinearMap(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         cells = self.shape.cells
-        y = self.linear(self.pooled(x[:, self.shape.axes]))
+        y = self.linear(self.pool(x[:, self.shape.axes]))
         y = y.unflatten(1, (self.shape.components, cells, cells))
         y = F.interpolate(y, size=x.shape[2:], mode="bilinear", align_corners=False) * x[:, 3:4]
         return y if self.shape.components > 1 else F.relu(y)
 
-    def pooled(self, fields: Tensor) -> Tensor:
+    def pool(self, fields: Tensor) -> Tensor:
         """Means of fields (B, K, N, N) over the blocks, (B, K blocks)."""
         return F.avg_pool2d(fields, fields.shape[-1] // self.shape.cells).flatten(1)
 
@@ -43,9 +43,9 @@ def solve(network: LinearMap, batches: Iterable[tuple[Tensor, Tensor]]) -> None:
     """Sets the weights to the ridge regression of the targets (B, 1|3, N, N) on the inputs (B, C, N, N)."""
     from sklearn.linear_model import Ridge  # of the extra `bench`
 
-    pairs = [(network.pooled(x[:, network.shape.axes]), network.pooled(y)) for x, y in batches]
+    pairs = [(network.pool(x[:, network.shape.axes]), network.pool(y)) for x, y in batches]
     moved, force = (torch.cat(each).cpu().double().numpy() for each in zip(*pairs, strict=True))
     penalty = network.shape.strength * float(np.square(moved).sum(0).mean())
-    found = Ridge(alpha=penalty, fit_intercept=False).fit(moved, force)
-    weight = torch.from_numpy(np.atleast_2d(found.coef_)).to(network.linear.weight)
+    fitted = Ridge(alpha=penalty, fit_intercept=False).fit(moved, force)
+    weight = torch.from_numpy(np.atleast_2d(fitted.coef_)).to(network.linear.weight)
     network.linear.weight.copy_(weight)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from learn.data.clips import Clip, amount, sources, target
 from learn.data.grid import Scales, membrane_code
-from learn.network.channels import channels, divergence, turned
+from learn.network.channels import channels, divergence, rotate
 from learn.settings import TrainingSettings
 from learn.training import error_transfer
 from learn.training.error_transfer import Transfer
@@ -31,10 +31,10 @@ class Batch(NamedTuple):
     target: Tensor  # (B, C, N, N) in the unit of `Scales.target`
     membrane: Tensor  # (B,) of `membrane_code`
 
-    def turned(self, turn: int) -> Batch:
-        """All fields turned by `turned`; each confidence is a scalar."""
-        planes = turned(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
-        moved, mask, true = (turned(one, turn) for one in (self.displacement, self.mask, self.target))
+    def rotate(self, turn: int) -> Batch:
+        """All fields turned by `rotate`; each confidence is a scalar."""
+        planes = rotate(self.confidence.flatten(0, 1)[:, None], turn).reshape(self.confidence.shape)
+        moved, mask, true = (rotate(field, turn) for field in (self.displacement, self.mask, self.target))
         return Batch(moved, mask, planes, true, self.membrane)
 
 
@@ -44,7 +44,7 @@ class FrameItem(NamedTuple):
     clip: int
     frame: int
     source: str  # displacement, as in `learn.data.clips.FIELDS`
-    turn: int = 0  # 0-7, as of `turned`
+    turn: int = 0  # 0-7, as of `rotate`
     membrane_known: bool = False
     errors: Transfer | None = None  # an error that is added to `source`, with its confidence
     deviation_factor: float = 1.0  # of the deviation that the confidence states
@@ -105,7 +105,7 @@ class FrameDataset:
         order = rng.permutation(len(items))
         known = [False] * len(items)
         if self.settings.arch.membrane:
-            known = [bool(one) for one in rng.random(len(items)) >= MEMBRANE_HIDDEN]
+            known = [bool(is_known) for is_known in rng.random(len(items)) >= MEMBRANE_HIDDEN]
         drawn = [FrameItem(items[i][0], items[i][1], self.sources[0], int(turn[i]), known[i]) for i in order]
         return [self._with_errors(one, rng) for one in drawn] if len(self.sources) > 1 else drawn
 
@@ -139,22 +139,22 @@ class FrameDataset:
                 moved, confidence = error_transfer.transfer(moved, donor, there[0] - donor, there[1], errors)
                 moved, confidence = moved * self._masks[c], confidence * self._masks[c]
             if factor != 1:
-                confidence = error_transfer.restated(confidence, factor)
+                confidence = error_transfer.restate(confidence, factor)
             code = membrane_code(self.clips[c].membrane) if known else 0.0
             codes = torch.full((1,), code, device=self.device)
-            frames.append(Batch(moved, self._masks[c], confidence, true, codes).turned(turn))
+            frames.append(Batch(moved, self._masks[c], confidence, true, codes).rotate(turn))
         return Batch(*map(torch.cat, zip(*frames, strict=True)))
 
     def _read(self, c: int, t: int, source: str) -> tuple[Tensor, ...]:
         """Displacement, confidence and target of a frame of clip `c`."""
-        if (found := self._stored.get((c, t, source))) is None:
+        if (frame := self._stored.get((c, t, source))) is None:
             clip = self.clips[c]
             truth = target(clip, t, self.settings.arch.components)
             arrays = clip.displacement[source][t], clip.confidence_of(source)[t], truth
-            found = tuple(torch.from_numpy(np.array(one))[None].to(self.device) for one in arrays)
+            frame = tuple(torch.from_numpy(np.array(array))[None].to(self.device) for array in arrays)
             if self._stores:
-                self._stored[c, t, source] = found
-        return found
+                self._stored[c, t, source] = frame
+        return frame
 
 
 def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: int = 16) -> Scales:
@@ -165,7 +165,7 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
         mask = torch.from_numpy(np.array(clip.mask))[None, None]
         inside = clip.mask > 0
         for t in np.unique(np.linspace(0, clip.frames - 1, frames).astype(int)):
-            for source in (one for one in sources(settings.input) if one in clip.displacement):
+            for source in (name for name in sources(settings.input) if name in clip.displacement):
                 u = torch.from_numpy(np.array(clip.displacement[source][t]))[None]
                 moved.append(np.linalg.norm(clip.displacement[source][t], axis=0)[inside])
                 strain.append(np.abs(divergence(u, mask, settings.grid.pitch_mm)[0, 0].numpy()[inside]))
@@ -175,7 +175,7 @@ def measure_scales(clips: Sequence[Clip], settings: TrainingSettings, frames: in
             cells += float(inside.sum() * len(truth))
         total = amount(clip, settings.arch.components, settings.grid.pitch_mm)
         force.append(np.linalg.norm(total, axis=1))
-    found = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
-    if min(found) <= 0:
+    scales = tuple(float(np.percentile(np.concatenate(v), 99.9)) for v in (moved, strain, wanted, force))
+    if min(scales) <= 0:
         raise UserError("the training sequences have no motion or no force")
-    return Scales(found[0], found[1], found[2], found[3], (squares / cells) ** 0.5)
+    return Scales(scales[0], scales[1], scales[2], scales[3], (squares / cells) ** 0.5)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from learn.network.channels import turned
+from learn.network.channels import rotate
 
 IDEAL, TRANSFERRED, RECOVERED = 0.25, 0.25, 0.25
 FACTOR = 2.0  # largest factor of a transferred error, of either sign
@@ -42,17 +42,17 @@ class Transfer(NamedTuple):
 def draw(rng: np.random.Generator, donors: list[tuple[int, int]], components: int) -> tuple[Transfer, float]:
     """A frame out of `donors` (clip, frames of it) with factors, and the factor of the stated deviation."""
     clip, frames = donors[int(rng.integers(len(donors)))]
-    factor = tuple(float(one) for one in rng.uniform(-FACTOR, FACTOR, components))
+    factor = tuple(float(value) for value in rng.uniform(-FACTOR, FACTOR, components))
     return Transfer(clip, int(rng.integers(frames)), factor), float(np.exp(rng.normal(0, SPREAD)))
 
 
-def restated(confidence: Tensor, factor: float) -> Tensor:
+def restate(confidence: Tensor, factor: float) -> Tensor:
     """The confidence for deviations `factor` times as large, as of `learn.data.grid.certainty`."""
     return confidence / (confidence + factor**2 * (1 - confidence)).clamp_min(1e-6)
 
 
 def transfer(
-    true: Tensor, donor_true: Tensor, error: Tensor, confidence: Tensor, how: Transfer
+    true: Tensor, donor_true: Tensor, error: Tensor, confidence: Tensor, transfer: Transfer
 ) -> tuple[Tensor, Tensor]:
     """Motion and confidence of a frame with the error of another.
 
@@ -68,17 +68,17 @@ def transfer(
         far = donor_true.norm(dim=1, keepdim=True) <= max(_FAR * donor_size, _LEAST_MM)
         error, confidence = error * far, torch.where(far, confidence, 1.0)
     else:
-        for one in range(8):
-            there = turned(donor_true, one)
+        for trial in range(8):
+            there = rotate(donor_true, trial)
             row, column = _contact(there)[0]
             moved = place[0] - row, place[1] - column
-            alike = float((_shifted(there, moved) * true).sum())
+            alike = float((_shift(there, moved) * true).sum())
             if abs(alike) > abs(likeness):
-                likeness, turn, shift = alike, one, moved
+                likeness, turn, shift = alike, trial, moved
         scale = float(np.sign(likeness)) * min(size / donor_size, LARGEST_SCALE)
-    factor = scale * error.new_tensor(how.factor).view(1, -1, 1, 1)
-    planes = turned(confidence.transpose(0, 1), turn).transpose(0, 1)
-    return true + factor * _shifted(turned(error, turn), shift), _shifted(planes, shift)
+    factor = scale * error.new_tensor(transfer.factor).view(1, -1, 1, 1)
+    planes = rotate(confidence.transpose(0, 1), turn).transpose(0, 1)
+    return true + factor * _shift(rotate(error, turn), shift), _shift(planes, shift)
 
 
 def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:
@@ -88,7 +88,7 @@ def _contact(motion: Tensor) -> tuple[tuple[int, int], float]:
     return divmod(at, size.shape[1]), float(size.flatten()[at].sqrt())
 
 
-def _shifted(values: Tensor, shift: tuple[int, int]) -> Tensor:
+def _shift(values: Tensor, shift: tuple[int, int]) -> Tensor:
     """Fields shifted down and right by whole cells, 0 where nothing is known."""
     (down, right), (height, width) = shift, values.shape[2:]
     up, left = max(-down, 0), max(-right, 0)

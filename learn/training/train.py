@@ -22,7 +22,7 @@ from learn.data.clips import RECOVERED, Clip, scored_source
 from learn.data.grid import Scales
 from learn.evaluation.metrics import agreement, moments
 from learn.inference.convert import add_onnx
-from learn.loss import full, loss
+from learn.loss import is_full, loss
 from learn.network.registry import build, load_network
 from learn.settings import TrainingSettings, replace
 from learn.split import Split, find_unit, name_parts
@@ -114,9 +114,9 @@ def _begun(card: ModelCard, start: ModelCard) -> ModelCard:
     for known, new in ((start.split, card.split), (start.groups, card.groups)):
         barred = {"select": ("fit", "start"), "intervals": ("fit", "select", "start"), "test": USED}
         for part, used in barred.items():
-            if {one for name in used for one in known.get(name, ())}.intersection(new.get(part, ())):
+            if {group for name in used for group in known.get(name, ())}.intersection(new.get(part, ())):
                 raise UserError(f"start: was trained on brains of this data's {part} part")
-        new["start"] = sorted({one for name in USED for one in known.get(name, ())})
+        new["start"] = sorted({group for name in USED for group in known.get(name, ())})
     return dataclasses.replace(card, motion=sorted({*card.motion, *start.motion}))
 
 
@@ -147,7 +147,7 @@ class _Run:
         # No epoch before the loss has its full penalty on off-target force. With `cosine` the last one: the
         # best on the select side erred half as much again on other mechanics (design.md).
         chosen = score > (-math.inf if settings.schedule == "cosine" else self.best)
-        improved = full(settings.loss, self.epoch / settings.epochs) and chosen
+        improved = is_full(settings.loss, self.epoch / settings.epochs) and chosen
         self.best = score if improved else self.best
         return improved
 
@@ -195,13 +195,13 @@ def _epoch(
     batches = max(len(order) // settings.batch, 1)
     if (solve := load_network(settings.network).solve) is not None:
         parts = (order[i * settings.batch : (i + 1) * settings.batch] for i in range(batches))
-        read = (_moved(frames.batch(part), settings, epoch, i) for i, part in enumerate(parts))
+        read = (_augment(frames.batch(part), settings, epoch, i) for i, part in enumerate(parts))
         solve(net, ((inputs(each, settings, scales), each.target / scales.target) for each in read))
     net.train(solve is None)
     total = torch.zeros((), device=frames.device)
     for i in range(batches):
         part = order[i * settings.batch : (i + 1) * settings.batch]
-        batch = _moved(frames.batch(part), settings, epoch, i)
+        batch = _augment(frames.batch(part), settings, epoch, i)
         with torch.set_grad_enabled(solve is None):
             predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
@@ -222,7 +222,7 @@ def _epoch(
     return {"loss": _finite(float(total) / batches, epoch)}
 
 
-def _moved(batch: Batch, settings: TrainingSettings, epoch: int, number: int) -> Batch:
+def _augment(batch: Batch, settings: TrainingSettings, epoch: int, number: int) -> Batch:
     """A batch of an epoch with the settings' motion of the surface."""
     if settings.surface_motion_mm <= 0:
         return batch
@@ -283,7 +283,7 @@ def _gain(forces: Floats, anatomies: int) -> float:
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
     """The state to continue from, or None for a new run in a new folder."""
     # An interrupted write of the first card leaves a hidden file.
-    if not out.exists() or (out.is_dir() and all(one.name.startswith(".") for one in out.iterdir())):
+    if not out.exists() or (out.is_dir() and all(path.name.startswith(".") for path in out.iterdir())):
         checkpoint.write_card(out, card)
         return None
     there = checkpoint.read_card(out)
@@ -291,7 +291,7 @@ def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
         raise UserError(f"{out}: holds a model trained with other settings; choose another folder")
     if there.split != card.split or there.scales != card.scales:
         raise UserError(f"{out}: holds a model trained on other data; choose another folder")
-    bound = not full(there.settings.loss, 0.0) or there.settings.schedule == "cosine"
+    bound = not is_full(there.settings.loss, 0.0) or there.settings.schedule == "cosine"
     if there.settings.epochs != card.settings.epochs and bound:
         raise UserError(f"{out}: its schedule is for {there.settings.epochs} epochs; don't change --epochs")
     return checkpoint.read_tensors(out / "last.pt") if (out / "last.pt").exists() else None

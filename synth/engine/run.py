@@ -102,7 +102,7 @@ def run_job(job: Job, root: Path, options: Options, watcher: Watcher) -> Summary
     if options.engine == "local" and options.work == Options.work:  # the memory of other work is unknown
         size_forecast.refuse_if_too_long(job, share, workers)
     if job.render.calibration is not None:
-        from synth.sequence.rest_scene import refuse_unfit  # slow to import
+        from synth.sequence.draw import refuse_unfit  # slow to import
 
         refuse_unfit(job.render)
     gpus = choose_gpus(options.gpus, job.render.variant == "cuda_ad_rgb")

@@ -30,13 +30,13 @@ from scipy.optimize import brentq
 from synth.arrays import Floats, Mask
 from synth.fem import tool_gesture
 from synth.fem.equilibrium import ExcessiveLoad, InvertedElement, NoEquilibrium, minimise_energy
+from synth.fem.law_choice import LEAST_JACOBIAN
 from synth.fem.material import Tissue
 from synth.fem.motion import Clock, PronyHistory
 from synth.fem.surface_embedding import Embedding
 from synth.fem.system import System, factorise
 from synth.fem.tangent import linearise
 from synth.fem.tool_gesture import Gesture, ToolMotion
-from synth.job.law_choice import LEAST_JACOBIAN
 
 FIRMNESS = 40.0
 """k0 over E/a: tissue under a flat punch has 0.8 E/a, so that it lags by some 3% of the way."""
@@ -144,15 +144,13 @@ def layers(
     return made
 
 
-class _Balance:
-    """Search for equilibrium of a system with layers, whose stiffness is taken anew where it is slow."""
+class Balance:
+    """Search for equilibrium of a system with springs, whose stiffness is taken anew where it is slow."""
 
-    def __init__(self, base: System, held: Sequence[Layer], firm: float = 1.0) -> None:
-        """`base`: the system without layers; `firm`: as `Clock.relative_stiffness`."""
-        self.layers, self.firm = held, firm
-        slip = sum((layer.springs for layer in held), start=sp.csr_array(base.stiffness.shape))
-        if base.slip is not None:
-            slip = slip + base.slip
+    def __init__(self, base: System, springs: sp.csr_array, firm: float = 1.0) -> None:
+        """`base`: the system without them; `springs`: (3N, 3N) mN/mm; `firm`: `Clock.relative_stiffness`."""
+        self._springs, self.firm = springs, firm
+        slip = springs if base.slip is None else springs + base.slip
         slip, hold = sp.csr_array(slip / firm), sp.csr_array(base.hold / firm)
         added = slip + sp.kron(hold - base.hold, np.eye(3), format="csr")
         if base.slip is not None:
@@ -165,9 +163,9 @@ class _Balance:
     def find(
         self, load: Floats, start: Floats, safe: Floats, energy: float, least_jacobian: float
     ) -> tuple[Floats, float, float, float]:
-        """Displacement (N, 3) mm under nodal forces (N, 3) mN, the layers' included, its least J, stored
-        energy [mN mm] without the layers' and residual. `energy`: least that the residual is measured by;
-        `least_jacobian`: smallest J that is accepted.
+        """Displacement (N, 3) mm under nodal forces (N, 3) mN, the springs' pull included, its least J,
+        stored energy [mN mm] without the springs' and residual. `energy`: least that the residual is measured
+        by; `least_jacobian`: smallest J that is accepted.
 
         Raises InvertedElement or NoEquilibrium.
         """
@@ -198,12 +196,11 @@ class _Balance:
             self._near = linearise(self.system, u)
 
     def _stored(self, u: Floats, energy: float) -> float:
-        """Energy [mN mm] at (N, 3) mm without the layers', of the whole."""
-        springs = sum(float(u.ravel() @ (layer.springs @ u.ravel())) for layer in self.layers)
-        return energy - 0.5 * springs / self.firm
+        """Energy [mN mm] at (N, 3) mm without the springs', of the whole."""
+        return energy - 0.5 * float(u.ravel() @ (self._springs @ u.ravel())) / self.firm
 
 
-def drive(balance: _Balance, layer: Layer, wanted: Callable[[_Drive], float | None]) -> _Drive:
+def drive(balance: Balance, layer: Layer, wanted: Callable[[_Drive], float | None]) -> _Drive:
     """Drives one instrument from rest until `wanted` gives the way at which to end, within what is known.
 
     `wanted`: from the states so far to the last way [mm]; None, or a way beyond the last state: further. A
@@ -298,9 +295,9 @@ def follow(
     InvertedElement or NoEquilibrium.
     """
     frames, count = len(further), len(held)
-    way, paths, first = np.zeros((frames, count)), list[_Drive](), dict[tuple[bool, ...], _Balance]()
+    way, paths, first = np.zeros((frames, count)), list[_Drive](), dict[tuple[bool, ...], Balance]()
     for k, (layer, motion) in enumerate(zip(held, motions, strict=True)):
-        alone = _Balance(base, [layer])
+        alone = Balance(base, layer.springs)
         end = partial(_end_of, layer.gesture, young_kpa, clock, frames)
         paths.append(drive(alone, layer, end))
         way[:, k] = min(end(paths[-1]) or 0.0, paths[-1].way[-1]) * motion.load
@@ -329,7 +326,7 @@ class _March:
         held: Sequence[Layer],
         paths: Sequence[_Drive],
         clock: Clock,
-        balances: dict[tuple[bool, ...], _Balance],
+        balances: dict[tuple[bool, ...], Balance],
     ) -> None:
         self._base, self._held, self._paths, self._clock = base, held, paths, clock
         self._balances, self._past = balances, PronyHistory(clock)
@@ -372,7 +369,10 @@ class _March:
         active = [k for k, on in enumerate(key) if on]
         if key not in self._balances:
             firm = self._clock.relative_stiffness
-            balance = _Balance(self._base, [self._held[k] for k in active], firm)
+            springs = sum(
+                (self._held[k].springs for k in active), start=sp.csr_array(self._base.stiffness.shape)
+            )
+            balance = Balance(self._base, springs, firm)
             middle = sum((self._paths[k].at(_MIDDLE * self._paths[k].way[-1]) for k in active), start=still)
             if active:  # most frames are nearer to this state than to rest
                 balance.approach(middle)

@@ -10,8 +10,8 @@ import numpy as np
 
 from synth.arrays import Floats
 from synth.errors import NotFinite, UserError
+from synth.fem.law_choice import LEAST_JACOBIAN
 from synth.fem.system import State, System
-from synth.job.law_choice import LEAST_JACOBIAN
 
 TOLERANCE = 2e-4
 """Force out of balance, as a part of the load, at which a step ends."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from synth.arrays import Floats
 from synth.errors import UserError, as_user_error
+from synth.fem.law_choice import LAWS, Law, load_law
 from synth.fem.laws import lame
-from synth.job.law_choice import LAWS, Law, load_law
 
 _STEP, _CLOSE = 1e-5, 1e-4
 
@@ -19,7 +19,7 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
 
     Raises UserError as `check_law`.
     """
-    law, label = checked(name)
+    law, label = load_checked(name)
     with np.errstate(all="ignore"), as_user_error(label):  # undefined values are handled below
         found, first = map(np.asarray, law.stress(strain + np.eye(3), mu, lam))
     if found.shape != energy.shape or first.shape != out.shape:
@@ -29,7 +29,7 @@ def stress(name: str, strain: Floats, mu: float, lam: float, out: Floats, energy
 
 
 @cache
-def checked(name: str) -> tuple[Law, str]:
+def load_checked(name: str) -> tuple[Law, str]:
     """The law of that name after `check_law`, and its label in messages."""
     law, label = load_law(name), LAWS.label(name)
     with as_user_error(label):

@@ -147,7 +147,7 @@ def _pull(
                     xx += bent[i, 0] * bent[i, 0]
                     yy += bent[i, 1] * bent[i, 1]
                     xy += bent[i, 0] * bent[i, 1]
-                density, sxx, syy, sxy = _stretched(square * xx, square * yy, square * xy)
+                density, sxx, syy, sxy = _stretch(square * xx, square * yy, square * xy)
                 sxx, syy, sxy = square * sxx, square * syy, square * sxy
             w = weight[f, q] * stiffness
             energy += w * density
@@ -160,7 +160,7 @@ def _pull(
 
 
 @inlined
-def _stretched(xx: float, yy: float, xy: float) -> tuple[float, float, float, float]:
+def _stretch(xx: float, yy: float, xy: float) -> tuple[float, float, float, float]:
     """Energy and second Piola-Kirchhoff stress (xx, yy, xy) at the metric C, for S = 1."""
     det = xx * yy - xy * xy
     half = 0.5 * (xx - yy)

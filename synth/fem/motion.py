@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,6 +22,15 @@ from synth.fem.material import Tissue
 from synth.fem.mesh.element import quadrature
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import State
+
+
+@dataclass(frozen=True)
+class TimeScheme:
+    """How tissue follows its load in time."""
+
+    time: Literal["quasi-static", "dynamic"] = "quasi-static"  # equilibrium in every frame, or inertia
+    mass_kg: float | None = None  # of the whole volume; None: that of grey and white matter
+    relaxation: tuple[tuple[float, float], ...] = ()  # Prony terms, as of `Clock`
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,14 @@ from synth.errors import UserError
 from synth.fem import driven_contact, surface_embedding, tool_gesture
 from synth.fem.deformation import Deformation, Volume
 from synth.fem.equilibrium import solve_path
+from synth.fem.law_choice import check_load
 from synth.fem.material import Tissue
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.motion import Clock, march_in_time, volume
+from synth.fem.motion import Clock, TimeScheme, march_in_time, volume
 from synth.fem.pulse import Pulse, lift
 from synth.fem.system import System
 from synth.fem.tool_gesture import Gesture, ToolMotion
 from synth.geometry.triangles import Shape
-from synth.job import schema
-from synth.job.law_choice import check_load
 
 _STEP_S = 0.03  # longest time step of dynamics
 _TO_VTK = [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]  # order of a tetrahedron's nodes in VTK
@@ -29,7 +28,7 @@ _DENSITY_KG_M3 = 1040.0  # of grey and white matter (Barber et al., Acta Neurol.
 
 
 def deform(
-    fem: schema.FemSection,
+    scheme: TimeScheme,
     tissue: Tissue,
     gestures: Sequence[Gesture],
     tets: Tets,
@@ -37,17 +36,28 @@ def deform(
     frames: int,
     fps: float,
     pulse: Pulse | None = None,
-    opening_mm: float = schema.CraniotomySection().radius_mm,
+    opening_mm: float = 12.0,
     motions: Sequence[ToolMotion] = (),
     inside: bool = False,
 ) -> Deformation:
     """Deformation of a brain by the gestures of its instruments.
 
-    `gestures`: one per instrument, all at once, none where only the pulse moves the tissue; `surface`: on the
-    volume, faces counter-clockwise from outside; `frames`: T >= 2; `pulse`: no part of the load, moves the
-    craniotomy of radius `opening_mm`; `motions`: of the gestures over T frames each, their own trajectories
-    if none; `inside`: return the volume too. UserError: the load is past the law's range, or the contact is
-    not on the surface; and as `equilibrium.solve_path`.
+    Args:
+        scheme: equilibrium or dynamics, and relaxation.
+        tissue: its material.
+        gestures: one per instrument, all at once; none where only the pulse moves the tissue.
+        tets: the volume's mesh.
+        surface: on the volume, faces counter-clockwise from outside.
+        frames: T >= 2.
+        fps: frames per second.
+        pulse: no part of the load; moves the craniotomy of radius `opening_mm`.
+        opening_mm: that radius.
+        motions: of the gestures over T frames each, their own trajectories if none.
+        inside: return the volume too.
+
+    Raises:
+        UserError: the load is past the law's range, or the contact is not on the surface; and as
+            `equilibrium.solve_path`.
     """
     motions = motions or [tool_gesture.trajectory(gesture, frames) for gesture in gestures]
     tools = list(zip(gestures, motions, strict=True))
@@ -56,7 +66,7 @@ def deform(
     if any(gesture.drive for gesture in gestures):
         with _naming(gestures, tissue.young_kpa):
             lifted = None if pulse is None else (pulse, opening_mm)
-            return _driven(fem, tissue, tools, tets, embedding, surface, frames, fps, lifted, inside)
+            return _driven(scheme, tissue, tools, tets, embedding, surface, frames, fps, lifted, inside)
     traction, load_parameter = _load(tools, tissue.law, surface.vertices, area, frames)
     # Loads for E = 1 kPa: displacement depends on force over stiffness alone.
     pressed = np.moveaxis(area[:, None] * traction / tissue.young_kpa, 0, -1)
@@ -67,8 +77,8 @@ def deform(
         height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
         loads += height[:, None, None] * raising
     with _naming(gestures, tissue.young_kpa):
-        if fem.time == "dynamic" or fem.relaxation:
-            path = march_in_time(tets, tissue, loads, load_parameter, clock(fem, fps, tets))
+        if scheme.time == "dynamic" or scheme.relaxation:
+            path = march_in_time(tets, tissue, loads, load_parameter, clock(scheme, fps, tets))
         else:
             path = solve_path(system, loads, load_parameter)
     moved = embedding.move(np.ascontiguousarray(np.moveaxis(path.displacement, 0, -1)))
@@ -91,7 +101,7 @@ def deform(
 
 
 def _driven(
-    fem: schema.FemSection,
+    scheme: TimeScheme,
     tissue: Tissue,
     tools: Sequence[tuple[Gesture, ToolMotion]],
     tets: Tets,
@@ -110,7 +120,7 @@ def _driven(
     if lifted is not None:
         pulse, opening_mm = lifted
         height, raising = pulse.height(np.arange(frames) / fps), lift(system, embedding, surface, opening_mm)
-    time, loads = clock(fem, fps, tets), height[:, None, None] * raising
+    time, loads = clock(scheme, fps, tets), height[:, None, None] * raising
     path = driven_contact.follow(system, tissue.young_kpa, held, motions, time, loads)
     displacement = np.stack([embedding.move(u) for u in path.displacement])
     traction, parts = np.zeros_like(displacement), np.zeros((frames, len(tools), 3))
@@ -165,13 +175,13 @@ def _size_of(gesture: Gesture) -> str:
     return f"{gesture.force_mn:.3g} mN"
 
 
-def clock(fem: schema.FemSection, fps: float, tets: Tets) -> Clock:
-    """The job's time steps: no longer than `_STEP_S`, a whole number per frame."""
-    if fem.time != "dynamic":
-        return Clock(1 / fps, relaxation=fem.relaxation)
+def clock(scheme: TimeScheme, fps: float, tets: Tets) -> Clock:
+    """Time steps of a scheme: no longer than `_STEP_S`, a whole number per frame."""
+    if scheme.time != "dynamic":
+        return Clock(1 / fps, relaxation=scheme.relaxation)
     substeps = int(np.ceil(1 / fps / _STEP_S - 1e-9))
-    mass = fem.mass_kg or _DENSITY_KG_M3 * 1e-9 * volume(tets).sum()
-    return Clock(1 / fps, substeps, float(mass), _DAMPING, fem.relaxation)
+    mass = scheme.mass_kg or _DENSITY_KG_M3 * 1e-9 * volume(tets).sum()
+    return Clock(1 / fps, substeps, float(mass), _DAMPING, scheme.relaxation)
 
 
 def _load(

@@ -239,7 +239,7 @@ def anchors(gesture: Gesture, motion: ToolMotion, surface: Shape) -> tuple[Ints,
     near = surface.faces[(np.abs(corner - start).max(axis=2) <= reach).any(axis=1)]
     places = (start + motion.shift)[:, None] + aside
     once, which = np.unique(places.reshape(-1, 2), axis=0, return_inverse=True)
-    found = [_under(place, surface.vertices, near) for place in once]
+    found = [_find_under(place, surface.vertices, near) for place in once]
     shape = (*places.shape[:2], 3)
     corners, weights = (np.array(of)[which.ravel()].reshape(shape) for of in zip(*found, strict=True))
     return corners, weights
@@ -261,7 +261,7 @@ def _aside(spread_mm: float, azimuth_deg: float) -> Floats:
     return np.asarray(0.5 * spread_mm * np.array([np.cos(across), np.sin(across)]))
 
 
-def _under(xy: Floats, vertices: Floats, faces: Array) -> tuple[Ints, Floats]:
+def _find_under(xy: Floats, vertices: Floats, faces: Array) -> tuple[Ints, Floats]:
     """The highest face above or below a point of the plane, and the point's barycentrics in it."""
     parts = side_areas(xy, vertices, faces)
     total = parts.sum(axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -13,7 +13,6 @@ from scipy.optimize import least_squares
 from synth.arrays import Floats, Map, Mask, Pixels
 from synth.fit.photograph import Photograph, measure
 from synth.job.schema import Family, Job
-from synth.render.appearance.family import FAMILIES
 from synth.render.camera import camera_sensor
 from synth.render.camera.camera_sensor import CameraSensor, balanced_light, processed
 from synth.render.camera.colour_processing import PLAIN, ColourProcessing
@@ -67,8 +66,8 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
     """
     theirs, video = measure(given.rgb, given.usable), given.rgb[given.usable] / 255
     widest = int(min(given.rgb.shape[1], _LARGEST_PX, _LARGEST_MM / given.mm_per_px)) // 4 * 4
-    small = {name: render(name, min(_CHOOSING_PX, widest), given.mm_per_px, 0) for name in FAMILIES}
-    family = min(FAMILIES, key=lambda name: fit_colours(small[name].light({}), video)[1])  # the closest
+    small = {name: render(name, min(_CHOOSING_PX, widest), given.mm_per_px, 0) for name in get_args(Family)}
+    family = min(small, key=lambda name: fit_colours(small[name].light({}), video)[1])  # the closest
     frames = [render(family, widest, given.mm_per_px, index) for index in range(_ANATOMIES)]
     reach = widest / given.rgb.shape[1]
 

@@ -13,8 +13,8 @@ from PIL import Image, JpegImagePlugin
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow.segmentation import segment
-from synth.job.schema import RenderSection, SensorSection
-from synth.render.camera import video_link
+from synth.job.schema import RenderSection
+from synth.render.camera.video_link import transmit
 from synth.system import checked_file
 
 _SMALLEST_PX, _LEAST_MM2 = 160, 60.0  # of a picture's sides, and of cortex
@@ -70,8 +70,7 @@ class Compression(NamedTuple):
         noise = np.random.default_rng(0).normal(0, 2, (5, *rgb.shape))
         video = np.clip(rgb + noise, 0, 255).astype(np.uint8)
         for rate in _BITRATES:
-            scaled = {"bitrate_mbps": rate * rgb[..., 0].size / (640 * 480), "chroma": self.chroma}
-            back = video_link.recorded(video, SensorSection.model_validate(scaled), 25.0)
+            back = transmit(video, 25.0, rate * rgb[..., 0].size / (640 * 480), self.chroma)
             if cv2.PSNR(video, back) >= lost:
                 break
         return rate

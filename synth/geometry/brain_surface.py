@@ -8,7 +8,7 @@ import re
 import warnings
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +17,10 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
+from synth.geometry.craniotomy import Attachment, Craniotomy
 from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
 from synth.geometry.skin import skin
 from synth.geometry.triangles import Shape, side_areas
-from synth.job import identity
-from synth.job.schema import AttachmentSection, CraniotomySection
 from synth.system import checked_file
 
 _KINDS = ("obj", "stl", "ply", "off", *SUFFIXES, "gii")  # suffixes of the files that can be read
@@ -43,13 +42,13 @@ class Brain:
 
     shape: Shape
     to_world: Floats  # (4, 4) rigid, mm: a point p of the file (RAS if it states one) is to_world @ (p, 1)
-    attachments: tuple[AttachmentSection, ...]  # fixed regions inside, in world axes
+    attachments: tuple[Attachment, ...]  # fixed regions inside, in world axes
 
 
 def load_brain(
     path: Path,
-    craniotomy: CraniotomySection,
-    attachments: Sequence[AttachmentSection] = (),
+    craniotomy: Craniotomy,
+    attachments: Sequence[Attachment] = (),
     fill_holes: bool = False,
 ) -> Brain:
     """Reads a surface (of a format of `anatomy.mesh`, mm), merges its vertices, and places it.
@@ -64,12 +63,10 @@ def place_brain(
     vertices: Floats,
     faces: Ints,
     name: str,
-    craniotomy: CraniotomySection,
-    attachments: Sequence[AttachmentSection] = (),
+    craniotomy: Craniotomy,
+    attachments: Sequence[Attachment] = (),
 ) -> Brain:
     """Places a surface of vertices (V, 3) mm and faces (F, 3) as `load_brain`; `name` is used in messages."""
-    assert craniotomy.point is not None  # the job requires both with a mesh
-    assert craniotomy.direction is not None
     out = np.asarray(craniotomy.direction) / np.linalg.norm(craniotomy.direction)
     turn, origin = axes(out), np.asarray(craniotomy.point)
     placed = (vertices - origin) @ turn.T
@@ -78,13 +75,17 @@ def place_brain(
     _check_place(name, vertices[faces], origin, out, craniotomy.radius_mm if len(heights) else 0.0)
     placed[:, 2] -= heights.max()
     origin = origin + heights.max() * turn[2]
-    held = []
-    for one in attachments:
-        normal = None if one.normal is None else tuple(turn @ np.asarray(one.normal))
-        held.append(one.model_copy(update={"point": tuple(turn @ (one.point - origin)), "normal": normal}))
+    placed_attachments = tuple(_turn(attachment, turn, origin) for attachment in attachments)
     to_world = np.eye(4)
     to_world[:3] = np.column_stack([turn, -turn @ origin])
-    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, tuple(held))
+    return Brain(Shape(np.ascontiguousarray(placed), faces.astype(np.int32)), to_world, placed_attachments)
+
+
+def _turn(attachment: Attachment, turn: Floats, origin: Floats) -> Attachment:
+    """An attachment of a surface's own axes in axes turned by (3, 3) about an origin (3,) mm."""
+    x, y, z = turn @ (attachment.point - origin)
+    normal = None if attachment.normal is None else tuple(turn @ np.asarray(attachment.normal))
+    return replace(attachment, point=(x, y, z), normal=normal)
 
 
 def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
@@ -100,13 +101,13 @@ def read_brain(path: Path, fill_holes: bool = False) -> tuple[Floats, Ints]:
         raise UserError(f"anatomy.mesh: {path.name} contains no triangles or polygons")
     span = np.ptp(vertices, axis=0)
     if not _BRAIN_MM[0] <= span.max() <= _BRAIN_MM[1]:
-        unit, factor = min(_UNITS_MM.items(), key=lambda one: abs(np.log(one[1] * span.max() / 150)))
+        unit, factor = min(_UNITS_MM.items(), key=lambda unit: abs(np.log(unit[1] * span.max() / 150)))
         likely = _BRAIN_MM[0] <= factor * span.max() <= _BRAIN_MM[1]
         hint = f"if it is in {unit}, multiply its coordinates by {factor:g}" if likely else "convert it to mm"
         raise UserError(f"anatomy.mesh: {path.name} is {span.max():.3g} mm long, a brain 100 to 200; {hint}")
-    faces = _oriented(vertices, faces)
+    faces = _orient(vertices, faces)
     if fill_holes:
-        faces = _filled(vertices, faces, path.name)
+        faces = _fill_holes(vertices, faces, path.name)
     flat = len(faces) < 4 or span.min() < 1e-3 * span.max()
     if flat or abs(_volumes(vertices, faces).sum()) < 1e-3 * span.prod():
         hint = "" if fill_holes else "; if it is open, anatomy.fill_holes=true closes it"
@@ -131,10 +132,10 @@ def _check_place(name: str, corners: Floats, point: Floats, out: Floats, radius_
     """
     from trimesh.triangles import closest_point
 
-    def nearest(at: Floats) -> tuple[float, Floats, int]:
-        found = np.asarray(closest_point(corners, np.broadcast_to(at, (len(corners), 3))))
-        away = np.linalg.norm(found - at, axis=1)
-        return float(away.min()), found[away.argmin()], int(away.argmin())
+    def nearest(place: Floats) -> tuple[float, Floats, int]:
+        feet = np.asarray(closest_point(corners, np.broadcast_to(place, (len(corners), 3))))
+        away = np.linalg.norm(feet - place, axis=1)
+        return float(away.min()), feet[away.argmin()], int(away.argmin())
 
     def text(vector: Floats) -> str:
         return "[" + ", ".join(f"{x:.2f}" for x in vector) + "]"
@@ -183,7 +184,7 @@ def _heights(vertices: Floats, faces: Ints) -> Floats:
 
 def _read(path: Path) -> tuple[Floats, Ints]:
     with as_user_error("anatomy.mesh"):
-        data = checked_file.read_bytes(path, identity.FILES["anatomy", "mesh"])
+        data = checked_file.read_bytes(path, checked_file.LARGEST_MESH)
     kind = path.suffix.lower().removeprefix(".")
     if data.startswith(_FREESURFER):
         kind = "freesurfer"
@@ -227,7 +228,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
         plus = f"scanner RAS is this plus {offset.round(2).tolist()}"
         what = f"{path.name} and points on it are in surface RAS, SurfaceRAS in freeview"
         warnings.warn(f"anatomy.mesh: {what}; {plus}", Caution, stacklevel=1)
-    return _merged(vertices, faces)
+    return _merge(vertices, faces)
 
 
 def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
@@ -243,8 +244,8 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
     else:
         _refuse_expansion(data)
         image = gifti.GiftiImage.from_bytes(data)  # which can't open further files
-        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{one}") for one in ("POINTSET", "TRIANGLE")]
-        if [[one.data.shape[1:] for one in arrays] for arrays in held] != [[(3,)], [(3,)]]:
+        held = [image.get_arrays_from_intent(f"NIFTI_INTENT_{kind}") for kind in ("POINTSET", "TRIANGLE")]
+        if [[array.data.shape[1:] for array in arrays] for arrays in held] != [[(3,)], [(3,)]]:
             raise ValueError("one list of points and one of triangles are needed, as in a .surf.gii")
         points, vertices, faces = held[0][0], held[0][0].data, held[1][0].data
         if points.coordsys is None or points.coordsys.dataspace != 1:  # 1: NIFTI_XFORM_SCANNER_ANAT
@@ -254,7 +255,7 @@ def _read_neuroimaging(path: Path, data: bytes) -> tuple[Floats, Ints, Floats]:
 
 def _refuse_expansion(data: bytes) -> None:
     """ValueError if the compressed arrays of a GIfTI file expand to more than a file may have."""
-    left = identity.FILES["anatomy", "mesh"]
+    left = checked_file.LARGEST_MESH
     for text in re.findall(rb"<Data>([^<]*)</Data>", data) if b"GZipBase64Binary" in data else ():
         unpacker, packed = zlib.decompressobj(), base64.b64decode(text)
         while packed and not unpacker.eof:
@@ -264,18 +265,20 @@ def _refuse_expansion(data: bytes) -> None:
                 raise ValueError("its arrays expand to more than 1 GB")
 
 
-def _oriented(vertices: Floats, faces: Ints) -> Ints:
+def _orient(vertices: Floats, faces: Ints) -> Ints:
     """The faces; if neighbours are oriented differently or bodies cancel, turned until all face outwards."""
     import trimesh
 
     mesh, count = trimesh.Trimesh(vertices, faces, process=False), len(faces)
-    one, other = mesh.face_adjacency.T
+    first, other = mesh.face_adjacency.T
     start, end = mesh.face_adjacency_edges[:, :, None].swapaxes(0, 1)
-    runs = [((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (one, other)]
+    runs = [
+        ((faces[f] == start) & (np.roll(faces[f], -1, axis=1) == end)).any(axis=1) for f in (first, other)
+    ]
     alike = runs[0] != runs[1]  # neighbours pass along their edge in opposite directions
     # Faces as they are and, from `count`, turned: each is linked to what its neighbours then are.
-    links = np.array([[one, one + count], [other + count * ~alike, other + count * alike]]).reshape(2, -1)
-    graph = coo_array((np.ones(2 * len(one)), links), shape=(2 * count, 2 * count))
+    links = np.array([[first, first + count], [other + count * ~alike, other + count * alike]]).reshape(2, -1)
+    graph = coo_array((np.ones(2 * len(first)), links), shape=(2 * count, 2 * count))
     label = connected_components(graph, directed=False)[1].reshape(2, count)
     turned, body = label[0] > label[1], label.min(axis=0)
     volumes = np.bincount(body, np.where(turned, -1, 1) * _volumes(vertices, faces))
@@ -284,7 +287,7 @@ def _oriented(vertices: Floats, faces: Ints) -> Ints:
     return faces
 
 
-def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+def _merge(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     """The surface without duplicate vertices and faces, faces without area, and vertices without faces."""
     if len(vertices) == 0 or len(faces) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
@@ -298,7 +301,7 @@ def _merged(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     return vertices[first][used], faces.reshape(-1, 3)
 
 
-def _filled(vertices: Floats, faces: Ints, name: str) -> Ints:
+def _fill_holes(vertices: Floats, faces: Ints, name: str) -> Ints:
     """The faces, with a fan of triangles over each hole."""
     import trimesh
 

@@ -96,18 +96,18 @@ class _Cells:
             raise ValueError("a cell's size or type is out of range")
         for kind in np.unique(kinds).tolist():
             mine = kinds == kind
-            own, each = nodes[np.repeat(mine, sizes)], sizes[mine]
+            corners, each = nodes[np.repeat(mine, sizes)], sizes[mine]
             if kind in IGNORED:
-                own = np.zeros((len(each), 1), np.int64)  # present, without a face
+                corners = np.zeros((len(each), 1), np.int64)  # present, without a face
             elif kind in (_POLYGON, _STRIP):
-                kind, own = TRIANGLE, _triangles(own, each, kind == _STRIP)
+                kind, corners = TRIANGLE, _triangles(corners, each, kind == _STRIP)
             else:
                 kind, order = _REGULAR.get(kind, (kind, slice(None)))
                 size = CELLS[kind].nodes if kind in CELLS else int(each[0])
                 if (each != size).any():
                     raise ValueError(f"a cell of VTK's type {kind} has {each[each != size][0]} nodes")
-                own = own.reshape(len(each), size)[:, order]
-            self._parts.setdefault(kind, []).append(own)
+                corners = corners.reshape(len(each), size)[:, order]
+            self._parts.setdefault(kind, []).append(corners)
 
     def join(self) -> dict[int, Ints]:
         """Nodes (C, n) of all by type. ValueError: cells of one type differ in size."""
@@ -177,10 +177,14 @@ def _refuse_hollow(data: bytes) -> None:
     """ValueError for a .glb with arrays that have no bytes in it: they may be of any size."""
     size = int.from_bytes(data[12:16], "little")
     tree = json.loads(data[20 : 20 + size])
-    hollow = [one for one in tree.get("accessors", []) if "bufferView" not in one or "sparse" in one]
+    hollow = [
+        accessor
+        for accessor in tree.get("accessors", [])
+        if "bufferView" not in accessor or "sparse" in accessor
+    ]
     if len(tree.get("nodes", [])) > _MOST_NODES:
         raise ValueError(f"it has over {_MOST_NODES} nodes; join its meshes")
-    outside = any("uri" in one for one in tree.get("buffers", []))
+    outside = any("uri" in buffer for buffer in tree.get("buffers", []))
     if data[:4] != b"glTF" or hollow or outside or tree.get("extensionsRequired"):
         raise ValueError("it is no plain GLB: sparse, empty, compressed or outer arrays, or another format")
 
@@ -213,7 +217,7 @@ def _read_xml(data: bytes) -> MeshFile:
     root = ET.fromstring(head + b"</VTKFile>" if tag else data)
     if root.tag != "VTKFile" or root.get("type") not in ("UnstructuredGrid", "PolyData"):
         raise ValueError(f"it holds {root.get('type') or root.tag}, not an unstructured grid or polygons")
-    array, found, cells = _xml_arrays(root, rest), MeshFile(), _Cells()
+    array, file, cells = _xml_arrays(root, rest), MeshFile(), _Cells()
     points, each, before = list[Floats](), list[tuple[int, dict[str, ET.Element]]](), 0
     for piece in root.iter("Piece"):
         listed = piece.get("NumberOfPoints")
@@ -225,26 +229,26 @@ def _read_xml(data: bytes) -> MeshFile:
         for name, kind in _XML_CELLS.items():
             stated = piece.get("NumberOfCells" if kind is None else f"NumberOf{name}")
             number = None if stated is None else int(stated)
-            parts = {str(one.get("Name")): one for one in piece.iterfind(f"{name}/DataArray")}
+            parts = {str(child.get("Name")): child for child in piece.iterfind(f"{name}/DataArray")}
             if {"connectivity", "offsets"} <= set(parts) and number != 0:
                 ends = whole(array(parts["offsets"], number))
                 kinds = whole(array(parts["types"], number)) if kind is None else kind
                 cells.add(kinds, before + whole(array(parts["connectivity"])), ends)
-        data_here = {str(one.get("Name")): one for one in piece.iterfind("PointData/DataArray")}
+        data_here = {str(child.get("Name")): child for child in piece.iterfind("PointData/DataArray")}
         if count:
             each.append((count, data_here))
         before += count
-    found.points, found.cells = np.concatenate([np.zeros((0, 3)), *points]), cells.join()
+    file.points, file.cells = np.concatenate([np.zeros((0, 3)), *points]), cells.join()
     for name in dict.fromkeys(name for _, here in each for name in here):
         nodes = [(count, here.get(name)) for count, here in each]
         if (parts_of := _count_parts(nodes, array)) is not None:
-            found.point_data[name] = PointArray(parts_of, partial(_join, nodes, parts_of, array))
-    for one in root.iterfind(".//FieldData/"):
-        if str(one.get("Name")).lower() in _TIMES:
-            found.time = float(array(one)[0])
-        elif one.get("Name") == "SPACE":
-            found.space = bytes(array(one).astype(np.uint8)).decode("latin-1").strip("\0").strip().upper()
-    return found
+            file.point_data[name] = PointArray(parts_of, partial(_join, nodes, parts_of, array))
+    for child in root.iterfind(".//FieldData/"):
+        if str(child.get("Name")).lower() in _TIMES:
+            file.time = float(array(child)[0])
+        elif child.get("Name") == "SPACE":
+            file.space = bytes(array(child).astype(np.uint8)).decode("latin-1").strip("\0").strip().upper()
+    return file
 
 
 _Nodes = list[tuple[int, ET.Element | None]]  # of an array: points of each piece, and its numbers there
@@ -252,9 +256,9 @@ _Nodes = list[tuple[int, ET.Element | None]]  # of an array: points of each piec
 
 def _count_parts(nodes: _Nodes, array: _Reader) -> int | None:
     """Numbers at each point of an array; where it states none, by its length. None: pieces differ."""
-    stated = {one.get("NumberOfComponents") for _, one in nodes if one is not None}
+    stated = {child.get("NumberOfComponents") for _, child in nodes if child is not None}
     if stated == {None}:
-        count, node = next((count, one) for count, one in nodes if one is not None)
+        count, node = next((count, child) for count, child in nodes if child is not None)
         length = len(array(node))
         return length // count if length and length % count == 0 else None
     return int(stated.pop() or 1) if len(stated) == 1 else None
@@ -263,8 +267,8 @@ def _count_parts(nodes: _Nodes, array: _Reader) -> int | None:
 def _join(nodes: _Nodes, parts: int, array: _Reader) -> Numbers:
     """An array (N, parts) over all pieces; 0 in those without it."""
     each = [
-        np.zeros((count, parts)) if one is None else array(one, parts * count).reshape(count, parts)
-        for count, one in nodes
+        np.zeros((count, parts)) if child is None else array(child, parts * count).reshape(count, parts)
+        for count, child in nodes
     ]
     return each[0] if len(each) == 1 else np.concatenate(each)
 
@@ -291,8 +295,8 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> _Reader:
         raise ValueError("its header_type is neither UInt32 nor UInt64")
     if (packer := root.get("compressor")) not in (None, *_PACKERS):
         raise ValueError(f"it is compressed by {packer}; write it with zlib or uncompressed")
-    appended = (one for one in root.iter() if one.get("format") == "appended")
-    starts = sorted({int(one.get("offset", 0)) for one in appended})
+    appended = (element for element in root.iter() if element.get("format") == "appended")
+    starts = sorted({int(element.get("offset", 0)) for element in appended})
     if starts and not 0 <= starts[0] <= starts[-1] <= len(tail):
         raise ValueError("an offset is outside of what is appended; is it truncated?")
     ends = dict(zip(starts, [*starts[1:], len(tail)], strict=False))
@@ -307,24 +311,24 @@ def _xml_arrays(root: ET.Element, rest: bytes) -> _Reader:
         dtype = np.dtype(_XML_TYPES[kind])
         data, form = (node.text or "").encode(), node.get("format", "ascii")
         if form == "ascii":
-            found = _parsed(data, dtype)
+            numbers = _parse(data, dtype)
         else:
             if form == "appended":
-                data = tail[(at := int(node.get("offset", 0))) : ends[at]]
+                data = tail[(offset := int(node.get("offset", 0))) : ends[offset]]
             if form != "appended" or not raw:  # header and data may be coded separately, each with padding
                 data = b"".join(map(base64.b64decode, re.findall(rb"[^=]+=*", b"".join(data.split()))))
             limit = budget[0] if expected is None else min(budget[0], expected * dtype.itemsize)
-            data = _unpacked(data, word, packer, limit)
+            data = _unpack(data, word, packer, limit)
             budget[0] -= len(data)
-            found = np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
-        if expected is not None and len(found) != expected:
-            raise ValueError(f"an array has {len(found)} numbers where {expected} are stated; truncated?")
-        return found
+            numbers = np.frombuffer(data, dtype.newbyteorder(order)).astype(dtype)
+        if expected is not None and len(numbers) != expected:
+            raise ValueError(f"an array has {len(numbers)} numbers where {expected} are stated; truncated?")
+        return numbers
 
     return array
 
 
-def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit: int) -> bytes:
+def _unpack(data: bytes, word: np.dtype[np.number], packer: str | None, limit: int) -> bytes:
     """The bytes of an array after its header, expanded; ValueError if they are not those that it states, or
     more than `limit`."""
     count, width = int(np.frombuffer(data, word, 1)[0]), word.itemsize
@@ -351,7 +355,7 @@ def _unpacked(data: bytes, word: np.dtype[np.number], packer: str | None, limit:
     return b"".join(parts)
 
 
-def _parsed(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
+def _parse(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
     """The numbers in a text."""
     kind = np.int64 if dtype.kind in "iu" else np.float64
     if len(text) < 2000:
@@ -363,14 +367,14 @@ def _parsed(text: bytes, dtype: np.dtype[np.number]) -> Numbers:
     refuse_excess(8 * count)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of a text that ends early
-        found = np.fromstring(text, kind, sep=" ")
-    if len(found) != count:
+        numbers = np.fromstring(text, kind, sep=" ")
+    if len(numbers) != count:
         raise ValueError("a number can't be read")
-    return found
+    return numbers
 
 
 def _read_legacy(data: bytes) -> MeshFile:
-    file, found, cells = _Legacy(data), MeshFile(), _Cells()
+    file, contents, cells = _Legacy(data), MeshFile(), _Cells()
     mixed: tuple[Ints, Ints] | None = None
     target: dict[str, PointArray] | None = None
     rows = 0
@@ -379,7 +383,7 @@ def _read_legacy(data: bytes) -> MeshFile:
         if key == "DATASET" and words[1].upper() not in ("POLYDATA", "UNSTRUCTURED_GRID"):
             raise ValueError(f"it holds {words[1]}, not an unstructured grid or polygons")
         if key == "POINTS":
-            found.points = file.numbers(3 * int(words[1]), words[2])().reshape(-1, 3).astype(np.float64)
+            contents.points = file.numbers(3 * int(words[1]), words[2])().reshape(-1, 3).astype(np.float64)
         elif key == "CELLS":
             mixed = file.cells(int(words[1]), int(words[2]))
         elif key in _LEGACY_CELLS:
@@ -387,9 +391,9 @@ def _read_legacy(data: bytes) -> MeshFile:
         elif key == "CELL_TYPES" and mixed is not None:
             cells.add(file.numbers(int(words[1]), "int")(), *mixed)
         elif key in ("POINT_DATA", "CELL_DATA"):
-            rows, target = int(words[1]), found.point_data if key == "POINT_DATA" else {}
-            if target is found.point_data and rows != len(found.points):
-                raise ValueError(f"it has data of {rows} points, and {len(found.points)} points")
+            rows, target = int(words[1]), contents.point_data if key == "POINT_DATA" else {}
+            if target is contents.point_data and rows != len(contents.points):
+                raise ValueError(f"it has data of {rows} points, and {len(contents.points)} points")
         elif key in _ATTRIBUTES and target is not None:
             parts = int(words[3]) if key == "SCALARS" and len(words) > 3 else _ATTRIBUTES[key]
             if key == "SCALARS":
@@ -408,9 +412,9 @@ def _read_legacy(data: bytes) -> MeshFile:
                 if target is not None:
                     target[name] = PointArray(parts if count == rows else 0, values)
                 elif name.lower() in _TIMES and parts * count > 0:
-                    found.time = float(values().ravel()[0])
-    found.cells = cells.join()
-    return found
+                    contents.time = float(values().ravel()[0])
+    contents.cells = cells.join()
+    return contents
 
 
 class _Legacy:
@@ -428,13 +432,13 @@ class _Legacy:
         while self._at < len(self._data):
             end = self._data.find(b"\n", self._at)
             end = len(self._data) if end < 0 else end
-            found = self._data[self._at : end].decode("latin-1").split()
+            line_words = self._data[self._at : end].decode("latin-1").split()
             self._at = end + 1
-            if found == ["METADATA"]:
+            if line_words == ["METADATA"]:
                 blank = _BLANK.search(self._data, self._at - 1)
                 self._at = blank.end() if blank else len(self._data)
-            elif found:
-                return found
+            elif line_words:
+                return line_words
         return []
 
     def skip_lines(self, count: int) -> None:
@@ -460,10 +464,10 @@ class _Legacy:
         self._at = end = stop.start() if stop else len(self._data)
 
         def read() -> Numbers:
-            found = _parsed(self._data[start:end], dtype)
-            if len(found) != count:
-                raise ValueError(f"it has {len(found)} numbers where {count} are stated; is it truncated?")
-            return found.reshape(shape)
+            values = _parse(self._data[start:end], dtype)
+            if len(values) != count:
+                raise ValueError(f"it has {len(values)} numbers where {count} are stated; is it truncated?")
+            return values.reshape(shape)
 
         return read
 
@@ -481,12 +485,12 @@ class _Legacy:
             return np.delete(numbers, slice(None, None, size // count)), np.arange(1, count + 1) * (
                 size // count - 1
             )
-        first, at, lengths = np.empty(count, np.int64), 0, numbers.tolist()
+        first, position, lengths = np.empty(count, np.int64), 0, numbers.tolist()
         for k in range(count):
-            if at >= size or lengths[at] < 0:
+            if position >= size or lengths[position] < 0:
                 raise ValueError("a cell has no nodes; is it truncated?")
-            first[k] = at
-            at += 1 + lengths[at]
-        if at != size:
+            first[k] = position
+            position += 1 + lengths[position]
+        if position != size:
             raise ValueError("numbers of cells and of their nodes differ")
         return np.delete(numbers, first), np.cumsum(numbers[first])

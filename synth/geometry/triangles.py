@@ -57,7 +57,7 @@ def normals(shape: Shape) -> Floats:
 
     Summed in the order of the faces: the renderer's own sum over threads is not reproducible.
     """
-    total = _area_weighted(np.ascontiguousarray(shape.vertices, np.float64), as_constant(shape.faces))
+    total = _weigh_by_area(np.ascontiguousarray(shape.vertices, np.float64), as_constant(shape.faces))
     length = lengths(total)[:, None]
     flat = length[:, 0] < 1e-12
     total[flat] = [0.0, 0.0, 1.0]
@@ -67,7 +67,7 @@ def normals(shape: Shape) -> Floats:
 
 @argument_types("f8[:,::1], Array(i4, 2, 'C', readonly=True)")
 @compiled
-def _area_weighted(vertices: Floats, faces: Indices) -> Floats:
+def _weigh_by_area(vertices: Floats, faces: Indices) -> Floats:
     total = np.zeros_like(vertices)
     # One corner after the other, to round like a sum over all first corners, all second and all third.
     for corner in range(3):

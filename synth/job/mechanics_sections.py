@@ -18,14 +18,12 @@ from pydantic import (
     model_validator,
 )
 
-from synth.job.law_choice import LAWS, LoadRange, check_load_range, choose_law
+from synth.fem.law_choice import LAWS, LoadRange, check_load_range, choose_law
 from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
 from synth.plugins import STORED
 
 Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
 Instrument = Literal["forceps", "bayonet", "dissector", "suction", "spatula", "probe", "none"]
-
-LARGEST_MESH = 64 << 20  # bytes of an instrument's file
 
 
 class OwnInstrument(Section):
@@ -200,6 +198,8 @@ class PulseSection(Section):
 
 _SINGLE = (str, dict, OwnInstrument)
 _OneOrMore = BeforeValidator(lambda value: (value,) if isinstance(value, _SINGLE) else value)
+Contact = Literal["loaded", "driven"]
+Contacts = Annotated[tuple[Contact, ...], Field(min_length=1), _OneOrMore]
 Skulls = Annotated[tuple[Literal["bonded", "slip"], ...], Field(min_length=1), _OneOrMore]
 
 
@@ -244,10 +244,10 @@ class FemSection(Section):
     """Peak load as P = F/(E a^2), dimensionless, so that one range suits every stiffness."""
     force_mn: Range[Positive] | None = None
     """Peak force of a contact [mN], instead of `load`; of a driven instrument, of all its contacts."""
-    contact: Literal["loaded", "driven"] = "loaded"
-    """Loaded: a pressure that is given, in the range of small strain. Driven: the instrument holds the tissue
-    under it and moves it; the force is the reaction. For large loads; sizes are then those of instruments,
-    and there are no slides."""
+    contact: Contacts = ("loaded",)
+    """Contact of instruments and tissue, one or both, in equal shares of the sequences. Loaded: a pressure
+    that is given, in the range of small strain. Driven: the instrument holds the tissue under it and moves
+    it; the force is the reaction. For large loads; sizes are then those of instruments, without slides."""
     travel_mm: Range[Positive] | None = None
     """Way of the tips of a driven instrument to its peak [mm], drawn uniformly, at most that over which a
     contact of its size holds; it ends earlier where tissue bears no more. Either this or `force_mn`."""
@@ -283,7 +283,7 @@ class FemSection(Section):
     @model_validator(mode="after")
     def _contacts_are_loaded_or_driven(self) -> FemSection:
         named = [(f"instrument_list[{k}].", one) for k, one in enumerate(self.instrument_list)]
-        if self.contact == "loaded":
+        if "driven" not in self.contact:
             ways = [("", self.travel_mm), *((at, one.travel_mm) for at, one in named)]
             for at, way in ways:
                 if way is not None:
@@ -291,8 +291,12 @@ class FemSection(Section):
             return self
         if self.time == "dynamic":
             raise ValueError("contact: driven needs time: quasi-static")
-        if "gestures" in self.model_fields_set and "slide" in self.gestures:
+        if self.contact == ("driven",) and "gestures" in self.model_fields_set and "slide" in self.gestures:
             raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
+        if len({*self.contact}) > 1:
+            if self.travel_mm is None:
+                raise ValueError("travel_mm: driven contacts next to loaded ones need it")
+            return self
         if self.travel_mm is not None and self.force_mn is not None:
             raise ValueError("travel_mm: either the way or force_mn, not both")
         general = self.travel_mm or self.force_mn
@@ -309,9 +313,9 @@ class FemSection(Section):
     def _law_bears_loads_and_relaxation(self, info: ValidationInfo) -> FemSection:
         if sum(part for part, _ in self.relaxation) >= 1:
             raise ValueError("relaxation: the lost shares add up to the whole stiffness or more")
-        checked = info.context is not STORED and self.contact == "loaded"
+        checked = info.context is not STORED and "loaded" in self.contact
         for name, loads in self.load_ranges if checked else ():
-            check_load_range(self.chosen_law[0], loads, self.young_kpa[0], name)
+            check_load_range(self.of_contact("loaded").chosen_law[0], loads, self.young_kpa[0], name)
         return self
 
     @model_validator(mode="after")
@@ -336,11 +340,11 @@ class FemSection(Section):
     @property
     def own_instruments(self) -> dict[str, OwnInstrument]:
         """The instruments that are meshes of one's own, by name. ValueError: two share one."""
-        found: dict[str, OwnInstrument] = {}
-        for tool in (*self.instrument, *(one.instrument for one in self.instrument_list)):
-            if isinstance(tool, OwnInstrument) and found.setdefault(name_of(tool), tool) != tool:
+        meshes: dict[str, OwnInstrument] = {}
+        for tool in (*self.instrument, *(line.instrument for line in self.instrument_list)):
+            if isinstance(tool, OwnInstrument) and meshes.setdefault(name_of(tool), tool) != tool:
                 raise ValueError(f"instrument: two are called {name_of(tool)}; rename one's file")
-        return found
+        return meshes
 
     def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Tool, float]]:
         """Gestures that an instrument may be drawn with, each with its instruments and their shares."""
@@ -353,7 +357,7 @@ class FemSection(Section):
                 shares = {name: float(named.count(name)) for name in named if name in takes}
             total = sum(shares.values())
             found[kind] = {name: share / total for name, share in shares.items() if share}
-        if self.contact == "driven":
+        if self.contact == ("driven",):
             found.pop("slide", None)
         return {kind: shares for kind, shares in found.items() if shares}
 
@@ -369,10 +373,16 @@ class FemSection(Section):
         drawn = [("", self.load_range(InstrumentSection()))] if self.instruments[1] > len(given) else []
         return drawn + [(f"instrument_list[{k}]: ", self.load_range(one)) for k, one in enumerate(given)]
 
+    def of_contact(self, contact: Contact) -> FemSection:
+        """The section of the sequences with one kind of contact; `force_mn` is then of loaded ones, if driven
+        ones have `travel_mm`."""
+        force = self.force_mn if contact == "loaded" or self.travel_mm is None else None
+        return self.model_copy(update={"contact": (contact,), "force_mn": force})
+
     @property
     def chosen_law(self) -> tuple[str, str]:
-        """The material law of every sequence, and the reason for it."""
-        if self.law == "auto" and self.contact == "driven":
+        """The material law of every sequence with the first kind of contact, and the reason for it."""
+        if self.law == "auto" and self.contact[0] == "driven":
             return "ogden", "driven contacts strain tissue beyond the range of the other laws"
         if self.law == "auto" and self.membrane.probability > 0:
             return "neo-hookean", "a membrane stretches as it bends, which the linear law leaves out"

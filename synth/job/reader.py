@@ -11,7 +11,6 @@ from typing import Any
 from synth.arguments import checked
 from synth.errors import UserError, did_you_mean
 from synth.job import identity
-from synth.job.mechanics_sections import LARGEST_MESH
 from synth.job.schema import Job
 from synth.system import checked_file
 from synth.system.config_file import ConfigFile, Loc, Mistake
@@ -68,7 +67,7 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
     """Makes the paths in a job absolute; yields the errors of those that can't be used."""
     places: list[tuple[Loc, int | None]] = [*identity.FILES.items(), (("mechanics", "source"), None)]
-    places += [(at, LARGEST_MESH) for at in identity.find_meshes(config.values)]
+    places += [(at, checked_file.LARGEST_INSTRUMENT) for at in identity.find_meshes(config.values)]
     for at, largest in places:
         block = _inside(config.values, at[:-1])
         name = _inside(block, at[-1:])

@@ -130,11 +130,6 @@ class MechanicsSection(Section):
     and x0, y0, z0 of the first one's tip and u0, v0, w0 from it to the hand. Empty: none is drawn."""
 
 
-def table_of(force: str | None) -> str | None:
-    """The table that `mechanics.force` names; None if it names a field, or nothing."""
-    return force if force is not None and force.lower().endswith(".csv") else None
-
-
 Family = Literal["healthy", "hyperaemic", "pale", "oedematous", "calf"]
 
 

@@ -13,10 +13,9 @@ from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.publish.picture import Rgb, caption, tile
 from synth.render.anatomy.surface import CortexSurface
-from synth.render.camera.camera import resized
+from synth.render.camera.camera import resize
 from synth.render.idle import with_idle
 from synth.render.scene import SceneState
-from synth.sequence import scenario
 from synth.sequence.rest_scene import RestScene, at_rest
 from synth.sequence.simulation import simulate
 from synth.system.terminal import ProgressCallback
@@ -52,21 +51,22 @@ def _draw_scenario(job: Job, index: int, size: tuple[int, int]) -> Rgb:
         state = replace(deformed.state(deformed.strongest), camera=None)
     else:
         scene = at_rest(job, index)
-        ready = [poised(gesture, scene.surface) for gesture in scene.scenario.gestures]
+        ready = [pose_touching(gesture, scene.surface) for gesture in scene.scenario.gestures]
         touching = (np.concatenate(part) for part in zip(*ready, strict=True))
         tips, shafts = with_idle(scene.scenario.idle, 0.0, *touching)
         state = SceneState(scene.surface.vertices, tips, shafts)
     sensor, part = scene.scenario.appearance.sensor, size[0] / job.render.size[0]
     sensor = replace(sensor, blur=part * sensor.blur)  # which is in px of the whole picture
     case = replace(scene.scenario, appearance=replace(scene.scenario.appearance, sensor=sensor))
-    scene = replace(scene, view=resized(scene.view, size), scenario=case)
-    frame = scene.renderer.render(state, scenario.frame_seeds(job, index)[0])
+    drawn = replace(scene.draw, camera=resize(scene.view, size), scenario=case)
+    scene = replace(scene, draw=drawn)
+    frame = scene.renderer.render(state, drawn.frame_seeds[0])
     picture = frame.rgb if frame.rgb_right is None else np.hstack([frame.rgb, frame.rgb_right])
     acting = " + ".join(f"{tool} {kind}" for kind, tool, _ in scene.instruments if kind != "idle")
     return caption(picture, f"{index}  {scene.scenario.family}  {acting}", size[1] - 8)
 
 
-def poised(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
+def pose_touching(gesture: Gesture, surface: CortexSurface) -> tuple[Floats, Floats]:
     """Tips (2, 3) mm on the surface where the gesture begins, and shafts (2, 3)."""
     touching = ToolMotion(np.zeros(1), np.zeros(1), np.zeros((1, 2)))
     shape = Shape(surface.vertices, surface.faces)

@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
-from synth.arrays import Floats, Indices
+from synth.arrays import Floats, Indices, Map
 from synth.geometry.triangles import Shape
-from synth.render.materials import Body, Lamp
+from synth.render.materials import Body, FinishMaps, Lamp
 
 
 class Instruments(Protocol):
@@ -20,8 +20,12 @@ class Instruments(Protocol):
     """
 
     @property
-    def tint(self) -> Floats:
-        """(V, 3) diffuse reflectance at vertices."""
+    def maps(self) -> FinishMaps:
+        """Texture of all of them."""
+
+    @property
+    def uv(self) -> Map:
+        """(V, 2) from 0 to 1: place in the maps."""
 
     @property
     def owner(self) -> Indices:
@@ -31,10 +35,13 @@ class Instruments(Protocol):
         """The mesh in its place; only its vertices depend on it."""
 
     def glow(self, posed: Shape) -> Floats:
-        """Radiance (V, 3) that the mesh in its place mirrors towards the camera at rest."""
+        """Radiance (V, 3) of the surroundings that a mirror in its place shows the camera at rest."""
 
-    def film(self, tips: Floats, surface: Floats) -> Floats:
-        """Height (V,) mm of the liquid that climbs to the tips from a tissue's vertices (V, 3) mm."""
+    def film(self, posed: Shape, surface: Floats) -> Floats:
+        """Height (V,) mm of the liquid that climbs to the mesh from a tissue's vertices (V, 3) mm."""
+
+    def shade(self, posed: Shape, surface: Floats) -> Floats:
+        """Share (V,) of light that scatters to a tissue's vertices (V, 3) mm past the mesh in its place."""
 
 
 @dataclass(frozen=True)

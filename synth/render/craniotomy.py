@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from synth.arrays import Floats, Map
-from synth.geometry.triangles import Shape
-from synth.job.schema import Job
-from synth.render import finish, instrument, own_instrument
+from synth.arrays import Map
+from synth.render import instrument, scenery
 from synth.render.anatomy import noise, rim, texture
 from synth.render.anatomy.rim import Rim
-from synth.render.anatomy.surface import CortexSurface, resized
-from synth.render.appearance import light, reflection
+from synth.render.anatomy.surface import CortexSurface, resize
+from synth.render.appearance import light
 from synth.render.appearance.family import Appearance
 from synth.render.appearance.reflection import Theatre
 from synth.render.camera.camera import Camera
 from synth.render.content import SceneContent
-from synth.render.finish import Finish
 from synth.render.idle import IdleInstrument
-from synth.render.materials import Body, Coat, Metal, Wet
+from synth.render.instrument import NO_MESHES, OwnMesh
+from synth.render.materials import Body, Coat, Wet
 from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
-_RIM_ROUGHNESS, _RIM_DRY = 0.09, 0.35
+_RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.33
+_SEEN = 1.4  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
-_DULL = Finish((0.15, 0.145, 0.14), 0.4, scattered=0.25)  # a retractor's, darkened against glare
 _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wider than the picture
 
 # An anatomy that is shown again, as by other gestures on it, keeps the paint of its cortex and its rim.
@@ -41,29 +40,35 @@ def craniotomy(
     surface: CortexSurface,
     appearance: Appearance,
     camera: Camera,
-    job: Job,
+    opening_mm: float,
     drawn: Sequence[tuple[str, float]] = (),
     idle: Sequence[IdleInstrument] = (),
     how: Randomization | None = None,
+    *,
+    photo: Path | None = None,
+    wear: float = 0.0,
+    meshes: Mapping[str, OwnMesh] = NO_MESHES,
 ) -> SceneContent:
-    """The content of one sequence at rest; UserError: the job's photograph cannot be read.
+    """The content of one sequence at rest; UserError: the photograph cannot be read.
 
-    `drawn`: kind of each acting instrument, `none` for one that is not drawn, and the radius of its contacts
-    [mm]; `idle`: those that touch nothing; `how`: what is randomised.
+    `opening_mm`: radius of the opening; `drawn`: kind of each acting instrument, `none` for one that is not
+    drawn, and the radius of its contacts [mm]; `idle`: those that touch nothing; `how`: what is randomised;
+    `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their steel;
+    `meshes`: of kinds of one's own.
     """
     how = how or Randomization()
     lit = appearance.light.power * light.blackbody(appearance.light.kelvin)
     ambient = appearance.light.ambient * lit
     # Grown and painted in the usual size.
-    patch, px_mm = resized(surface, 1 / how.scale), camera.mm_per_px / how.scale
-    around = rim.build(patch, job.anatomy.craniotomy.radius_mm / how.scale, appearance, px_mm)
+    patch, px_mm = resize(surface, 1 / how.scale), camera.mm_per_px / how.scale
+    seen_mm = _SEEN * 0.5 * float(np.hypot(*camera.size)) * px_mm
+    around = rim.build(patch, opening_mm / how.scale, appearance, px_mm, seen_mm)
     pixels, texels = (
         min(texture.resolution(extent, one), _MOST_TEXELS if how.scale != 1 else 4096)
         for extent, one in ((patch.chart.extent_mm, px_mm), (around.extent_mm, 2.2 * px_mm))
     )
     if how.pattern is None:
         shade = rim.shade(around, patch) if how.surroundings is None else None
-        photo = job.appearance.photo
         paint = partial(texture.cortex, patch, appearance, pixels, photo, shade)
         coat = paint() if photo else _COATS.get(paint, patch, appearance, pixels, shade)
         wet = appearance.roughness, appearance.dry_roughness
@@ -80,41 +85,26 @@ def craniotomy(
     static = [Body(how.scale * around.shape.vertices, around.shape.faces, around.uv, rim_coat)]
     lamps = light.lamps(camera, appearance.light)
     wound = _wound(patch, around, coat, appearance)
-    theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lamps, lit, camera.centre)
+    theatre = Theatre(wound, how.scale * patch.chart.extent_mm, lit, camera.centre)
     if how.surroundings is not None:
-        sizes = job.anatomy.craniotomy.radius_mm, 2 * camera.mm_per_px * camera.size[0]
+        sizes = opening_mm, 2 * camera.mm_per_px * camera.size[0]
         sheet = surroundings.sheet(how.surroundings, surface.vertices, *sizes, ambient)
         static = [] if how.surroundings.kind == "nothing" else [sheet]
     ground = np.concatenate([surface.vertices, *(one.vertices for one in static)])
-    if "retractor" in appearance.scenery and how.surroundings is None:
-        static.append(_retractor(how.scale * around.edge, theatre, ground, appearance.rim_seed))
-    hand = np.random.default_rng([appearance.rim_seed, 2])
-    strength, own = job.randomize.get("instruments", 0.0), own_instrument.read_own_instruments(job.fem)
+    seed, px = appearance.rim_seed, camera.mm_per_px
+    if how.surroundings is None:
+        if "retractor" in appearance.scenery:
+            static.append(scenery.build_retractor(how.scale * around.edge, theatre, ground, seed, px))
+        if "clips" in appearance.scenery:
+            static += scenery.build_clips(around, how.scale, theatre, ground, seed, camera)
+    hand = np.random.default_rng([seed, 2])
     return SceneContent(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(drawn, theatre, hand, strength, idle, ground, own),
+        instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),
         spot=appearance.light.even,
     )
-
-
-def _retractor(edge: Floats, theatre: Theatre, ground: Floats, seed: int) -> Body:
-    """A straight blade on the rim, its end over the opening's edge."""
-    rng = np.random.default_rng([seed, 5])
-    turn, lean, inside, wide = rng.uniform((0, 0.1, 1.5, 3.5), (2 * np.pi, 0.2, 3.5, 5.2))
-    parts, half = instrument.shape_of("spatula", float(wide))
-    out, up = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([0.0, 0.0, 1.0])
-    start = float(edge[int(turn / (2 * np.pi) * len(edge))]) - inside
-    along, aside = ground @ out - start, np.abs(ground @ np.cross(up, out))
-    under = (along > 0) & (aside < half + 0.5)
-    high = float((ground[under, 2] - np.tan(lean) * along[under]).max()) + 0.5
-    tip, shaft = start * out + high * up, np.cos(lean) * out + np.sin(lean) * up
-    dull = finish.reflectance(_DULL, parts[0].profile, instrument.RING, rng)
-    (vertices,) = instrument.place(parts, np.stack([tip, tip]), np.stack([shaft, shaft]))
-    blade = Shape(vertices, parts[0].shape.faces)
-    steel = Metal(dull.diffuse, reflection.glow(blade, dull, theatre))
-    return Body(*blade, np.zeros((len(vertices), 2), np.float32), steel)
 
 
 def _wound(surface: CortexSurface, around: Rim, coat: Coat, appearance: Appearance) -> Map:

@@ -7,25 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from types import MappingProxyType
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from synth.arrays import Floats, Indices
+from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
-from synth.geometry.triangles import Shape, grid_faces, joined, lengths
-from synth.render import finish
+from synth.geometry.triangles import Shape, grid_faces, joined
+from synth.render import finish, finish_maps
 from synth.render.appearance import reflection
-from synth.render.appearance.reflection import Reflectance, Theatre
+from synth.render.appearance.reflection import Theatre
+from synth.render.finish import Finish
+from synth.render.finish_maps import RING
 from synth.render.idle import CLOTH, IdleInstrument
+from synth.render.materials import FinishMaps, read_map, stack_maps
 
-RING = 32  # vertices of each of a part's rings
 _RINGS = 64
 _LENGTH_MM = 110.0
-_CLIMB_MM, _REACH_MM = 0.30, 0.40  # height to which fluid climbs at a tip, and distance of its fall-off
+_CLIMB_MM, _REACH_MM = 0.55, 0.35  # height to which fluid climbs at a tip, and distance of its fall-off
+_TOUCH_MM = 0.15  # distance from an instrument's vertices at which its surface is
+_SHADE, _SHADE_MM = 0.5, 0.9  # light that a body takes where it touches, and distance of its fall-off
+_AWAY_MM = 2.5  # distance from which on neither is seen
 _OTHER_SIZES = 0.6, 1.6  # of an acting instrument's tip, at strength 1
 _SHEET_MM, _LAID_MM = 0.4, 0.45  # spacing of a cloth's vertices, its height over what is below
 
@@ -37,12 +42,8 @@ class Part:
     profile: Floats  # (V, 3) mm
     side: int  # tip of the instrument that it follows: 1, -1; 0: their middle
     rows: int = 0  # of a sheet of cloth; 0: closed rings
-    faces: Indices | None = None  # of a mesh of one's own; None: a grid's
-
-    @property
-    def columns(self) -> int:
-        """Vertices of each ring as `finish.reflectance` takes it; 1 of a mesh without rings."""
-        return 0 if self.rows else RING if self.faces is None else 1
+    faces: Indices | None = None  # of a mesh without rings; None: a grid's
+    outline: Floats | None = None  # (R * RING, 3) mm of such a mesh: rings around it, which have its texture
 
     @property
     def shape(self) -> Shape:
@@ -52,6 +53,33 @@ class Part:
         faces = grid_faces(rows, len(self.profile) // rows, "" if self.rows else "columns")
         return Shape(self.profile, faces.reshape(-1, 3))
 
+    @property
+    def uv(self) -> Map:
+        """(V, 2) place in its maps, see `finish_maps`."""
+        if self.outline is not None:
+            return finish_maps.wrap(self.profile, self.outline)
+        if not self.rows:
+            return finish_maps.unfold(self.profile, self.turn)
+        sizes = self.rows, len(self.profile) // self.rows
+        ends = [np.linspace(0, 1, size, dtype=np.float32) for size in sizes]
+        across, along = np.meshgrid(*ends, indexing="ij")
+        return np.column_stack([along.ravel(), across.ravel()])
+
+    @property
+    def turn(self) -> int:
+        """Column of its rings that faces the microscope: of a tine its edge, of a blade its flat side."""
+        return RING // 4 if self.side else 0
+
+    def maps(self, skin: Finish, kind: str, rng: np.random.Generator, mm_per_px: float) -> FinishMaps:
+        """Its texture in a finish."""
+        rings = self.profile if self.outline is None else self.outline
+        return finish_maps.paint(skin, rings, self.rows, self.turn, kind, rng, mm_per_px)
+
+    def resize(self, size: float) -> Part:
+        """The part, larger by a factor."""
+        outline = None if self.outline is None else size * self.outline
+        return replace(self, profile=size * self.profile, outline=outline)
+
 
 @dataclass(frozen=True, eq=False)
 class OwnMesh:
@@ -59,25 +87,32 @@ class OwnMesh:
 
     part: Part
     half: float  # half the width of its tip, mm
-    outline: Part  # rings around it, for its distance from other instruments
+
+    @property
+    def outline(self) -> Part:
+        """Rings around it, for its distance from other instruments."""
+        assert self.part.outline is not None
+        return Part(self.part.outline, 0)
 
 
-NO_OWN: Mapping[str, OwnMesh] = MappingProxyType({})
+NO_MESHES: Mapping[str, OwnMesh] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class InstrumentMesh:
     """All instruments of a scene as one mesh; see `content.Instruments`."""
 
-    halves: tuple[float, ...]  # half the width of each one's contact with tissue, mm
     parts: tuple[tuple[Part, ...], ...]  # the parts of each, none where it is not drawn
     faces: Indices  # (F, 3) over all parts
-    surface: Reflectance  # at all vertices
+    uv: Map  # (V, 2)
+    maps: FinishMaps
     theatre: Theatre  # that they mirror
 
-    @property
-    def tint(self) -> Floats:
-        return self.surface.diffuse
+    @cached_property
+    def alpha(self) -> Map:
+        """(V,) roughness at the vertices, for what they mirror."""
+        texels = np.sqrt(self.maps.rough[..., 0] * self.maps.rough[..., 1])
+        return read_map(texels, self.uv)
 
     @property
     def owner(self) -> Indices:
@@ -93,15 +128,31 @@ class InstrumentMesh:
         return Shape(np.concatenate([bar for one in each for bar in place(*one)]), self.faces)
 
     def glow(self, posed: Shape) -> Floats:
-        return reflection.glow(posed, self.surface, self.theatre)
+        return reflection.glow(posed, self.alpha, self.theatre)
 
-    def film(self, tips: Floats, surface: Floats) -> Floats:
+    def film(self, posed: Shape, surface: Floats) -> Floats:
+        near, away = _near(posed, surface)
         height = np.zeros(len(surface))
-        for half, parts, ends in zip(self.halves, self.parts, tips.reshape(-1, 2, 3), strict=True):
-            for end in ends if len(parts) == 2 else ends.mean(axis=0, keepdims=True)[: len(parts)]:
-                away = lengths(surface - end) - half
-                height = np.maximum(height, _CLIMB_MM * np.exp(-np.maximum(away, 0) / _REACH_MM))
+        height[near] = _CLIMB_MM * np.exp(-np.maximum(away - _TOUCH_MM, 0) / _REACH_MM)
         return height
+
+    def shade(self, posed: Shape, surface: Floats) -> Floats:
+        near, away = _near(posed, surface)
+        share = np.ones(len(surface))
+        share[near] = 1 - _SHADE * np.exp(-((away / _SHADE_MM) ** 2))
+        return share
+
+
+def _near(posed: Shape, surface: Floats) -> tuple[Indices, Floats]:
+    """Indices (n,) of points (V, 3) mm that may be near a mesh, and their distances from its vertices."""
+    low, high = surface.min(axis=0) - _AWAY_MM, surface.max(axis=0) + _AWAY_MM
+    ends = posed.vertices[((posed.vertices > low) & (posed.vertices < high)).all(axis=1)]
+    if not len(ends):
+        return np.zeros(0, np.int32), np.zeros(0)
+    low, high = ends.min(axis=0) - _AWAY_MM, ends.max(axis=0) + _AWAY_MM
+    near = np.flatnonzero(((surface > low) & (surface < high)).all(axis=1))
+    away, _ = cKDTree(ends).query(surface[near], distance_upper_bound=_AWAY_MM)
+    return near.astype(np.int32), np.asarray(away)
 
 
 def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
@@ -119,15 +170,14 @@ def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
 
 
 def shape_of(
-    kind: str, footprint_mm: float, size: float = 1.0, own: Mapping[str, OwnMesh] = NO_OWN
+    kind: str, footprint_mm: float, size: float = 1.0, meshes: Mapping[str, OwnMesh] = NO_MESHES
 ) -> tuple[tuple[Part, ...], float]:
     """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip; both times
-    `size`. `own`: meshes of further kinds, which have the size of their files."""
+    `size`. `meshes`: of further kinds, which have the size of their files."""
     if kind == "none":
         return (), 0.0
-    if kind in own:
-        part = own[kind].part
-        return (replace(part, profile=size * part.profile),), size * own[kind].half
+    if kind in meshes:
+        return (meshes[kind].part.resize(size),), size * meshes[kind].half
     make, share, least, most = SHAPES[kind]
     half = size * float(np.clip(share * footprint_mm, least, most))
     return make(half), half
@@ -140,29 +190,40 @@ def build(
     strength: float = 0.0,
     idle: Sequence[IdleInstrument] = (),
     ground: Floats = np.zeros((1, 3)),
-    own: Mapping[str, OwnMesh] = NO_OWN,
+    mm_per_px: float = 0.05,
+    meshes: Mapping[str, OwnMesh] = NO_MESHES,
 ) -> InstrumentMesh | None:
     """Instruments in a theatre, with finishes drawn for each; None if there is none.
 
     `drawn`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
-    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `own`: as of `shape_of`.
+    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `mm_per_px`: of the picture; `meshes`:
+    as of `shape_of`.
     """
     sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
-    made = [shape_of(kind, a, size, own) for (kind, a), size in zip(drawn, sizes, strict=True)]
+    made = [shape_of(kind, a, size, meshes) for (kind, a), size in zip(drawn, sizes, strict=True)]
     made += [
         ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
         for one in idle
     ]
-    parts, halves = zip(*made, strict=True) if made else ((), ())
+    parts = tuple(shapes for shapes, _ in made)
     if not any(parts):
         return None
-    surfaces = list[Reflectance]()
-    for each, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
+    textures = list[tuple[Map, FinishMaps]]()
+    for own, kind in zip(parts, [*(kind for kind, _ in drawn), *(one.kind for one in idle)], strict=True):
         skin = finish.draw_finish(strength, rng, kind)
-        surfaces += [finish.reflectance(skin, part.profile, part.columns, rng) for part in each]
-    whole = Reflectance(*(np.concatenate(part) for part in zip(*surfaces, strict=True)))
-    faces = joined(*(part.shape for each in parts for part in each)).faces
-    return InstrumentMesh(halves, parts, faces, whole, theatre)
+        textures += [(part.uv, part.maps(skin, kind, rng, mm_per_px)) for part in own]
+    faces = joined(*(part.shape for own in parts for part in own)).faces
+    return InstrumentMesh(parts, faces, *stack_maps(textures), theatre)
+
+
+def sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
+    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
+    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    c, w = np.cos(angle), np.sin(angle)
+    x = np.sign(c) * np.abs(c) ** power
+    y = np.sign(w) * np.abs(w) ** power
+    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
+    return np.stack(columns, -1).reshape(-1, 3)
 
 
 def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part:
@@ -178,7 +239,7 @@ def _laid(one: IdleInstrument, ground: Floats, rng: np.random.Generator) -> Part
     z = np.maximum(gaussian_filter(below, 1.5, mode="nearest"), below) + _LAID_MM
     z[1:-1, 1:-1] += 0.3  # its border is lower
     if one.kind == "gauze":
-        z += 0.5 * np.maximum(finish.noise(at, 9.0, rng), 0).reshape(z.shape)
+        z += 0.5 * np.maximum(finish_maps.noise(at, 9.0, rng), 0).reshape(z.shape)
     return Part(np.column_stack([u, v, z.ravel() - tip[2]]), 1, rows)
 
 
@@ -192,16 +253,6 @@ def _axes(shaft: Floats, across: Floats) -> Floats:
             x = x / np.linalg.norm(x)
             return np.stack([x, np.cross(z, x), z])
     raise ValueError("a shaft without direction")
-
-
-def _sweep(s: Floats, thick: Floats, wide: Floats, bow: Floats, power: float) -> Floats:
-    """Rings (V, 3) at z = `s`: half axes `thick` and `wide`, shifted by `bow` along x; round at power 1."""
-    angle = np.linspace(0, 2 * np.pi, RING, endpoint=False)
-    c, w = np.cos(angle), np.sin(angle)
-    x = np.sign(c) * np.abs(c) ** power
-    y = np.sign(w) * np.abs(w) ** power
-    columns = [thick[:, None] * x + bow[:, None], wide[:, None] * y, np.repeat(s[:, None], len(x), 1)]
-    return np.stack(columns, -1).reshape(-1, 3)
 
 
 def _along() -> Floats:
@@ -225,7 +276,7 @@ def _forceps(half: float, aside_mm: float = 0.0) -> tuple[Part, ...]:
     bow = 5.5 * (1 - np.exp(-((s / 38.0) ** 1.5)))
     bend = np.clip((s - 24.0) / 14.0, 0, 1)
     shift = np.repeat(aside_mm * bend**2 * (3 - 2 * bend), RING)[:, None] * [0.0, 1.0, 0.0]
-    return tuple(Part(_sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
+    return tuple(Part(sweep(s, thick, wide, -side * bow, 0.7) + shift, side) for side in (1, -1))
 
 
 def _dissector(half: float) -> tuple[Part, ...]:
@@ -237,7 +288,7 @@ def _dissector(half: float) -> tuple[Part, ...]:
     thick = (0.28 + 0.55 * (1 - neck) + handle) * np.minimum(close * 1.4, 1)
     wide = (0.83 + (half - 0.75) * neck + handle) * close
     bow = 1.6 * np.exp(-s / 6.0) - 1.6
-    return (Part(_sweep(s, thick, wide, bow, 0.9), 0),)
+    return (Part(sweep(s, thick, wide, bow, 0.9), 0),)
 
 
 def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[Part, ...]:
@@ -249,7 +300,7 @@ def _suction(half: float, bend_mm: float = 2.5, wider_mm: float = 0.9) -> tuple[
     radius = half + np.concatenate([np.full(5, -0.3 * min(half, 0.5)), grown])
     radius[5] = half - 0.05  # a blunted edge
     bow = bend_mm * (1 - np.exp(-((s / 45.0) ** 2)))
-    return (Part(_sweep(s, radius, radius, bow, 1.0), 0),)
+    return (Part(sweep(s, radius, radius, bow, 1.0), 0),)
 
 
 def _spatula(half: float) -> tuple[Part, ...]:
@@ -258,7 +309,7 @@ def _spatula(half: float) -> tuple[Part, ...]:
     wide = (half + 0.8 * (1 - np.exp(-s / 30.0))) * _round_off(s, half)
     thick = np.full_like(s, 0.32) * _round_off(s, 0.3)
     bow = 4.0 * (1 - np.exp(-((s / 30.0) ** 2)))
-    return (Part(_sweep(s, thick, wide, bow, 0.35), 0),)
+    return (Part(sweep(s, thick, wide, bow, 0.35), 0),)
 
 
 def _probe(half: float) -> tuple[Part, ...]:
@@ -267,14 +318,14 @@ def _probe(half: float) -> tuple[Part, ...]:
     radius = np.maximum(np.sqrt(np.maximum(half**2 - (s - half) ** 2, 0)), np.where(s > half, 0.45 * half, 0))
     radius += 1.1 / (1 + np.exp(-(s - 42.0) / 2.0))
     low, up = (1 - np.sin(np.radians(50))) * half, np.cos(np.radians(50)) * half
-    return (Part(_sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)
+    return (Part(sweep(s - low, radius, radius, np.full_like(s, up), 1.0), 0),)
 
 
 def _rod(half: float, bend: float = 0.0) -> tuple[Part, ...]:
     """A round rod or finger with a round end, straight or bent upwards."""
     s = _along()
     radius = half * _round_off(s, half)
-    return (Part(_sweep(s, radius, radius, bend * s**2, 1.0), 0),)
+    return (Part(sweep(s, radius, radius, bend * s**2, 1.0), 0),)
 
 
 SHAPES: dict[str, tuple[Callable[[float], tuple[Part, ...]], float, float, float]] = {

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+
+import cv2
+import numpy as np
 
 from synth.arrays import Floats, Indices, Map
 from synth.geometry.triangles import Shape
@@ -44,13 +47,58 @@ class Wet:
 
 
 @dataclass(frozen=True)
-class Metal:
-    """A body whose reflections are given rather than rendered."""
+class FinishMaps:
+    """Texture maps (h, w) of hard bodies, float32: bare metal, plastic, paint, and what sticks to them."""
 
-    tint: Floats
-    """(V, 3) diffuse reflectance at vertices."""
+    base: Map
+    """(h, w, 3) linear reflectance: at right angles of bare metal, else albedo."""
+    bare: Map
+    """(h, w) share that is bare metal, a conductor; the rest scatters below a dielectric surface."""
+    rough: Map
+    """(h, w, 2) GGX alpha along u and across it; the first is the larger one."""
+    wet: Map
+    """(h, w) share under a film of liquid."""
+    mirror: Map
+    """(h, w, 3) reflectance at right angles for light of the surroundings."""
+    normal: Map
+    """(h, w, 3) unit normals in the surface's tangent frame."""
+
+
+def stack_maps(parts: Sequence[tuple[Map, FinishMaps]]) -> tuple[Map, FinishMaps]:
+    """One texture for several bodies: uv (V, 2) of each and its maps, to those of all and the maps' stack.
+
+    Maps of other widths than the widest are resampled.
+    """
+    width = max(maps.bare.shape[1] for _, maps in parts)
+    total, start = sum(len(maps.bare) for _, maps in parts), 0
+    places = list[Map]()
+    layers = dict[str, list[Map]]()
+    for uv, maps in parts:
+        height = len(maps.bare)
+        # Between the centres of a body's outermost texels: its neighbours don't show at its edges.
+        v = (start + 0.5 + uv[:, 1] * (height - 1)) / total
+        places.append(np.column_stack([(0.5 + uv[:, 0] * (width - 1)) / width, v]).astype(np.float32))
+        start += height
+        for name, layer in vars(maps).items():
+            fits = layer.shape[1] == width
+            layers.setdefault(name, []).append(layer if fits else cv2.resize(layer, (width, height)))
+    return np.concatenate(places), FinishMaps(**{name: np.concatenate(rows) for name, rows in layers.items()})
+
+
+def read_map(layer: Map, uv: Map) -> Map:
+    """A map (h, w) or (h, w, n) at places uv (V, 2) from 0 to 1, bilinear: (V,) or (V, n)."""
+    place = (uv * layer.shape[1::-1] - 0.5).astype(np.float32)[:, None]
+    texels = cv2.remap(layer, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(texels[:, 0])
+
+
+@dataclass(frozen=True)
+class Metal:
+    """A hard body that mirrors its surroundings; u of its body runs along the brushing."""
+
+    maps: FinishMaps
     glow: Floats
-    """(V, 3) mirrored radiance at vertices."""
+    """(V, 3) radiance of the surroundings, but for the lamps, that a mirror at a vertex would show."""
 
 
 @dataclass(frozen=True)

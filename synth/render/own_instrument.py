@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
 from synth.geometry.mesh_file import check_surface
-from synth.job.mechanics_sections import LARGEST_MESH, FemSection, OwnInstrument
-from synth.render.instrument import RING, OwnMesh, Part
+from synth.render.finish_maps import RING
+from synth.render.instrument import OwnMesh, Part
 from synth.system import checked_file
 
 _KINDS = "stl", "obj", "ply"
@@ -33,13 +32,26 @@ _SHARP_DEG = 35.0  # between neighbouring faces, above which their edge stays sh
 _SLICES = 48  # of an outline
 
 
-def read_own_instruments(fem: FemSection) -> Mapping[str, OwnMesh]:
-    """Meshes of a job's own instruments, by name. UserError: one can't be read, or isn't an instrument's."""
-    found = {name: _read(one, _state_of(one.file)) for name, one in fem.own_instruments.items()}
-    return MappingProxyType(found)
+Vector = tuple[float, float, float]
 
 
-def _state_of(path: Path) -> tuple[int, ...]:
+@dataclass(frozen=True)
+class PlacedFile:
+    """A file with an instrument's mesh, and what places it in the instrument's axes; as of `place_mesh`."""
+
+    path: Path
+    tip: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    up: Vector | None = None
+    unit_mm: float = 1.0
+
+
+def read_own_mesh(file: PlacedFile) -> OwnMesh:
+    """The mesh of an instrument; the last ones are kept. UserError: it can't be read, or isn't one's."""
+    return _read(file, _find_state(file.path))
+
+
+def _find_state(path: Path) -> tuple[int, ...]:
     """What distinguishes a file from another one that replaced it."""
     try:
         state = path.stat()
@@ -49,12 +61,12 @@ def _state_of(path: Path) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=8)
-def _read(given: OwnInstrument, state: object) -> OwnMesh:
+def _read(file: PlacedFile, state: object) -> OwnMesh:
     """The mesh of an instrument; `state`: of its file, so that one that replaced it is read anew."""
-    name = given.file.name
-    vertices, faces = read_triangles(given.file)
+    name = file.path.name
+    vertices, faces = read_triangles(file.path)
     try:
-        placed = place_mesh(vertices, faces, given.tip, given.axis, given.up, given.unit_mm)
+        placed = place_mesh(vertices, faces, file.tip, file.axis, file.up, file.unit_mm)
     except ValueError as error:
         raise UserError(f"fem.instrument: {name} {error}") from None
     if (long := placed[:, 2].max()) < _SHORT_MM:
@@ -68,8 +80,7 @@ def _read(given: OwnInstrument, state: object) -> OwnMesh:
         array.flags.writeable = False
     near = placed[placed[:, 2] <= max(placed[:, 2].min(), 0.0) + _TIP_MM]
     half = float(np.clip(np.median(np.hypot(*near[:, :2].T)), *_WIDE_MM))
-    part = Part(placed, 0, faces=faces.astype(np.int32))
-    return OwnMesh(part, half, Part(outline_mesh(placed, faces), 0))
+    return OwnMesh(Part(placed, 0, faces=faces.astype(np.int32), outline=outline_mesh(placed, faces)), half)
 
 
 def read_triangles(path: Path) -> tuple[Floats, Ints]:
@@ -81,7 +92,7 @@ def read_triangles(path: Path) -> tuple[Floats, Ints]:
     if kind not in _KINDS:
         raise UserError(f"{label} is none of {', '.join(_KINDS)}; CAD programs and Blender export them")
     with as_user_error("fem.instrument"):
-        data = checked_file.read_bytes(path, LARGEST_MESH)
+        data = checked_file.read_bytes(path, checked_file.LARGEST_INSTRUMENT)
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     try:
@@ -115,9 +126,9 @@ def read_triangles(path: Path) -> tuple[Floats, Ints]:
 def place_mesh(
     vertices: Floats,
     faces: Ints,
-    tip: tuple[float, float, float],
-    axis: tuple[float, float, float],
-    up: tuple[float, float, float] | None,
+    tip: Vector,
+    axis: Vector,
+    up: Vector | None,
     unit_mm: float,
 ) -> Floats:
     """Points (V, 3) mm of an instrument in its own axes: tip at the origin, z to the hand, x up.
@@ -158,7 +169,7 @@ def place_mesh(
 
 
 def outline_mesh(placed: Floats, faces: Ints) -> Floats:
-    """Rings (R * RING, 3) mm around slices of a mesh across z, whose edges they enclose."""
+    """Rings (R * RING, 3) mm, round, that enclose slices of a mesh across z, and two past its ends."""
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     start, end = np.moveaxis(placed[np.unique(sides, axis=0)], 1, 0)
     bounds = np.linspace(placed[:, 2].min(), placed[:, 2].max(), _SLICES + 1)
@@ -179,7 +190,8 @@ def outline_mesh(placed: Floats, faces: Ints) -> Floats:
         radius = np.linalg.norm(points - middle, axis=1).max()
         ring = middle + radius * np.column_stack([np.cos(turn), np.sin(turn)])
         rings.append(np.column_stack([ring, np.full(RING, 0.5 * (low + high))]))
-    return np.concatenate(rings)
+    step = np.array([0.0, 0.0, bounds[1] - bounds[0]])
+    return np.concatenate([rings[0] - step, *rings, rings[-1] + step])  # whose ends are within its texture
 
 
 def _distance(corners: Floats) -> float:

@@ -4,29 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from synth.arrays import Array, Floats, Map, Mask, Pixels
 from synth.geometry.triangles import Shape, joined, normals
-from synth.job.schema import RenderSection
 from synth.render import truth
 from synth.render.anatomy import noise
 from synth.render.appearance import light
 from synth.render.camera import camera_sensor
-from synth.render.camera.camera import Camera, blur_radius, disparity, right_camera
+from synth.render.camera.camera import Camera, blur_radius, disparity
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.content import SceneContent
-from synth.render.materials import Body, Metal, Wet
+from synth.render.materials import Body, FinishMaps, Metal, Wet, stack_maps
 from synth.render.mitsuba.adapter import Stage, forget, pick
 from synth.render.shadow import shadow_map
 from synth.render.truth import RestFrame
 
+Variant = Literal["auto", "llvm_ad_rgb", "scalar_rgb", "cuda_ad_rgb"]
+
 _GLARE = 0.35  # specular radiance, as a share of full scale, that hides the tissue under it
+_UNSHADED = 0.995  # share of the light from which on a contact's shadow is left out
 _NOTHING = Shape(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
-_OUT_OF_SIGHT = Shape(np.eye(3) - 1e3, np.array([[0, 1, 2]], np.int32)), Metal(*np.zeros((2, 3, 3)))
+_TEXEL = [np.full((1, 1, *shape), 0.5, np.float32) for shape in ((3,), (), (2,), (), (3,), (3,))]
+_NO_METAL = Metal(FinishMaps(*_TEXEL), np.zeros((3, 3)))
+_OUT_OF_SIGHT = Body(
+    np.eye(3) - 1e3,
+    np.array([[0, 1, 2]], np.int32),
+    np.zeros((3, 2), np.float32),
+    _NO_METAL,
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class SceneState:
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """One frame and its ground truth. Fields that are not in the job's `store.extra` are None."""
+    """One frame and its ground truth. Optional fields that the renderer was not asked for are None."""
 
     rgb: Pixels
     """(H, W, 3) sRGB."""
@@ -94,9 +102,10 @@ class Renderer:
         content: what is drawn.
         camera: the microscope at rest.
         sensor: its chip and video processor.
-        settings: of them variant, light paths and the right camera's baseline are used.
         extra: names of optional fields of a `RenderedFrame` to fill.
-        right: the right camera of the left one in any pose; by default parallel to it, at that baseline.
+        right: the right camera of the left one in any pose; none if None.
+        spp: light paths per pixel.
+        variant: of Mitsuba; `auto` is llvm_ad_rgb if LLVM works, else scalar_rgb.
 
     Raises:
         UserError: the variant cannot run here.
@@ -108,28 +117,32 @@ class Renderer:
         content: SceneContent,
         camera: Camera,
         sensor: CameraSensor = CameraSensor(),
-        settings: RenderSection = RenderSection(),
         extra: Sequence[str] = (),
         right: Callable[[Camera], Camera] | None = None,
+        *,
+        spp: int = 4,
+        variant: Variant = "auto",
     ) -> None:
         forget()  # earlier renderers
-        self.variant = pick(settings.variant)
+        self.variant = pick(variant)
         self.content, self.camera = content, camera
-        self._sensor, self._settings, self._extra = sensor, settings, extra
+        self._sensor, self._spp, self._extra = sensor, spp, extra
         if not isinstance(content.tissue.material, Wet):
             raise ValueError("the tissue's material must be Wet")
         self._wet = content.tissue.material
         self._static = joined(_NOTHING, *(body.shape for body in content.static))
-        metal = [(one.shape, one.material) for one in content.static if isinstance(one.material, Metal)]
+        metal = [(body, body.material) for body in content.static if isinstance(body.material, Metal)]
         # A face of metal at least, if out of sight: with and without instruments kernels are the same.
-        self._static_metal = metal or ([] if content.instruments is not None else [_OUT_OF_SIGHT])
+        self._static_metal = metal or (
+            [] if content.instruments is not None else [(_OUT_OF_SIGHT, _NO_METAL)]
+        )
         self.rest = truth.trace_rest(camera, content.tissue.shape, self._static)
         self.right: Camera | None = None
         """The right camera at rest, if there is one."""
         self._right_rest: RestFrame | None = None
-        self._right_of = right or partial(right_camera, baseline_mm=settings.stereo_mm)
-        if settings.stereo_mm:
-            self.right = self._right_of(camera)
+        self._right_of = right
+        if right is not None:
+            self.right = right(camera)
             self._right_rest = truth.trace_rest(self.right, content.tissue.shape, self._static)
         self._stage: Stage | None = None
 
@@ -151,6 +164,8 @@ class Renderer:
         faces = self.content.tissue.faces
         shapes = (Shape(state.vertices, faces), self._static, self._posed(state))
         own = truth.trace_frame(camera, self.rest, *shapes)
+        shade = self._contact(state, shapes[-1])
+        radiance = self._shaded(radiance, own.hits, shade)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
@@ -166,9 +181,9 @@ class Renderer:
         if "blur" in self._extra:
             extra["blur"] = blur_radius(camera, own.depth)
         extra |= self._shading(own.hits, shapes, "")
-        if self._right_rest is not None:
+        if self._right_of is not None and self._right_rest is not None:
             other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
-            picture = self.develop(others[0], seed + 1)
+            picture = self.develop(self._shaded(others[0], other.hits, shade), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
             extra |= self._shading(other.hits, shapes, "_right")
@@ -204,16 +219,20 @@ class Renderer:
         bodies = {"tissue": replace(self.content.tissue, vertices=state.vertices, film=self._film(state))}
         wet = (body for body in self.content.static if isinstance(body.material, Wet))
         bodies |= {f"static{k}": body for k, body in enumerate(wet)}
-        shape, metal = self._metal(state)
-        bodies["metal"] = Body(*shape, np.zeros((len(shape.vertices), 2), np.float32), metal)
+        shape, glow = self._metal(state)
+        textures = [(body.uv, metal.maps) for body, metal in self._static_metal]
+        if (instruments := self.content.instruments) is not None:
+            textures.insert(0, (instruments.uv, instruments.maps))
+        uv, maps = stack_maps(textures)
+        bodies["metal"] = Body(*shape, uv, Metal(maps, glow))
         return Stage(self.variant, self.camera, bodies, self.content.lamps, spp, integrator)
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Moves a stage to another state."""
         stage.move("tissue", state.vertices, film=self._film(state))
         if self.content.instruments is not None:
-            shape, metal = self._metal(state)
-            stage.move("metal", shape.vertices, glow=metal.glow)
+            shape, glow = self._metal(state)
+            stage.move("metal", shape.vertices, glow=glow)
 
     def develop(self, radiance: Map, seed: int) -> Pixels:
         """The recorded picture (H, W, 3) of a radiance (H, W, 3)."""
@@ -239,18 +258,41 @@ class Renderer:
 
     def _film(self, state: SceneState) -> Floats | None:
         instruments = self.content.instruments
-        return None if instruments is None else instruments.film(state.tips, state.vertices)
+        return None if instruments is None else instruments.film(self._posed(state), state.vertices)
+
+    def _contact(self, state: SceneState, posed: Shape) -> Floats | None:
+        """Share (V,) of light that instruments leave the tissue's vertices near them; None: all of it."""
+        if self.content.instruments is None:
+            return None
+        return self.content.instruments.shade(posed, state.vertices)
+
+    def _shaded(self, radiance: Map, hits: truth.Hits, shade: Floats | None) -> Map:
+        """The radiance (H, W, 3) less the light that contacts take from the tissue.
+
+        Light that would have come to there by scattering in tissue and between tissue and steel, of which the
+        renderer has none but a blurred albedo.
+        """
+        if shade is None or shade.min() >= _UNSHADED:
+            return radiance
+        faces = self.content.tissue.faces
+        # Of the pixels on tissue, those on a face with a shaded corner.
+        dark = np.append((shade < _UNSHADED)[faces].any(axis=1), False)
+        near = np.flatnonzero(dark[np.where(hits.face < len(faces), hits.face, -1)])
+        share = truth.blend(faces, hits.face[near], hits.bary[near], shade[:, None])
+        shaded = radiance.reshape(-1, 3).copy()
+        shaded[near] *= share.astype(np.float32)
+        return shaded.reshape(radiance.shape)
 
     def _gathered(self, states: Sequence[SceneState], seed: int) -> list[Map]:
         """Mean radiance over some states, in the camera and in the right one if there is one."""
         shots: list[list[Map]] = []
         for k, state in enumerate(states):
             if self._stage is None:
-                self._stage = self.stage(state, self._settings.spp)
+                self._stage = self.stage(state, self._spp)
             else:
                 self.move(self._stage, state)
             cameras = [state.camera or self.camera]
-            if self.right is not None:
+            if self._right_of is not None:
                 cameras.append(self._right_of(cameras[0]))
             shots.append([])
             for side, camera in enumerate(cameras):
@@ -261,14 +303,13 @@ class Renderer:
     def _spot(self, camera: Camera) -> Map:
         return light.spot(camera, self.camera, self.content.spot)
 
-    def _metal(self, state: SceneState) -> tuple[Shape, Metal]:
-        """All metal as one mesh, instruments first."""
-        parts = list(self._static_metal)
+    def _metal(self, state: SceneState) -> tuple[Shape, Floats]:
+        """All metal as one mesh, instruments first, and the surroundings (V, 3) that it mirrors."""
+        parts = [(body.shape, metal.glow) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
             posed = self._posed(state)
-            parts.insert(0, (posed, Metal(instruments.tint, instruments.glow(posed))))
-        tint, glow = ([getattr(metal, name) for _, metal in parts] for name in ("tint", "glow"))
-        return joined(*(shape for shape, _ in parts)), Metal(np.concatenate(tint), np.concatenate(glow))
+            parts.insert(0, (posed, instruments.glow(posed)))
+        return joined(*(shape for shape, _ in parts)), np.concatenate([glow for _, glow in parts])
 
     def _glare(self, radiance: Map, hits: truth.Hits, state: SceneState) -> Mask:
         """Pixels (H, W) of tissue whose radiance exceeds what diffuse reflection can reach."""

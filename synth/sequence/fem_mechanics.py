@@ -33,27 +33,45 @@ class FemMechanics:
     def deform(self, rest: RestScene, report: StageCallback, watch: Stopwatch, /) -> Deformation:
         """As `Mechanics.deform`; raises as `solver.deform`, and UserError for a volume without a mesh."""
         motions = self.motions and check_motions(self.motions, rest.scenario.gestures, rest.job.frames)
-        job, case, opening_mm = rest.job, rest.scenario, rest.job.anatomy.craniotomy.radius_mm
+        drawn, case, job = rest.draw, rest.scenario, rest.job
         with watch.stage("mesh"):
             tets = build_volume(rest)
         report("fem", 0, 1)
         with watch.stage("fem"):
-            tissue, duration = (job.fem, case.tissue, case.gestures), (job.frames, job.fps)
             return solver.deform(
-                *tissue, tets, rest.shape, *duration, case.pulse, opening_mm, motions, self.inside
+                drawn.scheme,
+                case.tissue,
+                case.gestures,
+                tets,
+                rest.shape,
+                job.frames,
+                job.fps,
+                case.pulse,
+                drawn.opening_mm,
+                motions,
+                self.inside,
             )
 
 
 def build_volume(rest: RestScene) -> Tets:
     """The volume under the surface, meshed finest under the contacts. UserError: it can't be meshed."""
-    anatomy, surface = rest.job.anatomy, rest.surface
-    focus = [place for gesture in rest.scenario.gestures for place in gesture.focus]
-    mesh, slips = (rest.job.fem.tets, focus), rest.scenario.tissue.skull == "slip"
+    drawn, surface, count = rest.draw, rest.surface, rest.job.fem.tets
+    focus = tuple(place for gesture in rest.scenario.gestures for place in gesture.focus)
+    slips, opening_mm = rest.scenario.tissue.skull == "slip", drawn.opening_mm
     if (brain := rest.brain) is not None:
-        make = partial(tetrahedra.from_brain, brain, anatomy, *mesh, slips=slips)
-        return _VOLUMES.get(make, brain, anatomy, mesh, slips)
+        mesh = partial(tetrahedra.from_brain, brain, count, focus, opening_mm=opening_mm, slips=slips)
+        return _VOLUMES.get(mesh, brain, count, focus, opening_mm, slips)
     height = HeightMap(surface.pia, surface.extent_mm)
-    how = rest.scenario.randomized
-    width, length, depth = (side * (1.0 if how is None else how.scale) for side in tetrahedra.BLOCK_MM)
-    make = partial(tetrahedra.block, anatomy, *mesh, height, slips=slips, size_mm=(width, length, depth))
-    return _VOLUMES.get(make, anatomy, mesh, height, slips, (width, length, depth))
+    width, length, depth = (drawn.scale * side for side in tetrahedra.BLOCK_MM)
+    block = partial(
+        tetrahedra.block,
+        count,
+        focus,
+        height,
+        opening_mm=opening_mm,
+        dome_mm=rest.job.anatomy.dome_mm,
+        attachments=drawn.attachments,
+        slips=slips,
+        size_mm=(width, length, depth),
+    )
+    return _VOLUMES.get(block, *block.args, *block.keywords.values())

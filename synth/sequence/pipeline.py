@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from synth.arguments import checked
-from synth.arrays import Mask, Pixels
+from synth.arrays import Array, Mask, Pixels
 from synth.dataset.dataset_folder import Folder
 from synth.dataset.store import Writer
 from synth.errors import UserError
+from synth.fem.law_choice import LAWS
 from synth.fields import FIELDS, MOST_INSTRUMENTS
 from synth.flow import track
 from synth.flow.estimator import create
 from synth.flow.segmentation import with_highlights
 from synth.flow.stereo import rig
 from synth.flow.stereo import stereo_track as stereo
-from synth.flow.track import Track
 from synth.job import identity
-from synth.job.law_choice import LAWS
 from synth.job.schema import Job
-from synth.render.camera import video_link
 from synth.render.camera.camera import Camera, between
 from synth.render.camera.camera_sensor import MOST_BLANK, blank_share
-from synth.sequence import scenario
+from synth.render.camera.video_link import transmit
+from synth.render.scene import Renderer
 from synth.sequence.published_labels import Published
 from synth.sequence.rest_scene import Scene
 from synth.sequence.simulation import simulate
@@ -39,14 +40,12 @@ _PUBLISHED = ("flow_noisy", "intensity")
 _CAMERAS = (("rgb", "tool"), ("rgb_right", "tool_right"))  # picture and instruments of each
 
 
-@dataclass(frozen=True)
-class _Task:
-    """A sequence in rendering, as shared by all stages."""
+class _Values(NamedTuple):
+    """What is to be stored: a whole field, or its frame `t`."""
 
-    scene: Scene
-    writer: Writer
-    watch: Stopwatch
-    report: StageCallback
+    name: str
+    values: Array
+    t: int | None = None
 
 
 class _Video(NamedTuple):
@@ -54,6 +53,18 @@ class _Video(NamedTuple):
 
     rgb: Pixels  # (T, H, W, 3)
     tools: Mask  # (T, H, W) pixels of the instruments
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A sequence in rendering, as shared by all stages."""
+
+    scene: Scene
+    renderer: Renderer
+    wanted: frozenset[str]
+    """Names of the fields that the job stores."""
+    watch: Stopwatch
+    report: StageCallback
 
 
 def render_sequence(job: Job, index: int, folder: Path, report: StageCallback) -> Path:
@@ -74,160 +85,158 @@ def write_scene(
     job, report, watch = scene.job, report or (lambda stage, done, of: None), watch or Stopwatch()
     with watch.stage("scene"):
         renderer = scene.renderer
-    _refuse_unseen(scene)
+    _refuse_unseen(scene, renderer)
     width, height = job.render.size
+    task = _Task(scene, renderer, frozenset(job.stored_fields), watch, report)
+    at_rest = _measure_rest(task)
     writer = Writer(Path(folder), scene.index, frames=job.frames, size=(height, width), job=scene.dataset)
     Folder(Path(folder)).refuse_replaced(scene.dataset, writer.job_identity)
-    writer.put("time", scene.time)
-    writer.put("force", scene.force)  # labels are in camera axes
-    if writer.wants("force_of"):
-        each = scene.motion.by_instrument @ scene.view.rotation.T
-        writer.put("force_of", np.pad(each, ((0, 0), (0, max(MOST_INSTRUMENTS - each.shape[1], 0)), (0, 0))))
-    writer.put("tissue", scene.tissue)
-    writer.put("area", scene.area)
-    if renderer.right is not None:
-        writer.put("disparity", renderer.disparity())
-    task = _Task(scene, writer, watch, report)
-    videos = _render_frames(task)
+    for name, values, t in chain(starmap(_Values, at_rest.items()), _run(task)):
+        with watch.stage("store"):
+            if t is None:
+                writer.put(name, values)
+            else:
+                writer.put_frame(name, t, values)
+    return writer.seal(**_describe(scene, renderer), timings=watch.report())
+
+
+def _run(task: _Task) -> Iterator[_Values]:
+    """All stages in their order: frames, codec, recovered flow and motion."""
+    job, videos = task.scene.job, list[_Video]()
+    yield from _render_frames(task, videos)
     if job.sensor.bitrate_mbps is not None:  # a codec needs all frames at once
-        videos = _encode(task, videos)
+        link = job.fps, job.sensor.bitrate_mbps, job.sensor.chroma
+        with task.watch.stage("store"):
+            videos = [_Video(transmit(rgb, *link), tools) for rgb, tools in videos]
+        yield from (_Values(name, video.rgb) for video, (name, _) in zip(videos, _CAMERAS, strict=False))
     if job.flow.backend != "ideal":
-        with watch.stage("flow"):
-            blocked = with_highlights(*videos[0])
-        recovered = _recover_flow(task, videos[0].rgb, blocked)
-        if writer.wants("motion_recovered"):
-            _recover_motion(task, videos[0].rgb, blocked, videos[1], recovered)
-    return _seal(task)
+        yield from _recover_motion(task, videos)
 
 
-def _refuse_unseen(scene: Scene) -> None:
+def _refuse_unseen(scene: Scene, renderer: Renderer) -> None:
     """Raises UserError if most of the largest force is outside the view, so that it has no label."""
-    t = scene.strongest
-    label = scene.renderer.traction(scene.motion.traction[t]) * scene.area[..., None]
-    size = float(np.linalg.norm(scene.force[t]))
-    if np.linalg.norm(label.sum(axis=(0, 1), dtype=np.float64) - scene.force[t]) > 0.5 * size:
+    t, force = scene.strongest, scene.force
+    label = renderer.traction(scene.motion.traction[t]) * renderer.rest.area[..., None]
+    size = float(np.linalg.norm(force[t]))
+    if np.linalg.norm(label.sum(axis=(0, 1), dtype=np.float64) - force[t]) > 0.5 * size:
         raise UserError(
             f"frame {t}: most of the force of {size:.3g} mN is on tissue that the camera does not show; "
             "change the contact's place, or widen render.field_mm"
         )
 
 
-def _render_frames(task: _Task) -> list[_Video]:
-    """Renders every frame and writes its fields, except videos that a codec follows; a video per camera."""
-    scene, writer, job = task.scene, task.writer, task.scene.job
+def _measure_rest(task: _Task) -> dict[str, Array]:
+    """Fields of the whole sequence that need no picture; labels are in camera axes."""
+    scene, rest = task.scene, task.renderer.rest
+    each = scene.motion.by_instrument @ scene.view.rotation.T
+    none = max(MOST_INSTRUMENTS - each.shape[1], 0)
+    fields = {
+        "time": scene.time,
+        "force": scene.force,
+        "force_of": np.pad(each, ((0, 0), (0, none), (0, 0))),
+        "tissue": rest.tissue,
+        "area": rest.area,
+    }
+    if task.renderer.right is not None:
+        fields["disparity"] = task.renderer.disparity()
+    return fields
+
+
+def _render_frames(task: _Task, videos: list[_Video]) -> Iterator[_Values]:
+    """Every frame's fields, except videos that a codec follows; adds a video per camera."""
+    scene, job, tissue = task.scene, task.scene.job, task.renderer.rest.tissue
     width, height = job.render.size
     labels = None
     if set(_PUBLISHED) & set(job.store.extra):
-        rng = scenario.label_rng(job, scene.index)
-        labels = Published(job.labels, scene.tissue, job.frames, rng)
+        rng = np.random.default_rng(scene.draw.label_seed)
+        labels = Published(job.labels, tissue, job.frames, rng)
     every = dict.fromkeys((*_RENDERED, *(_STEREO if job.render.stereo_mm else ()), *job.store.extra))
     later = () if job.sensor.bitrate_mbps is None else ("rgb", "rgb_right")
     names = [name for name in every if FIELDS[name].framed and name not in later]
     shape = (job.frames, height, width)
-    cameras = _CAMERAS if writer.wants("rgb_right") else _CAMERAS[:1]
-    videos = [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in cameras]
+    cameras = _CAMERAS if "rgb_right" in task.wanted else _CAMERAS[:1]
+    videos += [_Video(np.empty((*shape, 3), np.uint8), np.empty(shape, bool)) for _ in cameras]
     poses = np.empty((job.frames, 4, 4))
     for t in range(job.frames):
         task.report("render", t, job.frames)
         with task.watch.stage("render"):
             frame = scene.frame(t)
         if t == 0:
-            free = scene.tissue & ~frame.tool
+            free = tissue & ~frame.tool
             if blank_share(frame.rgb[free] if free.any() else frame.rgb) > MOST_BLANK:
                 raise UserError("frame 0: its tissue is black or burnt out; change sensor.exposure or light")
-        elif not frame.visible[scene.tissue].any():
+        elif not frame.visible[tissue].any():
             raise UserError(f"frame {t}: none of the tissue is visible any more; widen render.field_mm")
-        with task.watch.stage("store"):
-            made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
-            for name in names:
-                writer.put_frame(name, t, made[name] if name in made else getattr(frame, name))
-            writer.put_frame("traction", t, frame.traction)
+        made = labels.frame(t, frame.flow, frame.traction, scene.motion.force[t]) if labels else {}
+        for name in names:
+            yield _Values(name, made[name] if name in made else getattr(frame, name), t)
+        yield _Values("traction", frame.traction, t)
         for video, (rgb, tool) in zip(videos, cameras, strict=True):
             video.rgb[t], video.tools[t] = getattr(frame, rgb), getattr(frame, tool)
         poses[t] = frame.camera.pose
-    with task.watch.stage("store"):
-        writer.put("camera", poses)
-    return videos
+    yield _Values("camera", poses)
 
 
-def _encode(task: _Task, videos: list[_Video]) -> list[_Video]:
-    """Writes and returns the videos after the job's codec."""
-    job = task.scene.job
-    with task.watch.stage("store"):
-        coded = [_Video(video_link.recorded(rgb, job.sensor, job.fps), tools) for rgb, tools in videos]
-        for video, (name, _) in zip(coded, _CAMERAS, strict=False):
-            task.writer.put(name, video.rgb)
-    return coded
+def _recover_motion(task: _Task, videos: Sequence[_Video]) -> Iterator[_Values]:
+    """Flow by the job's estimator, and with two cameras motion in three dimensions.
 
-
-def _recover_flow(task: _Task, rgb: Pixels, blocked: Mask) -> Track:
-    """Recovers flow with the job's estimator and writes it.
-
-    As in a real pipeline, its inputs are pictures (T, H, W, 3) and masks (T, H, W) of instruments; glare is
-    detected in the pictures.
+    As in a real pipeline, its inputs are pictures and masks of instruments; glare is detected in the
+    pictures.
     """
-    job, writer = task.scene.job, task.writer
+    job, tissue = task.scene.job, task.renderer.rest.tissue
     task.report("flow", 0, job.frames)
     with task.watch.stage("flow"):
-        recovered = track.track(create(job.flow.backend), rgb, blocked, task.scene.tissue)
-    with task.watch.stage("store"):
-        writer.put("flow_recovered", recovered.flow)
-        writer.put("flow_confidence", recovered.confidence)
-    return recovered
-
-
-def _recover_motion(task: _Task, left: Pixels, left_blocked: Mask, right: _Video, flow: Track) -> None:
-    """Recovers motion in three dimensions from the left camera's flow and both videos, and writes it."""
-    scene, writer, job = task.scene, task.writer, task.scene.job
-    lens = scene.renderer.right
-    assert lens is not None
+        blocked = [with_highlights(*video) for video in videos]
+        recovered = track.track(create(job.flow.backend), videos[0].rgb, blocked[0], tissue)
+    yield _Values("flow_recovered", recovered.flow)
+    yield _Values("flow_confidence", recovered.confidence)
+    if "motion_recovered" not in task.wanted:
+        return
     with task.watch.stage("stereo"):
-        blocked = left_blocked, with_highlights(*right)
+        left, right = task.renderer.camera, task.renderer.right
+        assert right is not None
         pair = rig.StereoRig(
-            rig.Intrinsics(scene.view.K, scene.view.distortion),
-            rig.Intrinsics(lens.K, lens.distortion),
-            *between(scene.view, lens),
+            rig.Intrinsics(left.K, left.distortion),
+            rig.Intrinsics(right.K, right.distortion),
+            *between(left, right),
             size=job.render.size,
         )
-        still = stereo.still_frames(flow.flow, scene.tissue)
-        rest = left[:still], right.rgb[:still]
-        tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], scene.tissue)
+        still = stereo.still_frames(recovered.flow, tissue)
+        rest = videos[0].rgb[:still], videos[1].rgb[:still]
+        tracker = stereo.StereoTracker(pair, *rest, blocked[0][0], blocked[1][0], tissue)
     for t in range(job.frames):
         task.report("stereo", t, job.frames)
         with task.watch.stage("stereo"):
             if t == 0:
-                moved = stereo.Moved.nothing(scene.tissue.shape)
+                moved = stereo.Moved.nothing(tissue.shape)
             else:
-                now = left[t], right.rgb[t], blocked[0][t], blocked[1][t]
-                moved = tracker.step(*now, flow.flow[t], flow.confidence[t])
-        with task.watch.stage("store"):
-            writer.put_frame("motion_recovered", t, moved.motion)
-            writer.put_frame("motion_deviation", t, moved.deviation)
+                now = videos[0].rgb[t], videos[1].rgb[t], blocked[0][t], blocked[1][t]
+                moved = tracker.step(*now, recovered.flow[t], recovered.confidence[t])
+        yield _Values("motion_recovered", moved.motion, t)
+        yield _Values("motion_deviation", moved.deviation, t)
 
 
-def _seal(task: _Task) -> Path:
-    """Seals the store with its attributes; returns its path."""
-    scene = task.scene
-    case, extra = scene.scenario, dict[str, Any]()
+def _describe(scene: Scene, renderer: Renderer) -> dict[str, Any]:
+    """Attributes of the sequence."""
+    case, job, view = scene.scenario, scene.job, scene.view
     series = None if scene.series is None else scene.series.points.tobytes()
-    anatomy = identity.identify_anatomy(scene.job, case.relief.seed, series)
+    attributes: dict[str, Any] = {
+        "scenario": asdict(case),
+        "anatomy_id": identity.identify_anatomy(job, case.relief.seed, series),
+        **_lens(view),
+        "scale_mm_per_px": float(renderer.rest.scale_mm_per_px),
+        "young_kpa": (young_kpa := scene.young_kpa),
+        "poisson": None if young_kpa is None else case.tissue.poisson,
+        "mechanics": _mechanics(scene),
+        "variant": renderer.variant,
+    }
     if scene.brain is not None:
-        extra["opening_id"] = identity.identify_opening(scene.job, case.index, anatomy)
-        extra["mesh_to_world"] = scene.brain.to_world.tolist()
-    if (right := scene.renderer.right) is not None:
-        extra["right"] = {"baseline_mm": scene.job.render.stereo_mm, **_lens(right)}
-    return task.writer.seal(
-        scenario=case.as_dict(),
-        anatomy_id=anatomy,
-        **_lens(scene.view),
-        scale_mm_per_px=scene.scale_mm_per_px,
-        young_kpa=scene.young_kpa,
-        poisson=None if scene.young_kpa is None else case.tissue.poisson,
-        mechanics=_mechanics(scene),
-        variant=scene.renderer.variant,
-        timings=task.watch.report(),
-        **extra,
-    )
+        anatomy = attributes["anatomy_id"]
+        attributes["opening_id"] = identity.identify_opening(job, case.index, anatomy)
+        attributes["mesh_to_world"] = scene.brain.to_world.tolist()
+    if renderer.right is not None:
+        attributes["right"] = {"baseline_mm": job.render.stereo_mm, **_lens(renderer.right)}
+    return attributes
 
 
 def _mechanics(scene: Scene) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def intensity(traction: NDArray[np.floating], force_mn: float) -> Floats:
     return np.asarray(traction, np.float64) * (force_mn / peak if peak > 0 else 0.0)
 
 
-def with_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generator) -> Floats:
+def add_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generator) -> Floats:
     """First stage: normal noise, a `share` of each label (H, W, 3) mN, on those of the tissue (H, W)."""
     out = np.zeros_like(label)
     mine = label[tissue]
@@ -39,7 +39,7 @@ def with_noise(label: Floats, tissue: Mask, share: float, rng: np.random.Generat
     return out
 
 
-def disturbed(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Floats]:
+def disturb(flow: Map, label: Floats, tissue: Mask, rng: np.random.Generator) -> tuple[Map, Floats]:
     """Second stage, in one frame: flow (H, W, 2) px and label (H, W) mN with some points disturbed."""
     flow, label = flow.copy(), label.copy()
     place = np.argwhere(tissue)
@@ -80,8 +80,8 @@ class Published:
         """
         label = intensity(traction, float(np.linalg.norm(force_mn)))
         if t > 0:
-            label = with_noise(label, self._tissue, self._share, self._rng)
+            label = add_noise(label, self._tissue, self._share, self._rng)
         size = lengths(label)
         if t in self._disturbed and t > 0:
-            flow, size = disturbed(flow, size, self._tissue, self._rng)
+            flow, size = disturb(flow, size, self._tissue, self._rng)
         return {"flow_noisy": flow, "intensity": size.astype(np.float32)}

@@ -7,7 +7,7 @@ world", 2017. A group's strength moves its ranges from the usual ones (0) to the
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from synth.job.schema import AttachmentSection, Job
 from synth.job.types import Group, Scenery
 from synth.render.appearance.family import Appearance, Colour
 from synth.render.appearance.light import FreeLamp, Lighting, blackbody
-from synth.render.camera.camera import CameraView, place
+from synth.render.camera.camera import CameraView, Lens
 from synth.render.camera.colour_processing import KNOTS, encoded
 from synth.render.randomized.pattern import Pattern
 from synth.render.randomized.surroundings import Randomization, Surroundings
@@ -45,6 +45,47 @@ _SHEETS: dict[str, tuple[tuple[str, ...], Ends, Ends, float, float]] = {
 }
 
 
+class Spread(NamedTuple):
+    """Ends that a quantity is drawn between."""
+
+    usual: Ends
+    widest: Ends
+    scale: Literal["even", "log"] = "even"
+
+
+RANGES: dict[str, Spread] = {
+    # Field; lengths of the anatomy are those of a patch in its usual size.
+    "field_mm": Spread((32, 38), (20, 120), "log"),
+    "tilt_deg": Spread((0, 20), (0, 40)),
+    "dome_mm": Spread((70, 70), (40, 300), "log"),
+    "gyrus_mm": Spread((10, 15), (7, 22)),
+    "sulcus_mm": Spread((1.6, 2.8), (0.3, 2.8)),
+    "working_distance_mm": Spread((280, 320), (150, 500)),
+    # Texture.
+    "tinted": Spread((0, 0), (0, 1)),
+    "pattern_size": Spread((0.04, 0.1), (0.015, 0.35), "log"),  # of an extent
+    "pattern_roughness": Spread((0.01, 0.02), (0.01, 0.4)),
+    # Light.
+    "ring_tilt_deg": Spread((2, 6.5), (2, 12)),
+    "lamp_tilt_deg": Spread((2, 6.5), (2, 80)),
+    "kelvin": Spread((4200, 5600), (2500, 12000)),
+    "window_deg": Spread((0.7, 0.7), (0.1, 12), "log"),
+    "even": Spread((0.35, 0.5), (0.2, 1.5)),
+    "ambient": Spread((0.05, 0.05), (0, 0.3)),
+    "drift": Spread((0, 0.03), (0, 0.3)),
+    # Camera.
+    "native": Spread((1.0, 1.0), (0.35, 1.0)),
+    "halo_px": Spread((1, 1), (0.7, 3)),
+    "aperture_mm": Spread((4, 4), (2, 8)),
+    "exposure": Spread((0.98, 1.12), (0.7, 1.4), "log"),
+    "full_well": Spread((8e3, 2e4), (1.5e3, 3e4), "log"),
+    "read_noise": Spread((8, 14), (1, 25)),
+    "vignette": Spread((0.15, 0.15), (0, 0.7)),
+    "sharpening": Spread((0.15, 0.4), (0, 2.5)),
+}
+"""Quantities that groups draw: ends at strength 0 and 1, and whether evenly or evenly in the logarithm."""
+
+
 class _Draws:
     """Draws of one group, by a generator of its own: no other group's depend on it."""
 
@@ -53,15 +94,18 @@ class _Draws:
         key = (1, index, 64 + get_args(Group).index(group), part)
         self.rng = np.random.default_rng(np.random.SeedSequence(job.seed, spawn_key=key))
 
-    def __call__(self, usual: Ends, widest: Ends) -> float:
+    def __call__(self, name: str) -> float:
+        """A quantity of `RANGES`."""
+        usual, widest, scale = RANGES[name]
+        if scale == "even":
+            return self.between(usual, widest)
+        logs = [(float(np.log(low)), float(np.log(high))) for low, high in (usual, widest)]
+        return float(np.exp(self.between(*logs)))
+
+    def between(self, usual: Ends, widest: Ends) -> float:
         """A number from ends between the usual and the widest ones."""
         low, high = (a + self.strength * (b - a) for a, b in zip(usual, widest, strict=True))
         return float(self.rng.uniform(low, high))
-
-    def log(self, usual: Ends, widest: Ends) -> float:
-        """The same, log-uniformly."""
-        logs = [(float(np.log(low)), float(np.log(high))) for low, high in (usual, widest)]
-        return float(np.exp(self(*logs)))
 
     def happens(self, share: float) -> bool:
         """Whether something happens that does in a share of the sequences at full strength."""
@@ -84,69 +128,68 @@ class _Draws:
         return Pattern(kind, colours, size, slope, raised, dry, rough, int(self.rng.integers(2**31)))
 
 
-def randomized(job: Job, index: int) -> Job:
-    """The job with the keys of sequence `index` that its groups randomise, as drawn; itself without groups.
+def randomize(job: Job, index: int) -> tuple[Job, Randomization | None, Ends]:
+    """Draws what the groups of a job randomise in sequence `index`.
 
-    Keys that a group draws are replaced, so the job's own values of them have no effect; applying it again
-    changes nothing. UserError: a folder of photographs is empty.
+    Returns the job with the keys that its groups draw, in place of its own values; what no key expresses,
+    None without groups; and the opening's place off the picture's middle, in widths and heights. Drawn again
+    from the returned job, all is the same. UserError: a folder of photographs is empty.
     """
     keys: Keys = {"render": {}}
     if (photo := job.appearance.photo) is not None and photo.is_dir():
         pictures = identity.list_pictures(photo)
-        chosen = int(_Draws(job, index, "texture", 1).rng.integers(len(pictures)))
-        keys["appearance"] = {"photo": pictures[chosen]}
+        number = int(_Draws(job, index, "texture", 1).rng.integers(len(pictures)))
+        keys["appearance"] = {"photo": pictures[number]}
+    scale, off_centre = 1.0, (0.0, 0.0)
     if job.randomize.get("field"):
-        keys |= _draw_field(job, index)[1]
-    if _draw_sheet(job, index) is None and job.randomize.get("surroundings"):
+        scale, field, off_centre = _draw_field(job, index)
+        keys |= field
+    sheet = _draw_sheet(job, index)
+    if sheet is None and job.randomize.get("surroundings"):
         keys["render"]["scenery"] = get_args(Scenery)
     if job.randomize.get("camera"):
         aperture, keys["sensor"] = _draw_sensor(job, index)
         keys["render"]["aperture_mm"] = aperture
-    return job.model_copy(
-        update={name: getattr(job, name).model_copy(update=found) for name, found in keys.items() if found}
-    )
+    randomization = _draw_texture(job, index, scale, sheet) if job.randomize else None
+    sections = {name: getattr(job, name).model_copy(update=values) for name, values in keys.items() if values}
+    return job.model_copy(update=sections), randomization, off_centre
 
 
-def draw_randomization(job: Job, index: int) -> Randomization | None:
-    """What neither keys nor an appearance express for sequence `index`; None without groups."""
-    if not job.randomize:
-        return None
-    scale = _draw_field(job, index)[0] if job.randomize.get("field") else 1.0
+def _draw_texture(job: Job, index: int, scale: float, sheet: Surroundings | None) -> Randomization:
+    """Tint and pattern of the tissue, with what is drawn already."""
     draw = _Draws(job, index, "texture")
-    how = Randomization(scale, None, draw.colour(), draw((0, 0), (0, 1)), _draw_sheet(job, index))
+    randomization = Randomization(scale, None, draw.colour(), draw("tinted"), sheet)
     if not draw.happens(0.5 if job.appearance.photo else 0.85):
-        return how
+        return randomization
     kind = str(draw.rng.choice(list(_CONTRASTS)))
-    colours = draw.colours(draw((0.2, 0.4), (_CONTRASTS[kind], 1.0)))
+    colours = draw.colours(draw.between((0.2, 0.4), (_CONTRASTS[kind], 1.0)))
     if draw.rng.random() < 0.5:
         colours = _NATURAL.get(kind, colours)
-    size = (72.0 if kind == "spectrum" else 24.0) * draw.log((0.04, 0.1), (0.015, 0.35))
-    rough = draw((0.01, 0.02), (0.01, 0.4))
-    return replace(how, pattern=draw.pattern(kind, colours, size, 0.06 * draw.strength, rough))
+    size = (72.0 if kind == "spectrum" else 24.0) * draw("pattern_size")
+    rough = draw("pattern_roughness")
+    return replace(randomization, pattern=draw.pattern(kind, colours, size, 0.06 * draw.strength, rough))
 
 
-def vary_view(view: CameraView, job: Job, index: int) -> CameraView:
-    """The view with the opening off its centre (`field`) and out of focus (`camera`)."""
-    draw, (across, down) = _Draws(job, index, "camera", 1), job.render.size
-    x, y = _draw_field(job, index)[2] if job.randomize.get("field") else (0.0, 0.0)
+def vary(
+    view: CameraView, appearance: Appearance, job: Job, index: int, lens: Lens, off_centre: Ends
+) -> tuple[CameraView, Appearance]:
+    """A view and an appearance with what groups draw: the opening off its centre (`field`) and out of focus
+    (`camera`), lamps (`light`) and sensor (`camera`)."""
+    draw, (across, down), (x, y) = _Draws(job, index, "camera", 1), job.render.size, off_centre
     # Radius of the circle of confusion: 2 px at most; stronger ones are rarer.
     defocus_px = 2.0 * draw.strength * draw.rng.uniform(-1, 1) ** 3
-    share = defocus_px * place(view, job.render).mm_per_px / max(job.render.aperture_mm, 0.1)
+    share = defocus_px * lens.mm_per_px(view) / max(job.render.aperture_mm, 0.1)
     share = float(np.clip(share, -0.5, 0.5))  # of the plane's distance by which it is out of focus
     focus_mm = view.focus_mm + view.working_distance_mm * share / (1 - share)
-    return replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
-
-
-def vary_appearance(appearance: Appearance, job: Job, index: int) -> Appearance:
-    """The appearance with randomised lamps (`light`) and sensor (`camera`)."""
     sensor, lighting, draw = appearance.sensor, appearance.light, _Draws(job, index, "camera", 2)
     if draw.strength:
-        native = draw((1.0, 1.0), (0.35, 1.0)) if draw.rng.random() < 0.5 else 1.0
+        native = draw("native") if draw.rng.random() < 0.5 else 1.0
         white = _rgb(sensor.white * np.exp(draw.strength * draw.rng.uniform(-0.3, 0.3, 3)))
-        sensor = replace(sensor, native=native, halo_px=draw((1, 1), (0.7, 3)), white=white)
+        sensor = replace(sensor, native=native, halo_px=draw("halo_px"), white=white)
     if job.randomize.get("light"):
         lighting = _draw_light(lighting, job, index)
-    return replace(appearance, sensor=sensor, light=lighting)
+    varied = replace(view, focus_mm=focus_mm, off_centre=(x, y * down / across))
+    return varied, replace(appearance, sensor=sensor, light=lighting)
 
 
 def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
@@ -155,7 +198,7 @@ def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
     The tissue is visible through a hole, from edge to edge, in a corner, or as usual.
     """
     draw, (across, down) = _Draws(job, index, "field"), job.render.size
-    width, tilt = draw.log((32, 38), (20, 120)), draw((0, 20), (0, 40))
+    width, tilt = draw("field_mm"), draw("tilt_deg")
     layout = str(draw.rng.choice(["hole", "edges", "corner"])) if draw.happens(0.85) else "usual"
     hole, large, away = (float(draw.rng.uniform(*ends)) for ends in ((0.2, 0.42), (0.3, 0.6), (0.28, 0.36)))
     # From edge to edge the corners are tissue, whatever tilt and perspective.
@@ -167,16 +210,16 @@ def _draw_field(job: Job, index: int) -> tuple[float, Keys, Ends]:
     keys: Keys = {
         "anatomy": {
             "craniotomy": job.anatomy.craniotomy.model_copy(update={"radius_mm": radius}),
-            "dome_mm": scale * draw.log((70, 70), (40, 300)),
-            "gyrus_mm": (scale * draw((10, 15), (7, 22)),) * 2,
-            "sulcus_mm": (scale * draw((1.6, 2.8), (0.3, 2.8)),) * 2,
+            "dome_mm": scale * draw("dome_mm"),
+            "gyrus_mm": (scale * draw("gyrus_mm"),) * 2,
+            "sulcus_mm": (scale * draw("sulcus_mm"),) * 2,
             "attachments": (_draw_support(draw, radius),) if draw.happens(0.5) else (),
         },
         "fem": {"footprint_mm": (0.5 * largest, largest)},
         "render": {
             "field_mm": (width,) * 2,
             "tilt_deg": (tilt,) * 2,
-            "working_distance_mm": (max(draw((280, 320), (150, 500)), 2 * width),) * 2,
+            "working_distance_mm": (max(draw("working_distance_mm"), 2 * width),) * 2,
         },
     }
     if radius < 8.0 or layout == "corner":  # two instruments rarely fit
@@ -220,17 +263,17 @@ def _draw_light(usual: Lighting, job: Job, index: int) -> Lighting:
     ring, some = draw.happens(0.25), draw.happens(1.0)
     count = 6 if ring else int(draw.rng.integers(1, 7)) if some else 2
     shares = draw.rng.uniform(0.15, 1, count) ** (not ring)
-    near, first = draw((2, 6.5), (2, 12)), float(draw.rng.uniform(0, 360))
+    near, first = draw("ring_tilt_deg"), float(draw.rng.uniform(0, 360))
     lamps = []
     for k, share in enumerate((shares / shares.sum()).tolist()):
-        lean, turn = draw((2, 6.5), (2, 80)), float(draw.rng.uniform(0, 360))
+        lean, turn = draw("lamp_tilt_deg"), float(draw.rng.uniform(0, 360))
         lean, turn = (near, first + 60 * k) if ring else (lean, turn)
-        colour = blackbody(draw((4200, 5600), (2500, 12000)))
+        colour = blackbody(draw("kelvin"))
         if draw.happens(0.25):
             colour = colour * draw.rng.uniform(0.3, 1.3, 3)
-        lamps.append(FreeLamp(lean, turn, share, _rgb(colour), draw.log((0.7, 0.7), (0.1, 12))))
-    even, ambient = draw((0.35, 0.5), (0.2, 1.5)), draw((0.05, 0.05), (0, 0.3))
-    return replace(usual, lamps=tuple(lamps), even=even, ambient=ambient, drift=draw((0, 0.03), (0, 0.3)))
+        lamps.append(FreeLamp(lean, turn, share, _rgb(colour), draw("window_deg")))
+    even, ambient = draw("even"), draw("ambient")
+    return replace(usual, lamps=tuple(lamps), even=even, ambient=ambient, drift=draw("drift"))
 
 
 def _draw_sensor(job: Job, index: int) -> tuple[float, dict[str, Any]]:
@@ -243,15 +286,15 @@ def _draw_sensor(job: Job, index: int) -> tuple[float, dict[str, Any]]:
     level = gain * (level + s * rng.uniform(-0.3, 0.3) * level * (1 - level) * (2 * level - 1))
     curves = np.clip(level * (1 + s * rng.uniform(-0.06, 0.06, (3, 1))), 0, 1)
     bits = float(np.exp(rng.uniform(np.log(0.05), 0)))  # a pixel
-    return draw((4, 4), (2, 8)), {
-        "exposure": (draw.log((0.98, 1.12), (0.7, 1.4)),) * 2,
-        "full_well": (draw.log((8e3, 2e4), (1.5e3, 3e4)),) * 2,
-        "read_noise": (draw((8, 14), (1, 25)),) * 2,
-        "vignette": draw((0.15, 0.15), (0, 0.7)),
-        "blur_px": (draw((0.4, 1.2), (0, 2.5 * BLUR_WIDTH_PX / width)),) * 2,
+    return draw("aperture_mm"), {
+        "exposure": (draw("exposure"),) * 2,
+        "full_well": (draw("full_well"),) * 2,
+        "read_noise": (draw("read_noise"),) * 2,
+        "vignette": draw("vignette"),
+        "blur_px": (draw.between((0.4, 1.2), (0, 2.5 * BLUR_WIDTH_PX / width)),) * 2,
         "matrix": _rows(mixed / mixed.sum(axis=1, keepdims=True)),
         "curves": _rows(np.maximum.accumulate(curves, axis=1)),
-        "sharpening": (draw((0.15, 0.4), (0, 2.5)) * float(rng.uniform(1 - s, 1)),) * 2,
+        "sharpening": (draw("sharpening") * float(rng.uniform(1 - s, 1)),) * 2,
         "chroma": str(rng.choice(["4:4:4", "4:2:2", "4:2:0"])) if draw.happens(1) else "4:4:4",
         "bitrate_mbps": bits * width * height * job.fps * 1e-6 if draw.happens(0.5) else None,
     }

@@ -4,38 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from synth.arguments import checked
 from synth.arrays import Floats, Map, Mask
-from synth.errors import UserError, as_user_error
+from synth.errors import UserError
 from synth.fem.deformation import Deformation
-from synth.fem.external.read_series import read_job_series
 from synth.fem.external.series import MeshSeries
 from synth.fem.surface_embedding import vertex_area
 from synth.flow import track
 from synth.flow.estimator import Estimator
-from synth.flow.stereo.calibration import read_rig
-from synth.flow.stereo.rig import Rectified
 from synth.flow.track import Track
 from synth.geometry.brain_surface import Brain, load_brain, place_brain
+from synth.geometry.craniotomy import Attachment, Craniotomy
 from synth.geometry.triangles import Shape
-from synth.job.schema import AnatomySection, Job, RenderSection
-from synth.render.anatomy import surface as anatomy
-from synth.render.anatomy.surface import CortexSurface, Relief
-from synth.render.camera import camera, video_link
+from synth.job.schema import Job
+from synth.render.anatomy.surface import CortexSurface, Relief, grow, resize
 from synth.render.camera.camera import Camera
-from synth.render.camera.camera_calibration import rendered, scaled
+from synth.render.camera.video_link import transmit
 from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
 from synth.render.scene import RenderedFrame, Renderer, SceneState
-from synth.sequence import scenario
-from synth.sequence.randomization import randomized
+from synth.sequence.draw import Draw, draw
+from synth.sequence.job_instruments import read_job_instruments
+from synth.sequence.job_series import read_job_series
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
-from synth.system import camera_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,24 +58,41 @@ class Frame(RenderedFrame):
 class RestScene:
     """One sequence of a job, drawn and built, before any motion; made by `at_rest`."""
 
-    job: Job
-    """The job, with keys that it randomises as drawn for this sequence."""
-    index: int
-    """Number of the sequence in the job."""
-    scenario: Scenario
-    """All numbers drawn for it."""
+    draw: Draw
+    """The sequence as drawn and placed."""
     surface: CortexSurface
     """The fine surface at rest, world axes; shared between sequences of one anatomy, hence read-only."""
-    view: Camera
-    """The microscope at rest."""
     brain: Brain | None
     """The user's brain that the surface is part of, if any, with its transform to world axes."""
     content: Callable[[RestScene], SceneContent]
     """What is drawn of it: `draw_craniotomy`, or content of your own around the same surface."""
     series: MeshSeries | None
     """Motion and load by another program, of `mechanics.source`."""
-    dataset: Job
-    """The job of all sequences, as given."""
+
+    @property
+    def job(self) -> Job:
+        """The job, with keys that it randomises as drawn for this sequence."""
+        return self.draw.job
+
+    @property
+    def dataset(self) -> Job:
+        """The job of all sequences, as given."""
+        return self.draw.dataset
+
+    @property
+    def index(self) -> int:
+        """Number of the sequence in the job."""
+        return self.draw.index
+
+    @property
+    def scenario(self) -> Scenario:
+        """All numbers drawn for it."""
+        return self.draw.scenario
+
+    @property
+    def view(self) -> Camera:
+        """The microscope at rest."""
+        return self.draw.camera
 
     @property
     def shape(self) -> Shape:
@@ -93,9 +107,11 @@ class RestScene:
     @property
     def instruments(self) -> list[tuple[str, str, float]]:
         """Gesture, kind and radius of the contact in mm of each acting instrument, then of idle ones."""
-        idle = [("idle", one.kind, one.radius_mm) for one in self.scenario.idle]
+        idle = [("idle", instrument.kind, instrument.radius_mm) for instrument in self.scenario.idle]
         if self.series is None:
-            return [(one.kind, one.instrument, one.footprint_mm) for one in self.scenario.gestures] + idle
+            return [
+                (gesture.kind, gesture.instrument, gesture.footprint_mm) for gesture in self.scenario.gestures
+            ] + idle
         kinds, radius = self.job.fem.names or ("probe",), self.job.fem.footprint_mm[0]
         return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])] + idle
 
@@ -111,8 +127,9 @@ class RestScene:
         drawn, own = content.tissue.shape, self.shape
         if not (np.array_equal(drawn.faces, own.faces) and np.array_equal(drawn.vertices, own.vertices)):
             raise UserError("content: its tissue must have the vertices and faces of the scene's surface")
-        right = right_of(job.render, self.view)
-        made = Renderer(content, self.view, sensor, job.render, job.store.extra, right)
+        look = job.render
+        lens = self.draw.camera, sensor, job.store.extra, self.draw.right
+        made = Renderer(content, *lens, spp=look.spp, variant=look.variant)
         if not made.rest.tissue.any():
             raise UserError("render: the camera shows no tissue; change render.tilt_deg or the opening")
         return made
@@ -145,10 +162,6 @@ class Scene(RestScene):
         case, rest = self.scenario, self.surface.vertices
         moving = case.camera_motion, case.appearance.light, self.job.fps
         return Timeline(rest, self.motion, self.view, *moving, case.idle)
-
-    @cached_property
-    def _seeds(self) -> list[int]:
-        return scenario.frame_seeds(self.job, self.index)
 
     def __len__(self) -> int:
         return self.job.frames
@@ -186,7 +199,7 @@ class Scene(RestScene):
         job, line = self.job, self._timeline
         now = line.at(t)
         lit = line.exposure(t, job.sensor.shutter)
-        rendered = self.renderer.render(now, self._seeds[t], lit, line.at(t + 1))
+        rendered = self.renderer.render(now, self.draw.frame_seeds[t], lit, line.at(t + 1))
         return Frame(
             **vars(rendered),
             index=t,
@@ -219,17 +232,27 @@ class Scene(RestScene):
         chosen = self.job.flow.backend if backend is None else backend
         if chosen == "ideal":
             raise UserError("flow.backend: `ideal` recovers no flow; name an estimator")
-        rgb, tools = np.stack([one.rgb for one in frames]), np.stack([one.tool for one in frames])
-        rgb = video_link.recorded(rgb, self.job.sensor, self.job.fps)
+        rgb, tools = np.stack([frame.rgb for frame in frames]), np.stack([frame.tool for frame in frames])
+        rgb = transmit(rgb, self.job.fps, self.job.sensor.bitrate_mbps, self.job.sensor.chroma)
         return track.recover_flow(rgb, tools, self.tissue, chosen)
 
 
 def draw_craniotomy(rest: RestScene) -> SceneContent:
     """The opening in skull and dura around the tissue, with the instruments of the gestures and the lamps."""
-    case = rest.scenario
-    drawn = [one[1:] for one in rest.instruments if one[0] != "idle"]
-    given = rest.surface, case.appearance, rest.view, rest.job, drawn
-    return craniotomy(*given, case.idle, case.randomized)
+    case, job = rest.scenario, rest.job
+    acting = [(kind, radius_mm) for gesture, kind, radius_mm in rest.instruments if gesture != "idle"]
+    return craniotomy(
+        rest.surface,
+        case.appearance,
+        rest.view,
+        rest.draw.opening_mm,
+        acting,
+        case.idle,
+        case.randomized,
+        photo=job.appearance.photo,
+        wear=job.randomize.get("instruments", 0.0),
+        meshes=read_job_instruments(job.fem),
+    )
 
 
 def at_rest(
@@ -246,72 +269,60 @@ def at_rest(
     `content`: what is drawn around the surface and of it, `draw_craniotomy` if None. UserError: the job's
     surface or calibration cannot be used.
     """
-    case = case or scenario.draw_scenario(job, index)
-    dataset, job = job, randomized(job, index)
-    view = camera.place(case.view, job.render)
-    if job.render.calibration is not None:
-        case = replace(case, view=camera.calibrated(case.view, view))
-    mesh, series = job.anatomy.mesh, None
-    if job.mechanics.source is not None:
-        series = read_job_series(job, index)
-        tissue = replace(case.tissue, law="external", why="mechanics.source", membrane=None)
-        case = replace(case, gestures=(), pulse=None, tissue=tissue)
+    return build(draw(job, index, case=case), content)
+
+
+def build(drawn: Draw, content: Callable[[RestScene], SceneContent] | None = None) -> RestScene:
+    """The surface of a sequence, grown or read, and what is drawn around it. Raises as `at_rest`."""
+    anatomy, series = drawn.job.anatomy, None
+    if drawn.job.mechanics.source is not None:
+        series = read_job_series(drawn.job, drawn.index)
+    mesh, relief, scale = anatomy.mesh, drawn.scenario.relief, drawn.scale
     about = mesh.stat() if mesh and mesh.is_file() else None
-    written = about and (about.st_mtime_ns, about.st_size)
-    bare = content is not None  # whoever draws another organ has no veins on it
-    scale = case.randomized.scale if case.randomized is not None else 1.0
-    section, relief = anatomy.shrunk(job.anatomy.opened(case.index), case.relief, scale)
-    surface, brain = _cortex(section, relief, written, series, bare)
-    surface = anatomy.resized(surface, scale)
-    return RestScene(job, index, case, surface, view, brain, content or draw_craniotomy, series, dataset)
+    given = _Given(
+        mesh,
+        anatomy.fill_holes,
+        None if mesh is None and series is None else drawn.craniotomy,
+        drawn.attachments if mesh is not None else (),
+        series,
+        about and (about.st_mtime_ns, about.st_size),
+    )
+    # A procedural surface is grown in its usual size; whoever draws another organ has no veins on it.
+    usual = replace(relief, gyrus_mm=relief.gyrus_mm / scale, sulcus_mm=relief.sulcus_mm / scale)
+    sizes = drawn.opening_mm / scale, anatomy.vertices, anatomy.dome_mm / scale
+    surface, brain = _build_cortex(given, usual, *sizes, series is None or content is None)
+    return RestScene(drawn, resize(surface, scale), brain, content or draw_craniotomy, series)
 
 
-def refuse_unfit(render: RenderSection) -> None:
-    """Raises UserError for a calibration that can't be read, or whose cameras don't show the opening."""
-    if render.calibration is not None:
-        right_of(render, camera.place(scenario.draw_view(render, np.random.default_rng(0)), render))
+@dataclass(frozen=True)
+class _Given:
+    """The user's surface, if any."""
 
+    mesh: Path | None
+    fill_holes: bool
+    craniotomy: Craniotomy | None
+    attachments: tuple[Attachment, ...]
+    series: MeshSeries | None
+    written: tuple[int, int] | None  # time and size of the mesh's file: another may have replaced it
 
-def right_of(render: RenderSection, view: Camera) -> Callable[[Camera], Camera] | None:
-    """The right camera of the left one in any pose, by the job's stereo calibration; None without one.
-
-    `view`: the left camera at rest; its picture may have another size than those of the calibration.
-    Raises UserError for a pair that is none, or whose right camera does not show the opening's centre.
-    """
-    if render.calibration is None or not camera_file.find_baseline_mm(render.calibration):
-        return None
-    with as_user_error("render.calibration"):
-        pair = read_rig(render.calibration, render.size)
-    scale = np.diag(view.K)[:2] / np.diag(pair.left.K)[:2]
-    K = scaled(pair.right.K, scale)
-    lens = rendered(pair.right.distortion, render.calibration)
-    turn, shift = pair.rotation, pair.translation
-    place = partial(camera.calibrated_right, K=K, distortion=lens, rotation=turn, translation=shift)
-    Rectified(pair)  # refuses a right camera that is not to the right
-    right = place(view)
-    at = camera.project(right, np.zeros((1, 3)))[0]
-    if right.translation[2] <= 0 or (at < 0).any() or (at >= right.size).any():
-        raise UserError(
-            f"render.calibration: the opening, {view.translation[2]:.4g} mm away, is at ({at[0]:.0f}, "
-            f"{at[1]:.0f}) px for the right camera, outside its picture; change render.working_distance_mm"
-        )
-    return place
+    def place(self) -> Brain | None:
+        """The surface in world axes."""
+        if self.craniotomy is None:
+            return None
+        if self.mesh is not None:
+            return load_brain(self.mesh, self.craniotomy, self.attachments, self.fill_holes)
+        assert self.series is not None
+        return place_brain(self.series.points, self.series.faces, "mechanics.source", self.craniotomy)
 
 
 @lru_cache(maxsize=4)
-def _cortex(
-    section: AnatomySection, relief: Relief, written: object, series: MeshSeries | None, bare: bool
+def _build_cortex(
+    given: _Given, relief: Relief, opening_mm: float, vertices: int, dome_mm: float, veined: bool
 ) -> tuple[CortexSurface, Brain | None]:
-    """The fine surface, and the user's brain that it is part of, if any; cached, hence read-only.
-
-    `written` (time and size of the brain's file) distinguishes a mesh from one that replaced it.
-    """
-    brain = None
-    if section.mesh is not None:
-        brain = load_brain(section.mesh, section.craniotomy, section.attachments, section.fill_holes)
-    elif series is not None:
-        brain = place_brain(series.points, series.faces, "mechanics.source", section.craniotomy)
-    surface = anatomy.grow(relief, section, brain.shape if brain else None, series is None or not bare)
+    """The fine surface, and the user's brain that it is part of, if any; cached, hence read-only."""
+    brain = given.place()
+    shape = None if brain is None else brain.shape
+    surface = grow(relief, opening_mm, vertices=vertices, dome_mm=dome_mm, brain=shape, veined=veined)
     for value in (*vars(surface).values(), *((*brain.shape, brain.to_world) if brain else ())):
         if isinstance(value, np.ndarray):
             value.flags.writeable = False

@@ -1,16 +1,15 @@
-"""Scenario of one sequence: every number drawn for it, a function of (job, index) only."""
+"""Scenario of one sequence: every number drawn for it, part by part; `draw` puts it together."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from synth.arguments import checked
 from synth.arrays import Floats
 from synth.errors import UserError
 from synth.fem import tool_gesture
@@ -18,31 +17,25 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, InstrumentSection, name_of
+from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, Contact, InstrumentSection, name_of
 from synth.job.microscope import BLUR_WIDTH_PX
-from synth.job.reader import as_job
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render import instrument
 from synth.render.anatomy.surface import Relief
 from synth.render.appearance.family import FAMILIES, Appearance, Colour
 from synth.render.appearance.light import Lighting, balance
-from synth.render.camera.camera import CameraView, place, visible_radius
+from synth.render.camera.camera import CameraView
 from synth.render.camera.camera_motion import CameraMotion
 from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
-from synth.render.idle import IdleInstrument, draw_idle
+from synth.render.finish_maps import RING
+from synth.render.idle import IdleInstrument
 from synth.render.instrument import OwnMesh
-from synth.render.own_instrument import read_own_instruments
 from synth.render.randomized.surroundings import Randomization
-from synth.sequence.randomization import draw_randomization, randomized, vary_appearance, vary_view
+from synth.sequence.job_instruments import read_job_instruments
 
 Random = np.random.Generator
 Range = tuple[float, float]
-
-# First element of the spawn key.
-_ANATOMY, _SEQUENCE = 0, 1
-_TISSUE, _GESTURE, _APPEARANCE, _VIEW, _NOISE, _FURTHER, _LABELS, _CAMERA_MOTION, _PULSE = range(9)
-_IDLE = 16
 
 _STRETCH = 1.01, 1.03
 """Pre-stretch of a membrane. Not measured: its tension then balances a pressure of 3-350 Pa (at most 2.6
@@ -50,7 +43,6 @@ mmHg) under a dome of 70 mm radius, which is plausible in a living head."""
 _RAMP = 0.25, 0.35  # time over which the load grows to its peak, as a part of the sequence
 ATTEMPTS = 4  # draws of a sequence's gestures, each where the mesh did not bear those before
 DRIVEN_ATTEMPTS = 12  # likewise, of driven instruments, whose range is found while solving
-_REDRAW = 32  # third element of the spawn key of further attempts
 _TRIES, _ROUNDS = 400, 8  # draws of a gesture until it fits, and of all gestures of `fem.instrument_list`
 _END_ON_DEG, _APART_MM = 25.0, 3.0  # least angle of a shaft to the line of sight; gap between instruments
 _RINGS = 4  # every fourth ring of an instrument is compared with those of others
@@ -65,7 +57,12 @@ _SPARSE_DEG = 17.0  # slope that mirrors the main lamp into the lens where highl
 _KELVIN = 4200.0, 5600.0  # colour temperature of the lamps
 _POWER = 0.95, 1.1  # illumination, relative to one that just fills the sensor with white
 _DRIFT = 0.0, 0.03  # largest change of power over the sequence, as a share of it
-_SHOWN = 0.75  # share of the sequences that show a part of `render.scenery`
+_SHOWN = {
+    "retractor": 0.2,
+    "bone": 0.33,
+    "drape": 0.4,
+    "clips": 0.4,
+}  # shares of the sequences that show a part
 
 
 @dataclass(frozen=True)
@@ -95,49 +92,6 @@ class Scenario:
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
-
-
-@checked
-def draw_scenario(job: Job | str | Path, index: int, attempt: int = 0) -> Scenario:
-    """Draws sequence `index` of `job`, independently of the others' number and order.
-
-    `attempt`: number of earlier draws of its gestures; all else is the same in every attempt
-    but idle instruments, which keep away from them.
-    """
-    job = as_job(job)
-    if index < 0:
-        raise UserError(f"index {index}: sequences are numbered from 0")
-    read_own_instruments(job.fem)  # those that can't be drawn are refused before anything is computed
-    job, how = randomized(job, index), draw_randomization(job, index)
-    family = job.appearance.families[index % len(job.appearance.families)]
-    generator = partial(_generator, job, _SEQUENCE, index)
-    relief = draw_relief(job.anatomy, _generator(job, _ANATOMY, index, 0))
-    tissue = draw_tissue(job.fem, generator(_TISSUE))
-    pulse = draw_pulse(job.fem.pulse, generator(_PULSE))
-    view = vary_view(draw_view(job.render, generator(_VIEW)), job, index)
-    motion = draw_camera_motion(job.render, generator(_CAMERA_MOTION))
-    lens, opening_mm = place(view, job.render), job.anatomy.craniotomy.radius_mm
-    again, shown = (_REDRAW, attempt) if attempt else (), (visible_radius(lens), lens.centre)
-    rngs = generator(*again, _GESTURE), generator(*again, _FURTHER)
-    gestures = draw_gestures(job.fem, opening_mm, tissue.young_kpa, *rngs, *shown, job.frames)
-    appearance = vary_appearance(draw_appearance(job, family, generator(_APPEARANCE)), job, index)
-    acting = np.array([[(*one.point_mm, 0.0), one.shaft] for one in gestures]).reshape(-1, 2, 3)
-    strength = job.randomize.get("instruments", 0.0)
-    idle = draw_idle(strength, generator(_IDLE), opening_mm, visible_radius(lens), acting)
-    return Scenario(
-        index, family, relief, tissue, gestures, appearance, view, motion, pulse, idle, how, attempt
-    )
-
-
-def frame_seeds(job: Job, index: int) -> list[int]:
-    """One seed per frame for light paths and sensor noise, so that noise differs between frames."""
-    sequence = np.random.SeedSequence(job.seed, spawn_key=(_SEQUENCE, index, _NOISE))
-    return [int(seed) for seed in sequence.generate_state(job.frames)]
-
-
-def label_rng(job: Job, index: int) -> Random:
-    """Random generator for the noise of the published labels."""
-    return _generator(job, _SEQUENCE, index, _LABELS)
 
 
 def draw_relief(anatomy: schema.AnatomySection, rng: Random) -> Relief:
@@ -185,32 +139,36 @@ def draw_gestures(
 
     Raises UserError if not all instruments fit into the opening, or not in their places.
     """
-    given, (fewest, most) = fem.instrument_list, fem.instruments
+    given, (fewest, most), meshes = fem.instrument_list, fem.instruments, read_job_instruments(fem)
     drawn = max(int(others.integers(fewest, most + 1)), len(given))
     sight, least = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
     # Each time all anew: the shaft of one may be in the way of the next. At last fewer, if the job allows it.
     for count in (*[drawn] * _ROUNDS, *range(drawn - 1, max(fewest, len(given)) - 1, -1)):
         wanted = [*given, *[InstrumentSection()] * (count - len(given))]
-        order, found = sorted(range(count), key=lambda k: wanted[k].place is None), dict[int, Gesture]()
+        order, placed_gestures = (
+            sorted(range(count), key=lambda k: wanted[k].place is None),
+            dict[int, Gesture](),
+        )
         for k in order:
             for _ in range(_TRIES):
-                own = others if k else rng
-                if fem.contact == "driven":
-                    trial = draw_driven_gesture(fem, opening_mm, own, wanted[k], visible_mm, frames)
+                generator = others if k else rng
+                if fem.contact == ("driven",):
+                    trial = draw_driven_gesture(fem, opening_mm, generator, wanted[k], visible_mm, frames)
                 else:
-                    trial = draw_gesture(fem, opening_mm, young_kpa, own, wanted[k], visible_mm, frames)
+                    trial = draw_gesture(fem, opening_mm, young_kpa, generator, wanted[k], visible_mm, frames)
                 longest = np.linalg.norm(trial.axes, axis=1).max()
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 hides = trial.shaft @ sight > least and trial.instrument != "none"
-                if fits and not hides and all(_apart(trial, other, fem) for other in found.values()):
-                    found[k] = trial
+                apart = (_are_apart(trial, other, meshes) for other in placed_gestures.values())
+                if fits and not hides and all(apart):
+                    placed_gestures[k] = trial
                     break
             else:
                 break
         else:
-            return tuple(found[k] for k in range(count))
-    placed = f" next to {len(found)} others" if found else ""
+            return tuple(placed_gestures[k] for k in range(count))
+    placed = f" next to {len(placed_gestures)} others" if placed_gestures else ""
     key = "instrument_list" if given else "instruments"
     raise UserError(
         f"fem.{key}: instrument {k + 1} of {count} does not fit{placed} "
@@ -233,11 +191,11 @@ def draw_gesture(
     Its contacts stay within the opening and within `visible_mm` of its middle, which the camera shows of a
     wide one; a gesture too large for that is in the middle. With a given place it may reach beyond.
     """
-    drawn, wanted, own = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
+    drawn, wanted, further = str(rng.choice(fem.gestures)), fem.load_range(given), rng.spawn(1)[0]
     choices = fem.choices(given)
-    kind = drawn if drawn in choices else list(choices)[int(own.integers(len(choices)))]
+    kind = drawn if drawn in choices else list(choices)[int(further.integers(len(choices)))]
     tools = choices[kind]
-    tool = name_of(list(tools)[int(own.choice(len(tools), p=list(tools.values())))])
+    tool = name_of(list(tools)[int(further.choice(len(tools), p=list(tools.values())))])
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
@@ -255,8 +213,8 @@ def draw_gesture(
         point = np.asarray(given.place, np.float64)
     along, direction = _draw_direction(fem, kind, rng, given)
     if kind == "retract":  # the hand is on the side that tissue is drawn to, in a quarter of them opposite
-        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (own.random() < 0.25)
-        azimuth = float((turn + _uniform(own, (-30, 30))) % 360)
+        turn = np.degrees(np.arctan2(along[1], along[0])) + 180 * (further.random() < 0.25)
+        azimuth = float((turn + _uniform(further, (-30, 30))) % 360)
     places, directions = tool_gesture.grip(kind, point - 0.5 * path * along, direction, spread, azimuth)
     whole = load * unit_mn * directions.sum(axis=0)
     each = zip(places.tolist(), load * unit_mn * directions, strict=True)
@@ -322,10 +280,10 @@ def draw_driven_gesture(
     if kind == "retract":  # the hand is on the side that tissue is drawn to
         azimuth = float((np.degrees(np.arctan2(along[1], along[0])) + _uniform(rng, (-30, 30))) % 360)
     way, force = rng.uniform(), None
-    own = given if given.travel_mm or given.force_mn else fem
-    if own.force_mn is not None:
-        force = float(own.force_mn[0] * (own.force_mn[1] / own.force_mn[0]) ** way)
-    low, high = own.travel_mm or (0.0, 0.0)
+    ranges = given if given.travel_mm or given.force_mn else fem
+    if ranges.force_mn is not None:
+        force = float(ranges.force_mn[0] * (ranges.force_mn[1] / ranges.force_mn[0]) ** way)
+    low, high = ranges.travel_mm or (0.0, 0.0)
     holds = _HOLDS[kind] * mean
     if given.travel_mm is None:  # one that is named is as given
         low, high = min(low, holds), min(high, holds)
@@ -355,26 +313,30 @@ def draw_driven_gesture(
     )
 
 
-def _apart(one: Gesture, other: Gesture, fem: FemSection) -> bool:
+def _are_apart(gesture: Gesture, other: Gesture, meshes: Mapping[str, OwnMesh]) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
-    if tool_gesture.clearance(one, other) < 0:
+    if tool_gesture.clearance(gesture, other) < 0:
         return False
-    own = read_own_instruments(fem)
-    (here, wide), (there, broad) = (_rings(each, own.get(each.instrument)) for each in (one, other))
+    (here, wide), (there, broad) = (
+        _rings(acting, meshes.get(acting.instrument)) for acting in (gesture, other)
+    )
     gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
     return float(gap.min(initial=np.inf)) >= _APART_MM
 
 
 @lru_cache(maxsize=64)
-def _rings(gesture: Gesture, own: OwnMesh | None = None) -> tuple[Floats, Floats]:
+def _rings(gesture: Gesture, mesh: OwnMesh | None = None) -> tuple[Floats, Floats]:
     """Middles (N, 3) mm and radii (N,) mm of the instrument's rings before, at the start and at the end."""
-    parts, _ = ((own.outline,), 0) if own else instrument.shape_of(gesture.instrument, gesture.footprint_mm)
-    found = [np.zeros((0, 3))]
+    if mesh is None:
+        parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
+    else:
+        parts = (mesh.outline,)
+    shapes = [np.zeros((0, 3))]
     for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
         place = gesture.point_mm + slid * np.asarray(gesture.path_mm)
         tips = np.column_stack([place + gesture.sides, np.zeros(2)]) + away * gesture.shaft
-        found += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
-    rings = np.concatenate(found).reshape(-1, instrument.RING, 3)[::_RINGS]
+        shapes += instrument.place(parts, tips, np.stack([gesture.shaft] * 2))
+    rings = np.concatenate(shapes).reshape(-1, RING, 3)[::_RINGS]
     middles = rings.mean(axis=1)
     return middles, np.linalg.norm(rings - middles[:, None], axis=2).max(axis=1)
 
@@ -399,6 +361,11 @@ def _draw_direction(
     return along, np.append(np.sqrt(1 - rise**2) * along, up)
 
 
+def choose(rng: Random, kinds: tuple[Contact, ...]) -> Contact:
+    """One of several kinds, in equal shares."""
+    return kinds[int(rng.integers(len(kinds)))]
+
+
 def _draw_timing(kind: str, rng: Random, frames: int) -> tuple[float, float, float, float]:
     """Times of touch, full load, start of its fall, and release, as parts of the sequence."""
     touch = _uniform(rng, (0.08, 0.15))
@@ -414,7 +381,7 @@ def _draw_timing(kind: str, rng: Random, frames: int) -> tuple[float, float, flo
 
 
 def draw_view(render: RenderSection, rng: Random) -> CameraView:
-    """Draws the microscope's pose and field; a calibration replaces the latter, see `camera.calibrated`."""
+    """Draws the microscope's pose and field; a calibration replaces the latter, see `camera.state_field`."""
     return CameraView(
         field_mm=_uniform(rng, render.field_mm),
         working_distance_mm=_uniform(rng, render.working_distance_mm),
@@ -437,7 +404,8 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     if job.appearance.blood:
         ranges = ranges | {"blood": job.appearance.blood}
     drawn: dict[str, Any] = {
-        name: _near(ends, rng) if len(ends) == 3 else _uniform(rng, ends) for name, ends in ranges.items()
+        name: _vary_colour(ends, rng) if len(ends) == 3 else _uniform(rng, ends)
+        for name, ends in ranges.items()
     }
     # More glare: a thicker and rougher layer of a higher index, over more relief. Chosen on photographs.
     square = lighting.glare**2
@@ -458,8 +426,8 @@ def draw_appearance(job: Job, family: Family, rng: Random) -> Appearance:
     blur = _uniform(np.random.default_rng([appearance.rim_seed, 5]), job.sensor.blur_px)
     sensor = replace(appearance.sensor, blur=blur * job.render.size[0] / BLUR_WIDTH_PX)
     parts = job.render.scenery
-    shown = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts)) < _SHOWN
-    scenery = tuple(part for part, one in zip(parts, shown, strict=True) if one)
+    chance = np.random.default_rng([appearance.rim_seed, 4]).random(len(parts))
+    scenery = tuple(part for part, drawn in zip(parts, chance, strict=True) if drawn < _SHOWN[part])
     return replace(appearance, sensor=sensor, scenery=scenery)
 
 
@@ -496,7 +464,7 @@ def draw_sensor(section: schema.SensorSection, white: Colour, rng: Random) -> Ca
     return replace(sensor, matrix=section.matrix or camera.matrix, curves=section.curves or camera.curves)
 
 
-def _near(colour: Colour, rng: Random) -> Colour:
+def _vary_colour(colour: Colour, rng: Random) -> Colour:
     """A colour of slightly different brightness and hue."""
     value = np.asarray(colour) * rng.uniform(0.94, 1.05) * rng.uniform(0.96, 1.04, 3)
     return _vector(np.clip(value, 0.01, 0.95))
@@ -512,7 +480,3 @@ def _log_uniform(rng: Random, ends: Range) -> float:
 
 def _vector(value: Floats) -> tuple[float, float, float]:
     return float(value[0]), float(value[1]), float(value[2])
-
-
-def _generator(job: Job, *key: int) -> Random:
-    return np.random.default_rng(np.random.SeedSequence(job.seed, spawn_key=key))

@@ -34,7 +34,7 @@ class SeriesMechanics:
         turn, shift = rest.brain.to_world[:3, :3], rest.brain.to_world[:3, 3]
         with watch.stage("mesh"):
             transfer = attach(series.points @ turn.T + shift, series.faces, rest.shape)
-        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], job.anatomy.craniotomy.radius_mm
+        area, count, opening_mm = rest.vertex_area, series.tip.shape[1], rest.draw.opening_mm
         moved = np.zeros((len(time), len(area), 3))
         load, lost = np.zeros_like(moved), np.zeros((len(time), 3))
         parts, work = np.zeros((len(time), count, 3)), np.zeros(len(time))
@@ -59,7 +59,9 @@ class SeriesMechanics:
         corners = series.points[series.faces]
         cell = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
         cautions = list(series.cautions)
-        if (step := float(steps.max())) > cell and not any(one.startswith("nodes") for one in cautions):
+        if (step := float(steps.max())) > cell and not any(
+            caution.startswith("nodes") for caution in cautions
+        ):
             between = f"from frame {steps.argmax()} to the next, more than a cell of the mesh, {cell:.2g} mm"
             cautions.append(f"the surface moves by {step:.2g} mm {between}: store more states, or raise fps")
         whole, hidden = load.sum(axis=1), np.hypot(*rest.surface.vertices[:, :2].T) > opening_mm

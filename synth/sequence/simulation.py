@@ -14,10 +14,11 @@ from synth.fem.tool_gesture import ToolMotion, trajectory
 from synth.job.reader import as_job
 from synth.job.schema import Job
 from synth.render.content import SceneContent
+from synth.sequence.draw import Draw, draw
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.mechanics import Mechanics
-from synth.sequence.rest_scene import RestScene, Scene, at_rest
-from synth.sequence.scenario import ATTEMPTS, DRIVEN_ATTEMPTS, Scenario, draw_scenario
+from synth.sequence.rest_scene import RestScene, Scene, build
+from synth.sequence.scenario import ATTEMPTS, DRIVEN_ATTEMPTS, Scenario
 from synth.sequence.series_mechanics import SeriesMechanics
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -61,33 +62,37 @@ def simulate(
     if mechanics is not None and len(motions):
         raise UserError("simulate: motions are for the built-in mechanics; give either motions or mechanics")
     ours = isinstance(mechanics, FemMechanics | None) and not len(motions)
-    stated = any(one.load or one.force_mn or one.travel_mm for one in job.fem.instrument_list)
-    attempts = DRIVEN_ATTEMPTS if job.fem.contact == "driven" else ATTEMPTS
-    left = 0 if case or stated or not ours else attempts - 1
-    case = case or draw_scenario(job, index)
+    stated = any(
+        instrument.load or instrument.force_mn or instrument.travel_mm
+        for instrument in job.fem.instrument_list
+    )
+    drawn = draw(job, index, case=case)
+    driven = any(gesture.drive for gesture in drawn.scenario.gestures)
+    left = 0 if case or stated or not ours else (DRIVEN_ATTEMPTS if driven else ATTEMPTS) - 1
     report, watch = report or (lambda stage, done, of: None), watch or Stopwatch()
     report("mesh", 0, 1)
     mechanics = mechanics or (FemMechanics(motions) if job.mechanics.source is None else SeriesMechanics())
     while True:
         if ours:
-            refuse_untouched(job, case)
+            refuse_untouched(drawn)
         with watch.stage("mesh"):
-            rest = at_rest(job, index, case=case, content=content)
+            rest = build(drawn, content)
         try:
             motion = mechanics.deform(rest, report, watch)
             break
         except ExcessiveLoad:
-            if case.attempt >= left:
+            if drawn.scenario.attempt >= left:
                 raise
-            case = draw_scenario(job, index, case.attempt + 1)
-    acting = len(rest.instruments) - len(case.idle)
+            drawn = draw(job, index, drawn.scenario.attempt + 1)
+    acting = len(rest.instruments) - len(drawn.scenario.idle)
     check_deformation(motion, rest.shape, job.frames, acting, "force" in job.stored_fields)
-    return Scene(**{one.name: getattr(rest, one.name) for one in fields(rest)}, motion=motion)
+    return Scene(**{field.name: getattr(rest, field.name) for field in fields(rest)}, motion=motion)
 
 
-def refuse_untouched(job: Job, case: Scenario) -> None:
+def refuse_untouched(drawn: Draw) -> None:
     """Raises UserError for an instrument whose contact falls between two frames."""
-    for k, gesture in enumerate(case.gestures):
+    job = drawn.job
+    for k, gesture in enumerate(drawn.scenario.gestures):
         if not trajectory(gesture, job.frames).load.max() > 1e-6:
             touch, leave = (f"{part * (job.frames - 1) / job.fps:.3g}" for part in gesture.timing[::3])
             when = f"from {touch} to {leave} s falls between two frames, {1 / job.fps:.3g} s apart"

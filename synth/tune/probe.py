@@ -21,8 +21,8 @@ from synth.flow.estimator import create
 from synth.job.schema import Job
 from synth.render import truth
 from synth.render.camera import camera
+from synth.sequence.draw import draw_scenario
 from synth.sequence.rest_scene import Frame, Scene, at_rest
-from synth.sequence.scenario import draw_scenario
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import Stopwatch
 

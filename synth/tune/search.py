@@ -25,8 +25,8 @@ from scipy import stats
 from synth.arrays import Floats
 from synth.dataset import provenance
 from synth.errors import UserError
+from synth.fem.law_choice import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job import identity, reader
-from synth.job.law_choice import CHEAPEST_FIRST, LARGEST_LOAD
 from synth.job.schema import Job
 from synth.render.mitsuba import adapter
 from synth.system import cache, packages
@@ -59,7 +59,7 @@ class Measurements:
 
     def __init__(self, job: Job) -> None:
         self.job, self.grid = job, list_settings(job)
-        explicit = changed(job, {"fem.law": job.fem.chosen_law[0]})
+        explicit = changed(job, {"fem.law": own_law(job)})
         self.own: Settings = {key: attrgetter(key)(explicit) for key in self.grid}
         self.full: Settings = {key: settings[0] for key, settings in self.grid.items()}
         here = packages.machine(), adapter.pick(job.render.variant)  # costs are of this machine
@@ -158,10 +158,15 @@ def tune(measurements: Measurements, budget: float, probes: int, checks: int) ->
     return Tuned(budget, full, own, best, (*single, full, own, *tried))
 
 
+def own_law(job: Job) -> str:
+    """The material law of a job; auto where it has both kinds of contact, each with a law of its own."""
+    return job.fem.law if len({*job.fem.contact}) > 1 else job.fem.chosen_law[0]
+
+
 def list_settings(job: Job) -> dict[str, list[Any]]:
     """Settings by key, finest first and the job's own among them; only keys with more than one."""
     fem, (width, height), vertices = job.fem, job.render.size, job.anatomy.vertices
-    law = fem.chosen_law[0]
+    law = own_law(job)
     tets = sorted({fem.tets, 4000, 2500, 1600, 800}, reverse=True)
     grid: dict[str, list[Any]] = {"fem.law": [law], "fem.tets": tets}
     if law in CHEAPEST_FIRST:  # a plug-in's is another tissue, not a dearer way to the same one

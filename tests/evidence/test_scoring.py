@@ -90,6 +90,14 @@ def test_neither_another_finding_nor_a_wide_interval_clears_a_wrong_force() -> N
     assert not stability.is_silent(row | {"named": None}), "there is no cause to name"
 
 
+def test_a_change_is_caught_if_it_is_in_each_recording_and_a_wide_interval_is_vague() -> None:
+    held, named = {"change": "a", "error": None, "named": False}, {"change": "a", "error": 0.9, "named": True}
+    missed = {"change": "b", "error": 0.9, "named": False}
+    harmless = {"change": "c", "error": 0.0, "named": None}
+    assert stability.count_caught([held, named, missed, held | {"change": "b"}, harmless]) == (1, 2)
+    assert [stability.is_vague({"width": width}) for width in (None, 0.4, 1.6)] == [False, False, True]
+
+
 def test_a_degraded_recording_states_what_its_case_does(tmp_path: Path) -> None:
     folder = Maker(tmp_path)(frames=24, meta={"membrane": "stripped"})
     meta = degradations.read_meta(folder)

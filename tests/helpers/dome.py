@@ -21,4 +21,4 @@ def patch(n: int = 61, extent: float = 46.0) -> Shape:
 
 
 def block(fem: schema.FemSection) -> tetrahedra.Tets:
-    return tetrahedra.block(ANATOMY, fem.tets)
+    return tetrahedra.block(fem.tets)

@@ -6,12 +6,14 @@ Run it with a Python that has felupe (GPL: it judges and never ships):
 
 `points`: stress and tangent of the law at deformation gradients. `scenes`: a block of 40 x 40 x 20 mm, E 1
 kPa, fixed but for its top, on which a layer of springs k0 (1 - (r/a)^2)^2 joins a disc to an instrument that
-is driven. Of felupe are the law (its Ogden energy, differentiated automatically) and the elements (bricks of
+is driven. `openings`: likewise, but of 60 x 60 x 40 mm and held beyond 12 mm on its top too, as by a skull,
+with the motion of the surface there: what a method sees that estimates the force.
+
+Of felupe are the law (its Ogden energy, differentiated automatically) and the elements (bricks of
 20 nodes); of this file the springs, on the same faces, and Newton's loop. Half of the block is solved.
 """
 
 import json
-import sys
 from pathlib import Path
 
 import felupe as fem
@@ -21,13 +23,24 @@ import tensortrax.math as tm
 from felupe.constitution.tensortrax import Hyperelastic
 from felupe.constitution.tensortrax.models.hyperelastic import ogden
 
-HALF, DEPTH, RADIUS, FIRM = 20.0, 20.0, 5.0, 40.0  # mm; k0 over E/a
-SCENES = [  # Poisson's ratio, alpha, way of the instrument in mm
-    (0.45, -5.0, [0.0, 0.0, -3.0]),
-    (0.45, -5.0, [3.0, 0.0, 0.0]),
-    (0.45, -15.0, [0.0, 0.0, -4.0]),
-    (0.45, -15.0, [2.0, 0.0, 3.0]),
+FIRM = 40.0  # k0 over E/a
+SCENES = [  # Poisson's ratio, alpha, radius of the disc and way of the instrument in mm
+    (0.45, -5.0, 5.0, [0.0, 0.0, -3.0]),
+    (0.45, -5.0, 5.0, [3.0, 0.0, 0.0]),
+    (0.45, -15.0, 5.0, [0.0, 0.0, -4.0]),
+    (0.45, -15.0, 5.0, [2.0, 0.0, 3.0]),
+    (0.45, -5.0, 9.0, [0.0, 0.0, -6.0]),
+    (0.45, -5.0, 9.0, [5.5, 0.0, 0.0]),
+    (0.45, -12.0, 9.0, [4.0, 0.0, 6.0]),
+    (0.45, -8.0, 11.0, [0.0, 0.0, -8.0]),
 ]
+OPENINGS = [  # likewise, with the disc's middle
+    (0.45, -5.0, 5.0, [0.0, 0.0, -4.0], 0.0),
+    (0.45, -8.0, 6.0, [1.0, 0.0, -3.0], 2.0),
+    (0.45, -12.0, 5.0, [4.0, 0.0, 0.0], 0.0),
+    (0.45, -15.0, 6.0, [1.0, 0.0, 4.0], -2.0),
+]
+OPENING = 12.0  # mm
 PLACES = [[0, 0], [2.5, 0], [-2.5, 0], [0, 5], [6, 0], [-6, 0], [0, 8], [10, 0], [-10, 0]]
 
 
@@ -61,15 +74,15 @@ def points():
 class Layer:
     """Springs between the top and an instrument."""
 
-    def __init__(self, field, mesh, way):
+    def __init__(self, field, mesh, radius, way, middle):
         self.field, self.way, self.part = field, np.array(way), 0.0
         top = mesh.points[:, 2] > -1e-9
         region = fem.RegionQuadraticHexahedronBoundary(mesh, only_surface=True, mask=top)
         cells, size = region.mesh.cells, len(mesh.points)
         h = np.broadcast_to(region.h, (*region.h.shape[:2], len(cells)))  # nodes, points, cells
         place = np.einsum("cai,aqc->qci", mesh.points[cells], h)
-        r = np.hypot(place[..., 0], place[..., 1]) / RADIUS
-        weight = FIRM / RADIUS * np.maximum(1 - r**2, 0) ** 2 * region.dV
+        r = np.hypot(place[..., 0] - middle, place[..., 1]) / radius
+        weight = FIRM / radius * np.maximum(1 - r**2, 0) ** 2 * region.dV
         local, n = np.einsum("qc,aqc,bqc->cab", weight, h, h), cells.shape[1]
         rows, columns = np.repeat(cells, n, axis=1).ravel(), np.tile(cells, (1, n)).ravel()
         nodal = sp.csr_matrix((local.ravel(), (rows, columns)), shape=(size, size))
@@ -88,24 +101,25 @@ def graded(end, count, first):
     return np.append(0, np.cumsum(steps) * end / steps.sum())
 
 
-def scene(poisson, alpha, way, fine):
-    side = graded(HALF, fine, 1.0)
-    x, y, z = np.append(-side[:0:-1], side), side, -graded(DEPTH, fine - 1, 1.2)[::-1]
-    grid = [np.unique(a) for a in (x, y, z)]
-    mesh = fem.mesh.add_midpoints_edges(fem.mesh.Grid(*grid))
+def solve(poisson, alpha, radius, way, middle, half, depth, opening, fine):
+    """Nodes (N, 3), displacement (N, 3) mm and reaction (3,) mN; `fine`: elements from middle to side."""
+    side = graded(half, fine, 1.0)
+    x, y, z = np.append(-side[:0:-1], side), side, -graded(depth, fine - 1, 1.2)[::-1]
+    mesh = fem.mesh.add_midpoints_edges(fem.mesh.Grid(x, y, np.unique(z)))
     region = fem.RegionQuadraticHexahedron(mesh)
     field = fem.FieldContainer([fem.Field(region, dim=3)])
     p = mesh.points
     held = (
-        (np.abs(np.abs(p[:, 0]) - HALF) < 1e-9) | (np.abs(p[:, 1] - HALF) < 1e-9) | (p[:, 2] < 1e-9 - DEPTH)
+        (np.abs(np.abs(p[:, 0]) - half) < 1e-9) | (np.abs(p[:, 1] - half) < 1e-9) | (p[:, 2] < 1e-9 - depth)
     )
+    held |= (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) > opening)
     bounds = {
         "held": fem.Boundary(field[0], mask=held),
         "middle": fem.Boundary(field[0], mask=np.abs(p[:, 1]) < 1e-9, skip=(1, 0, 1)),
     }
     mu, lam = lame(poisson)
     body = fem.SolidBody(Hyperelastic(energy, mu=mu, lam=lam, alpha=alpha), field)
-    layer = Layer(field, mesh, way)
+    layer = Layer(field, mesh, radius, way, middle)
     dof0, dof1 = fem.dof.partition(field, bounds)
     steps = int(np.ceil(np.linalg.norm(way)))
     for k in range(steps):
@@ -120,13 +134,18 @@ def scene(poisson, alpha, way, fine):
                 break
         else:
             raise SystemExit("no convergence")
-    u = field[0].values
-    near = [int(np.abs(p - [x, y, 0]).sum(axis=1).argmin()) for x, y in PLACES]
     reaction = 2 * layer.force().reshape(-1, 3).sum(axis=0) * [1, 0, 1]  # by symmetry
-    print(fine, poisson, alpha, way, reaction, flush=True)
+    print(fine, poisson, alpha, radius, way, reaction, flush=True)
+    return p, field[0].values, reaction
+
+
+def scene(poisson, alpha, radius, way, fine):
+    p, u, reaction = solve(poisson, alpha, radius, way, 0.0, 20.0, 20.0, np.inf, fine)
+    near = [int(np.abs(p - [x, y, 0]).sum(axis=1).argmin()) for x, y in PLACES]
     return {
         "poisson": poisson,
         "alpha": alpha,
+        "radius": radius,
         "way": way,
         "reaction": reaction.tolist(),
         "places": p[near].tolist(),
@@ -134,7 +153,23 @@ def scene(poisson, alpha, way, fine):
     }
 
 
+def opening(poisson, alpha, radius, way, middle, fine):
+    p, u, reaction = solve(poisson, alpha, radius, way, middle, 30.0, 40.0, OPENING, fine)
+    seen = (p[:, 2] > -1e-9) & (np.hypot(p[:, 0], p[:, 1]) < OPENING + 4)
+    return {
+        "poisson": poisson,
+        "alpha": alpha,
+        "reaction": reaction.tolist(),
+        "places": p[seen, :2].round(4).tolist(),  # of the half with y >= 0
+        "displacement": u[seen].round(5).tolist(),
+    }
+
+
 if __name__ == "__main__":
-    fine = int(sys.argv[1]) if len(sys.argv) > 1 else 8  # elements from the middle to a side
-    found = {"felupe": fem.__version__, "points": points(), "scenes": [scene(*one, fine) for one in SCENES]}
-    Path(__file__).with_suffix(".json").write_text(json.dumps(found))
+    answer = {
+        "felupe": fem.__version__,
+        "points": points(),
+        "scenes": [scene(*case, 8 if case[2] <= 5 else 6) for case in SCENES],
+        "openings": [opening(*case, 6) for case in OPENINGS],
+    }
+    Path(__file__).with_suffix(".json").write_text(json.dumps(answer))

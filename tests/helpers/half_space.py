@@ -11,7 +11,6 @@ from synth.fem.membrane import MembraneSheet
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import assemble
-from synth.job import schema
 
 Row = dict[str, Any]
 _RADIUS_MM = 4.5
@@ -26,7 +25,7 @@ def errors(count: int, poisson: float, sheet_mm: float = 0.0) -> list[Row]:
     """
     a = _RADIUS_MM
     size = _WIDE_MM if sheet_mm else tetrahedra.BLOCK_MM
-    tets = tetrahedra.block(schema.AnatomySection(dome_mm=1e6), count, ((0.0, 0.0, a),), size_mm=size)
+    tets = tetrahedra.block(count, ((0.0, 0.0, a),), size_mm=size, dome_mm=1e6)
     free = Tets(tets.points, tets.cells, tets.fixed, 0 * tets.hold)
     system = assemble(free, "linear", poisson, MembraneSheet(sheet_mm, 1.0) if sheet_mm else None)
     ring = a * np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)

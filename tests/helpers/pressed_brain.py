@@ -55,7 +55,7 @@ class Brain:
 
 def brain(on: Patch, law: str, tets: int, contact: tuple[float, float, float], poisson: float = 0.4) -> Brain:
     """Mesh, equations and embedded surface of one contact."""
-    volume = tetrahedra.block(ANATOMY, tets, (contact,))
+    volume = tetrahedra.block(tets, (contact,))
     embedding = surface_embedding.embed(volume, on.vertices)
     pressure = tool_gesture.footprint(np.array(contact[:2]), contact[2], on.vertices, on.area)
     system = assemble(volume, law, poisson)

@@ -7,8 +7,8 @@ from pathlib import Path
 from sources import PACKAGES, ROOT, imported, imports, module, parsed, sources
 
 INSIDE = {
-    "synth": "arrays errors arguments fields formats plugins system job flow flow.stereo video "
-    "flow.recording geometry fem.mesh fem fem.external "
+    "synth": "arrays errors arguments fields formats plugins system fem.law_choice job flow flow.stereo "
+    "video flow.recording geometry fem.mesh fem fem.external "
     "render.camera render.materials render.mitsuba render.appearance render.anatomy render.randomized render "
     "dataset sequence checks publish publish.export engine tune fit cli __main__",
     "learn": "data uncertainty network loss settings checkpoint split inference evaluation training "
@@ -64,6 +64,11 @@ def test_physics_rendering_and_flow_do_not_import_each_other() -> None:
         for path in sources(one.replace(".", "/")):
             met = [name for name in ours(path) for other in APART if other != one and name.startswith(other)]
             assert not met, f"{path} imports {met}"
+
+
+def test_numerics_never_see_a_job() -> None:
+    for path in sources("synth/fem", "synth/render", "synth/flow", "synth/geometry"):
+        assert not [name for name in ours(path) if name.startswith("synth.job")], path
 
 
 def test_the_product_does_not_import_evidence() -> None:

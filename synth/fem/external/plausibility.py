@@ -99,14 +99,14 @@ def find_exchanged_states(displacement: Map, time: Floats) -> list[str]:
     nodes = np.linspace(0, displacement.shape[1] - 1, min(displacement.shape[1], _PATH_NODES)).astype(int)
     path = np.asarray(displacement[:, nodes], np.float64).reshape(count, -1)
 
-    def roughness(order: Ints, at: Ints) -> Floats:
-        before, here, after = (path[order[at + step]] for step in (-1, 0, 1))
-        left, right = time[at] - time[at - 1], time[at + 1] - time[at]
+    def bends(order: Ints, places: Ints) -> Floats:
+        before, here, after = (path[order[places + step]] for step in (-1, 0, 1))
+        left, right = time[places] - time[places - 1], time[places + 1] - time[places]
         bend = (after - here) / right[:, None] - (here - before) / left[:, None]
         return np.asarray(np.linalg.norm(bend, axis=1))
 
     plain, inner = np.arange(count), np.arange(1, count - 1)
-    rough = roughness(plain, inner)
+    rough = bends(plain, inner)
     worst = inner[np.argsort(-rough, kind="stable")[:_WORST_STATES]]
     chosen = np.unique(np.clip(worst[:, None] + [-1, 0, 1], 1, count - 1))
     best, share, pair = np.inf, 1.0, (0, 0)
@@ -114,13 +114,15 @@ def find_exchanged_states(displacement: Map, time: Floats) -> list[str]:
         near = np.unique(np.clip([i - 1, i, i + 1, j - 1, j, j + 1], 1, count - 2))
         order = plain.copy()
         order[[i, j]] = j, i
-        before, after = float(rough[near - 1].sum()), float(roughness(order, near).sum())
+        before, after = float(rough[near - 1].sum()), float(bends(order, near).sum())
         if after - before < best:
             best, share, pair = after - before, after / max(before, 1e-30), (i, j)
     if not (share < _SMOOTHER and best < -_ROUGHER * rough.sum()):
         return []
-    one, other = pair
-    return [f"states {one} and {other} may have changed places: the motion is smooth if they are exchanged"]
+    first, second = pair
+    return [
+        f"states {first} and {second} may have changed places: the motion is smooth if they are exchanged"
+    ]
 
 
 def find_speed_doubts(displacement: Map, time: Floats) -> list[str]:
@@ -155,23 +157,23 @@ def find_load_doubts(
     f, u = np.asarray(force[k], np.float64), np.asarray(displacement[k], np.float64)
     total_mn, radius = float(size[k].sum()), contact_radius(points, faces, f)
     work, most = float((f * u).sum()), float((size[k] * np.linalg.norm(u, axis=1)).sum())
-    found, low, high = list[str](), *_LOADS
+    doubts, low, high = list[str](), *_LOADS
     if young_kpa is not None and not low <= (load := total_mn / (young_kpa * radius**2)) <= high:
         where = f"a contact of {radius:.2g} mm radius and {young_kpa:g} kPa"
         what = f"{total_mn:.3g} mN on {where} is P = {load:.2g}"
-        found.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
+        doubts.append(f"force: {what}; {low:g} to {high:g} are likely: is mechanics.unit_mn right?")
     done = np.einsum("snd,snd->s", force, displacement, dtype=np.float64)
     if done.min() < -_LEAST_WORK * np.abs(done).max():
-        at = int(done.argmin())
-        found.append(
-            f"force: does negative work, {done[at] / 2:.2g} mN mm in state {at}: it has to be what acts on "
-            "the tissue, not the reaction; is its sign right?"
+        state = int(done.argmin())
+        doubts.append(
+            f"force: does negative work, {done[state] / 2:.2g} mN mm in state {state}: it has to be "
+            "what acts on the tissue, not the reaction; is its sign right?"
         )
     elif 0 < work < _ALONG * most:
         angle = np.degrees(np.arccos(np.clip(work / max(most, 1e-300), -1, 1)))
-        found.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
+        doubts.append(f"force: at {angle:.0f} degrees to the motion of its nodes; are axes swapped?")
     elif work <= 0:
-        found.append(
+        doubts.append(
             f"force: {total_mn:.3g} mN act on nodes that don't move; are nodes, faces and force in one order?"
         )
     else:
@@ -180,16 +182,16 @@ def find_load_doubts(
         if not least <= stiff <= largest:
             stated = "not stated" if young_kpa is None else f"{young_kpa:g} kPa"
             what = f"load and motion are those of a tissue of {stiff:.2g} kPa, fem.young_kpa is {stated}"
-            found.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
+            doubts.append(f"force: {what}: are mechanics.unit_mn, unit_mm and fem.young_kpa right?")
         borne = size.sum(axis=1, dtype=np.float64)
         given = done / np.maximum(borne, 1e-30) ** 2  # compliance: mean motion along the load, per load
         late = np.flatnonzero((borne > _LOADED * total_mn) & (given < _GIVES_LESS * given[k]))
         if late.size:
             state, why = int(late[0]), "have force and motion the same times?"
-            found.append(
+            doubts.append(
                 f"force: {borne[state]:.3g} mN in state {state} move the tissue hardly at all; {why}"
             )
-    return found
+    return doubts
 
 
 def find_mirror_doubt(points: Floats, faces: Ints, displacement: Map, force: Map) -> list[str]:

@@ -1,4 +1,4 @@
-"""Reading the series of a job, of any kind."""
+"""Reading the series of another program, of any kind."""
 
 from __future__ import annotations
 
@@ -13,22 +13,26 @@ from synth.fem.external import plausibility, series
 from synth.fem.external.recorded import find_run, read_arrays
 from synth.fem.external.series import MeshSeries, Units
 from synth.fem.external.vtk_series import read_files
-from synth.job import identity
-from synth.job.schema import Job, MechanicsSection, table_of
-
-_PULLING = {"forceps", "bayonet", "suction", "none"}  # instruments that may pull
+from synth.system import series_files
+from synth.system.series_files import inside, table_of
 
 
-def read_job_series(job: Job, index: int) -> MeshSeries:
-    """The series of sequence `index` of a job with `mechanics.source`, as `read_series`; its `cautions` are
-    complete. UserError: also for files that are replaced while they are read."""
-    given = job.mechanics
-    sources = identity.list_sources(given)
-    source = given.model_copy(update={"source": sources[index % len(sources)]})
-    out, radius, fem = job.anatomy.craniotomy.direction, job.fem.footprint_mm[0], job.fem
-    young = fem.young_kpa[0] if fem.young_kpa[0] == fem.young_kpa[1] else None
-    pulls = bool(_PULLING.intersection(fem.names) or fem.own_instruments)
-    return _read(source, radius, young, None if pulls else out, _state_of(source))
+def read_checked_series(
+    source: Path,
+    units: Units,
+    force: str | None = None,
+    instruments: str | None = None,
+    patch_mm: float = 4.0,
+    young_kpa: float | None = None,
+    outward: tuple[float, float, float] | None = None,
+) -> MeshSeries:
+    """A series as of `read_series`, whose `cautions` also tell what is doubtful about its load.
+
+    `young_kpa`: of its tissue, None: not known; `outward`: direction out of the tissue, if no instrument may
+    pull. The last two series are kept. UserError: also for files that are replaced while they are read.
+    """
+    written = _find_state(source, force, instruments)
+    return _read(source, units, force, instruments, patch_mm, young_kpa, outward, written)
 
 
 def forget() -> None:
@@ -36,35 +40,36 @@ def forget() -> None:
     _read.cache_clear()
 
 
-def _state_of(given: MechanicsSection) -> tuple[tuple[int, ...], ...]:
+def _find_state(source: Path, force: str | None, instruments: str | None) -> tuple[tuple[int, ...], ...]:
     """What distinguishes the files of a series from others that replaced them."""
-    every = (file.stat() for file in identity.list_files(given))
-    return tuple((one.st_ino, one.st_mtime_ns, one.st_ctime_ns, one.st_size) for one in every)
+    states = (file.stat() for file in series_files.list_files(source, force, instruments))
+    return tuple((state.st_ino, state.st_mtime_ns, state.st_ctime_ns, state.st_size) for state in states)
 
 
 @lru_cache(maxsize=2)
 def _read(
-    given: MechanicsSection,
+    source: Path,
+    units: Units,
+    force: str | None,
+    instruments: str | None,
     patch_mm: float,
     young_kpa: float | None,
-    out: tuple[float, float, float] | None,
-    written: object,
+    outward: tuple[float, float, float] | None,
+    written: tuple[tuple[int, ...], ...],
 ) -> MeshSeries:
-    """`written`: as of `_state_of`; `out`: outwards, where a load that pulls is doubtful."""
-    assert given.source is not None
-    units = Units(given.unit_mm, given.unit_mn, given.dt_s)
-    found = read_series(given.source, units, given.force, given.instruments, patch_mm)
-    doubts = doubt_load(found, young_kpa)
-    if found.force is not None and out is not None:
-        doubts += plausibility.find_pull_doubt(found.force, np.array(out))
-    if _state_of(given) != written:
-        raise UserError(f"{given.source}: was replaced while it was read")
-    return replace(found, cautions=(*found.cautions, *doubts))
+    """`written`: as of `_find_state`, before the files are read."""
+    series = read_series(source, units, force, instruments, patch_mm)
+    doubts = doubt_load(series, young_kpa)
+    if series.force is not None and outward is not None:
+        doubts += plausibility.find_pull_doubt(series.force, np.array(outward))
+    if _find_state(source, force, instruments) != written:
+        raise UserError(f"{source}: was replaced while it was read")
+    return replace(series, cautions=(*series.cautions, *doubts))
 
 
 def doubt_load(series: MeshSeries, young_kpa: float | None) -> list[str]:
     """Doubts on the load of a series, if it has one; see `plausibility`."""
-    if series.force is None or any(one.startswith("nodes") for one in series.cautions):
+    if series.force is None or any(caution.startswith("nodes") for caution in series.cautions):
         return []  # nor of false motion
     motion = series.points, series.faces, series.displacement, series.force
     return plausibility.find_load_doubts(*motion, young_kpa) + plausibility.find_mirror_doubt(*motion)
@@ -88,9 +93,9 @@ def read_series(
     if source.is_dir() and len(alone := list(source.glob("*.npz"))) == 1:
         source = alone[0]
     if run is not None or source.suffix == ".npz":
-        found = read_arrays(run or source, units, field, recorded=run is not None)
+        motion = read_arrays(run or source, units, field, recorded=run is not None)
     else:
-        found = read_files(source, units, field)
+        motion = read_files(source, units, field)
     if table is not None:
-        found = series.press(found, identity.inside(folder, table), units, patch_mm)
-    return found if instruments is None else series.equip(found, identity.inside(folder, instruments))
+        motion = series.press(motion, inside(folder, table), units, patch_mm)
+    return motion if instruments is None else series.equip(motion, inside(folder, instruments))

@@ -23,7 +23,6 @@ from synth.fem.external.series import MeshSeries, State, Units, assemble, find_s
 from synth.fem.external.vtk_series import force_field
 from synth.geometry.mesh_file import Numbers, read_surface, whole
 from synth.geometry.skin import TRIANGLE
-from synth.job import identity
 from synth.system import checked_file
 
 _CELLS = {"faces": TRIANGLE, "tetrahedra": 10, "hexahedra": 12}
@@ -34,8 +33,8 @@ _NEAR = 1e-3  # of the extent, within which a vertex of the OBJ is one of the ar
 
 def find_run(folder: Path) -> Path | None:
     """The arrays of a run of the published recorder in a folder: the final ones if there are some."""
-    found = sorted(folder.glob("*_final.npz")) or sorted(folder.glob("*_auto.npz"))
-    return found[-1] if found else None
+    files = sorted(folder.glob("*_final.npz")) or sorted(folder.glob("*_auto.npz"))
+    return files[-1] if files else None
 
 
 def read_arrays(file: Path, units: Units, force: str | None = None, recorded: bool = False) -> MeshSeries:
@@ -89,13 +88,13 @@ def _double(values: Numbers) -> Floats:
 
 def _faces_of(arrays: Path, rest: Floats) -> Ints:
     """Faces (F, 3) of the surface next to the arrays, by the numbers of their points."""
-    found = sorted(arrays.parent.glob("*.obj"))
-    if len(found) != 1:
-        raise UserError(f"{arrays.parent}: {len(found)} OBJ files; the recorded surface, one, is needed")
-    data = checked_file.read_bytes(found[0], identity.FILES["anatomy", "mesh"])
-    with as_user_error(f"{found[0]}: is not a readable surface"):
+    files = sorted(arrays.parent.glob("*.obj"))
+    if len(files) != 1:
+        raise UserError(f"{arrays.parent}: {len(files)} OBJ files; the recorded surface, one, is needed")
+    data = checked_file.read_bytes(files[0], checked_file.LARGEST_MESH)
+    with as_user_error(f"{files[0]}: is not a readable surface"):
         vertices, faces = read_surface(data, "obj")
     away, nearest = cKDTree(rest).query(vertices)
     if len(away) == 0 or away.max() > _NEAR * np.ptp(rest, axis=0).max():
-        raise UserError(f"{found[0]}: its vertices are not those of {arrays.name} at rest")
+        raise UserError(f"{files[0]}: its vertices are not those of {arrays.name} at rest")
     return np.asarray(nearest[faces], np.int64)

@@ -104,7 +104,7 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
     _, first, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     place = first[place.ravel()]
     with as_user_error(str(where)):
-        if any(one.min(initial=0) < 0 for one in cells.values()):
+        if any(cell.min(initial=0) < 0 for cell in cells.values()):
             raise ValueError("a cell refers to a missing point")
         cells = {kind: place[one] for kind, one in cells.items()}
         outer = skin(points, cells)
@@ -113,8 +113,8 @@ def find_surface(points: Floats, cells: Mapping[int, Ints], where: Path) -> Oute
         if not area.max(initial=0) > 0:
             raise ValueError("its surface has no area")
         nodes, faces = np.unique(outer[area > _ROUNDING**2 * area.max()], return_inverse=True)
-    links = [np.stack([one[:, :-1], one[:, 1:]]).reshape(2, -1) for one in cells.values()]
-    graph = sp.coo_array((np.ones(sum(one.shape[1] for one in links)), np.hstack(links)), [len(points)] * 2)
+    links = [np.stack([cell[:, :-1], cell[:, 1:]]).reshape(2, -1) for cell in cells.values()]
+    graph = sp.coo_array((np.ones(sum(link.shape[1] for link in links)), np.hstack(links)), [len(points)] * 2)
     bodies = np.unique(connected_components(graph, directed=False)[1][nodes])
     if len(bodies) > 1:
         raise UserError(f"{where}: has {len(bodies)} separate bodies; write the tissue alone")
@@ -141,12 +141,12 @@ def assemble(
     with as_user_error(f"{source}: {count} states"):
         refuse_excess(12 * count * len(nodes))
     displacement, force = np.empty((count, len(nodes), 3), np.float32), None
-    for k, (where, at, moved, load) in enumerate(states):
+    for k, (where, time_s, moved, load) in enumerate(states):
         _refuse_wild(surface.points, moved[nodes], where)
         if np.abs(moved - moved[place]).max(initial=0) > _ROUNDING * max(float(np.abs(moved).max()), 1e-9):
             raise UserError(f"{where}: points at one place move apart; write one body, with its nodes once")
         files.append(where)
-        times.append(at)
+        times.append(time_s)
         displacement[k] = moved[nodes]
         if load is not None:
             force, whole = np.empty_like(displacement) if force is None else force, np.zeros_like(moved)
@@ -172,13 +172,13 @@ def assemble(
     cautions += plausibility.find_speed_doubts(displacement, time)
     cautions += plausibility.find_exchanged_states(displacement, time)
     about = scale, tuple(fields), timed, None, tuple(cautions)
-    found = MeshSeries(points, surface.faces, time, displacement, none, none, *about)
+    series = MeshSeries(points, surface.faces, time, displacement, none, none, *about)
     if force is None:
-        return found
+        return series
     each = vertex_area(points, surface.faces)[:, None] / scale**2 if per_area else 1.0
     with np.errstate(over="ignore", invalid="ignore"):  # `bear` refuses what is infinite
         force *= np.asarray(_force_mn(units, source) * each, np.float32)
-    return bear(found, force, source)
+    return bear(series, force, source)
 
 
 def _single(values: Floats, where: Path) -> Map:
@@ -213,14 +213,14 @@ def _refuse_blank(displacement: Map, files: list[Path]) -> None:
 def _rising(times: list[float], files: list[Path], units: Units) -> Floats:
     """Times (S,) s from 0, as stated by the files or `dt_s`. UserError: none, or they don't rise."""
     if (wild := np.abs(times) > _LATEST_S).any():
-        raise UserError(f"{files[at := int(wild.argmax())]}: its time is {times[at]:g} s")
+        raise UserError(f"{files[state := int(wild.argmax())]}: its time is {times[state]:g} s")
     if np.isnan(times).all():
         if units.dt_s is None:
             raise UserError(f"{files[0]}: states no time; mechanics.dt_s is needed, seconds between states")
         return np.arange(len(times), dtype=np.float64) * units.dt_s
     if not (rises := np.diff(times) > 0).all():
-        at = int(np.argmin(rises)) + 1
-        raise UserError(f"{files[at]}: its time {times[at]:g} s does not follow {times[at - 1]:g} s")
+        state = int(np.argmin(rises)) + 1
+        raise UserError(f"{files[state]}: its time {times[state]:g} s does not follow {times[state - 1]:g} s")
     return np.asarray(times, np.float64) - times[0]
 
 
@@ -290,9 +290,9 @@ def equip(series: MeshSeries, table: Path) -> MeshSeries:
 
 def _at_states(series: MeshSeries, table: Path, names: Sequence[str]) -> Floats:
     """Columns (S, len(names)) of a table, linear between rows. UserError: it does not cover the states."""
-    found = read_csv(table, ("time", *names))
-    time = found["time"] - found["time"][0]
-    rows = np.stack([found[name] for name in names], axis=1)
+    columns = read_csv(table, ("time", *names))
+    time = columns["time"] - columns["time"][0]
+    rows = np.stack([columns[name] for name in names], axis=1)
     if not np.isfinite([*rows.ravel(), *time]).all() or not (np.diff(time) > 0).all():
         raise UserError(f"{table}: times don't rise, or a value is missing")
     if series.time[-1] > time[-1] + 1e-6:

@@ -65,8 +65,10 @@ def attach(points: Floats, faces: Ints, scene: Shape) -> Transfer:
     # Nodes between the vertices, on triangles without any, are borne by the nearest vertex.
     between = np.flatnonzero(whole == 0)
     away, at = cKDTree(vertices).query(points[between], distance_upper_bound=2 * float(np.sqrt(area.max())))
-    found = np.isfinite(away)
-    rest = sp.csr_array((np.ones(found.sum()), (at[found], between[found])), shape=share.shape)
+    near_enough = np.isfinite(away)
+    rest = sp.csr_array(
+        (np.ones(near_enough.sum()), (at[near_enough], between[near_enough])), shape=share.shape
+    )
     scale = np.divide(1.0, whole, out=np.zeros_like(whole), where=whole > 0)
     load = sp.csr_array(share.multiply(scale[None, :]) + rest)
     return Transfer(motion, corner, load, points, close, arm)
@@ -133,6 +135,6 @@ def _rotations(rest: Floats, now: Floats, faces: Ints) -> Floats:
     left, _, right = np.linalg.svd(whole[used])
     flip = np.linalg.det(left @ right) < 0
     left[flip, :, 2] *= -1
-    found = np.broadcast_to(np.eye(3), whole.shape).copy()
-    found[used] = left @ right
-    return found
+    turns = np.broadcast_to(np.eye(3), whole.shape).copy()
+    turns[used] = left @ right
+    return turns

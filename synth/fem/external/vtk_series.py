@@ -14,8 +14,8 @@ from synth.errors import UserError, as_user_error, did_you_mean
 from synth.fem.external.series import MeshSeries, State, Units, assemble, find_surface
 from synth.geometry.mesh_file import SUFFIXES, SURFACES, MeshFile, read_mesh, read_surface
 from synth.geometry.skin import TRIANGLE
-from synth.job.identity import COLLECTIONS, LARGEST_STATE, read_collection
 from synth.system import checked_file
+from synth.system.series_files import COLLECTIONS, LARGEST_STATE, read_collection
 
 MOVED = ("displacement", "displacements", "disp", "u")  # usual names of the field, in small letters
 _OTHERS = {
@@ -58,8 +58,8 @@ def read_files(source: Path, units: Units, force: str | None = None) -> MeshSeri
 
 def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     """Files of a series in order, two at least, and their times [s] if a collection states them."""
-    if (how := _OTHERS.get(source.suffix.lower())) is not None:
-        raise UserError(f"{source}: can't be read; convert it to VTU: {how}")
+    if (advice := _OTHERS.get(source.suffix.lower())) is not None:
+        raise UserError(f"{source}: can't be read; convert it to VTU: {advice}")
     if source.suffix in COLLECTIONS:
         files, times = zip(*read_collection(source), strict=True)
         return list(files), list(times)
@@ -67,12 +67,12 @@ def list_states(source: Path) -> tuple[list[Path], list[float] | None]:
     lists = [file for file in every if file.suffix in COLLECTIONS]
     if len(lists) == 1:
         return list_states(lists[0])
-    found = [file for file in every if file.suffix[1:] in SUFFIXES]
-    found = found or [file for file in every if file.suffix[1:].lower() in SURFACES]
-    stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in found})
+    members = [file for file in every if file.suffix[1:] in SUFFIXES]
+    members = members or [file for file in every if file.suffix[1:].lower() in SURFACES]
+    stems = sorted({re.sub(r"\d+$", "", file.stem) + "*" + file.suffix for file in members})
     if len(stems) > 1:
         raise UserError(f"{source}: files of several series, {', '.join(stems[:3])}; choose one of these")
-    numbers = {file: re.search(r"\d+$", file.stem) for file in found}
+    numbers = {file: re.search(r"\d+$", file.stem) for file in members}
     order = sorted((int(number[0]), file) for file, number in numbers.items() if number)
     if len(order) < 2:
         raise UserError(

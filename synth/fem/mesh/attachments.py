@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope, scatter, shape
-from synth.job import schema
+from synth.geometry.craniotomy import Attachment
 
 FIRM_PER_MM = 2.0  # springs of skull, dura and attachments, in E per mm: 10 times as stiff as the tissue
 
@@ -22,7 +22,7 @@ _SAMPLES = (_GRID + 0.25) / _FINE
 """(165, 4) evenly spaced barycentric points: a sheet may be much thinner than the elements it crosses."""
 
 
-def springs(points: Floats, cells: Ints, attachments: Sequence[schema.AttachmentSection]) -> sp.csr_array:
+def springs(points: Floats, cells: Ints, attachments: Sequence[Attachment]) -> sp.csr_array:
     """Springs (N, N) mm (mN/mm for E = 1 kPa) of all attachments on nodes (N, 3) mm of cells (M, 10), in
     their axes. UserError: an attachment holds no tissue."""
     total = sp.csr_array((len(points), len(points)))
@@ -46,7 +46,7 @@ def springs(points: Floats, cells: Ints, attachments: Sequence[schema.Attachment
     return sp.csr_array(total)
 
 
-def within(attachment: schema.AttachmentSection, at: Floats) -> Mask:
+def within(attachment: Attachment, at: Floats) -> Mask:
     """Mask (...) of the points (..., 3) mm that an attachment holds."""
     away = at - np.asarray(attachment.point)
     inside = np.linalg.norm(away, axis=-1) <= attachment.radius_mm

@@ -57,10 +57,10 @@ def _once(points: Floats, cells: Ints, faces: Ints, inside: Callable[[Floats], F
     shortest = np.full(len(used), np.inf)
     np.minimum.at(shortest, local, sides.min(axis=1)[:, None])
     step = np.clip(spsolve(whole, target), -_FARTHEST * shortest, _FARTHEST * shortest)
-    return _moved(points, cells, used, step[:, None] * out)
+    return _move(points, cells, used, step[:, None] * out)
 
 
-def _moved(points: Floats, cells: Ints, used: Ints, step: Floats) -> Floats:
+def _move(points: Floats, cells: Ints, used: Ints, step: Floats) -> Floats:
     """Moves the corners by the step, or by as much of it as the quality of their tetrahedra allows."""
     least = np.minimum(_SOUND, quality(points[cells]))
     share = np.zeros(len(points))

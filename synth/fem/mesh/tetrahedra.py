@@ -12,15 +12,15 @@ import scipy.sparse as sp
 
 from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
-from synth.fem.mesh import attachments, winding
-from synth.fem.mesh.attachments import FIRM_PER_MM
+from synth.fem.mesh import winding
+from synth.fem.mesh.attachments import FIRM_PER_MM, springs
 from synth.fem.mesh.element import TRI_POINTS, TRI_WEIGHTS, bary_slope, scatter, shape
 from synth.fem.mesh.fit import fit
 from synth.fem.mesh.lattice_stuffing import stuff
 from synth.fem.mesh.mesh_relief import HeightMap, raise_top
 from synth.fem.mesh.refine import edges_of, refine
 from synth.geometry.brain_surface import Brain
-from synth.job import schema
+from synth.geometry.craniotomy import Attachment
 
 Contact = tuple[float, float, float]
 """World x, y of a contact's centre and its radius, mm."""
@@ -54,43 +54,53 @@ class Tets:
 
 
 def block(
-    anatomy: schema.AnatomySection,
     tets: int,
     focus: Sequence[Contact] = (),
     height: HeightMap | None = None,
     *,
+    opening_mm: float = 12.0,
+    dome_mm: float = 70.0,
+    attachments: Sequence[Attachment] = (),
     slips: bool = False,
     size_mm: tuple[float, float, float] = BLOCK_MM,
 ) -> Tets:
     """A domed block, fixed at its sides and bottom, held by the skull around the opening.
 
-    Of about `tets` tetrahedra, finest under the contacts `focus`, or in the whole opening if none. `height`:
-    of the surface over opening and rim, None: the bare dome; `slips`: along the skull, rather than bonded
-    to it; `size_mm`: width, height, depth. UserError: too round a dome; an attachment holds nothing.
+    Args:
+        tets: about how many tetrahedra, finest under the contacts.
+        focus: contacts; the whole opening if none.
+        height: of the surface over opening and rim; None: the bare dome.
+        opening_mm: radius of the opening in the skull.
+        dome_mm: radius of curvature of the surface.
+        attachments: regions inside in which the tissue is fixed too, world axes.
+        slips: along the skull, rather than bonded to it.
+        size_mm: width, height, depth.
+
+    Raises:
+        UserError: too round a dome; an attachment holds nothing.
     """
     size = np.asarray(size_mm)
-    fall = -dome(np.array([size[:2] / 2]), anatomy.dome_mm)[0]
+    fall = -dome(np.array([size[:2] / 2]), dome_mm)[0]
     if fall > 0.8 * size[2]:
         steep = f"the dome falls by {fall:.0f} mm, too much for a block of {size[2]:g} mm depth"
         raise UserError(f"anatomy.dome_mm: {steep}")
     points, cells = _bricks(size, tets / 60)
-    opening = anatomy.craniotomy.radius_mm
-    points, cells = refine(points, cells, _grading(opening, focus), tets)
+    points, cells = refine(points, cells, _grading(opening_mm, focus), tets)
     wall = (np.abs(np.abs(points[:, :2]) - size[:2] / 2) < 1e-9).any(axis=1) | (points[:, 2] < 1e-9 - size[2])
     points, cells = with_midsides(points, cells)
-    faces, ground = boundary(cells), partial(dome, radius_mm=anatomy.dome_mm)
+    faces, ground = boundary(cells), partial(dome, radius_mm=dome_mm)
     top = faces[(points[faces, 2] > -1e-9).all(axis=1)]
     points = raise_top(points, cells, top, ground, ground if height is None else height.over(ground))
     # A face is on a wall if its three corners are; the upper edge of the walls belongs to both.
-    return _finished(points, cells, wall, anatomy.craniotomy, anatomy.attachments, slips)
+    return _hold(points, cells, wall, opening_mm, attachments, slips)
 
 
 def from_brain(
     brain: Brain,
-    anatomy: schema.AnatomySection,
     tets: int,
     focus: Sequence[Contact] = (),
     *,
+    opening_mm: float = 12.0,
     slips: bool = False,
 ) -> Tets:
     """A user's whole brain, held by the skull everywhere but in the opening; arguments as in `block`.
@@ -98,14 +108,14 @@ def from_brain(
     UserError: the surface encloses no volume that can be meshed, or none under the opening; an attachment
     holds nothing.
     """
-    points, cells = _filled(brain, _grading(anatomy.craniotomy.radius_mm, focus), tets)
+    points, cells = _fill(brain, _grading(opening_mm, focus), tets)
     if len(cells) < 0.2 * tets:
         raise UserError("anatomy.mesh: the surface encloses no volume that tetrahedra fit into")
-    top = points[np.hypot(points[:, 0], points[:, 1]) < anatomy.craniotomy.radius_mm, 2].max(initial=-np.inf)
-    if top < -anatomy.craniotomy.radius_mm:
+    top = points[np.hypot(points[:, 0], points[:, 1]) < opening_mm, 2].max(initial=-np.inf)
+    if top < -opening_mm:
         raise UserError("anatomy.craniotomy: there is no volume under the opening")
     points, cells = with_midsides(points, cells)
-    return _finished(points, cells, np.zeros(len(points), bool), anatomy.craniotomy, brain.attachments, slips)
+    return _hold(points, cells, np.zeros(len(points), bool), opening_mm, brain.attachments, slips)
 
 
 def dome(xy: Floats, radius_mm: float) -> Floats:
@@ -175,13 +185,13 @@ def _bricks(size: Floats, count: float) -> tuple[Floats, Ints]:
     return grid, cells
 
 
-def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
+def _fill(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tuple[Floats, Ints]:
     """Graded tetrahedra inside a surface, about as many as wanted after up to four tries."""
     turns = winding.prepare(*brain.shape)
     low, high = brain.shape.vertices.min(axis=0), brain.shape.vertices.max(axis=0)
     size = 1.1 * (high - low)
 
-    def wanted(at: Floats) -> Floats:
+    def grade(at: Floats) -> Floats:
         """The grading, coarser well outside the surface, where refining gains nothing."""
         outside = turns(at) < 0.01
         far = np.linalg.norm(at, axis=1) > _ALL_MM
@@ -191,7 +201,7 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
     for _ in range(4):
         points, cells = _bricks(size, lattice / 18)
         points += 0.5 * (low + high) + [0, 0, 0.5 * size[2]]
-        points, cells = refine(points, cells, wanted, lattice)
+        points, cells = refine(points, cells, grade, lattice)
         points, cells = stuff(points, cells, lambda at: turns(at) - 0.5)
         if 0.9 * tets <= len(cells) <= 1.1 * tets or len(cells) == 0:
             break
@@ -201,25 +211,26 @@ def _filled(brain: Brain, grading: Callable[[Floats], Floats], tets: int) -> tup
     return points, cells
 
 
-def _finished(
+def _hold(
     points: Floats,
     cells: Ints,
     wall: Mask,
-    at: schema.CraniotomySection,
-    held: Sequence[schema.AttachmentSection],
+    opening_mm: float,
+    attachments: Sequence[Attachment],
     slips: bool,
 ) -> Tets:
+    """The mesh with what holds it: nodes (N,) on a wall, the skull around the opening, attachments."""
     faces = boundary(cells)
     on_wall = wall[faces[:, :3]].all(axis=1)
     fixed = np.zeros(len(points), bool)
     fixed[faces[on_wall]] = True
-    bonded, slip = _springs(points, faces[~on_wall], at, slips)
-    hold = bonded + attachments.springs(points, cells, held)
+    bonded, slip = _springs(points, faces[~on_wall], opening_mm, slips)
+    hold = bonded + springs(points, cells, attachments)
     return Tets(points, cells, fixed, sp.csr_array(hold), slip)
 
 
 def _springs(
-    points: Floats, faces: Ints, at: schema.CraniotomySection, slips: bool
+    points: Floats, faces: Ints, opening_mm: float, slips: bool
 ) -> tuple[sp.csr_array, sp.csr_array | None]:
     """The skull's springs on the surface, which grow over the rim's width from none in the opening to firm:
     (N, N) mm of those that hold in every direction, and (3N, 3N) mm of those along the normal alone. Deep
@@ -228,24 +239,24 @@ def _springs(
     facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = 0.5 * np.linalg.norm(facing, axis=1)
     place = np.einsum("qc,fcd->fqd", TRI_POINTS, corner)
-    out = np.hypot(place[..., 0], place[..., 1]) - at.radius_mm
+    out = np.hypot(place[..., 0], place[..., 1]) - opening_mm
     firm = np.clip(out / RIM_MM, 0, 1)
     # Deep below lies the far side of the brain, which no opening exposes.
-    deep = place[..., 2] < -2 * at.radius_mm
+    deep = place[..., 2] < -2 * opening_mm
     firm[deep] = 1
     value = shape(TRI_POINTS)
     pressed = FIRM_PER_MM * firm * firm * (3 - 2 * firm) * area[:, None] * TRI_WEIGHTS
 
-    def gathered(part: Floats) -> sp.csr_array:
+    def gather(part: Floats) -> sp.csr_array:
         return scatter(np.einsum("fq,qi,qj->fij", part, value, value), faces, len(points))
 
     if not slips:
-        return gathered(pressed), None
+        return gather(pressed), None
     normal = facing / (2 * area)[:, None]
     slip = sp.csr_array((3 * len(points),) * 2)
     for i, j in product(range(3), repeat=2):
         one = np.zeros((3, 3))
         one[i, j] = 1
         part = np.where(deep, 0, pressed) * (normal[:, i] * normal[:, j])[:, None]
-        slip = slip + sp.kron(gathered(part), one, format="csr")
-    return gathered(np.where(deep, pressed, 0)), sp.csr_array(slip)
+        slip = slip + sp.kron(gather(part), one, format="csr")
+    return gather(np.where(deep, pressed, 0)), sp.csr_array(slip)

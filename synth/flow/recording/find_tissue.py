@@ -33,8 +33,9 @@ class Limits:
     sure: float = 0.7  # confidence above which a pixel is tracked
     visible: float = 0.7  # share of frames in which a pixel has to be tracked
     rounds: int = 5  # of GrabCut
-    small: float = 0.05  # share of the picture below which what is found is doubtful
+    small: float = 0.05  # share of the picture below which what is found is not the tissue
     solid: float = 0.93  # share of its convex hull below which it is doubtful: right ones 0.95 and more
+    hollow: float = 0.75  # likewise, below which it is not the tissue
 
 
 def choose_frames(footage: Footage) -> frozenset[int]:
@@ -101,8 +102,10 @@ class TissueSearch:
             if is_alike:
                 text = "neither motion nor colour shows a rim: the whole picture is assumed"
                 return whole, _state(text, "warning")
-            text = "too little moves to find its rim: what moves is taken for it"
-            return whole & _hull(moves), _state(text, "warning")
+            text, hull = "too little moves to find its rim: what moves is taken for it", whole & _hull(moves)
+            if hull.mean() < Limits.small:
+                return hull, _refuse(f"what moves is {100 * hull.mean():.2g}% of the picture")
+            return hull, _state(text, "warning")
         guess = np.where(core, cv2.GC_FGD, np.where(moves, cv2.GC_PR_FGD, cv2.GC_PR_BGD)).astype(np.uint8)
         # From either guess tissue may be lost that instruments cut off: the rounder result is right.
         guesses = guess, _by_colour(guess, colours, core, still & ~_inner(whole))
@@ -110,7 +113,9 @@ class TissueSearch:
         tissue, solid = max(found, key=lambda one: one[1])
         text = f"found by motion and colour, {100 * tissue.mean():.2g}% of the picture"
         if tissue.mean() < Limits.small:
-            return tissue, _state(f"{text}: is it an instrument that moves?", "warning")
+            return tissue, _refuse(f"what is found is {100 * tissue.mean():.2g}% of the picture")
+        if solid < Limits.hollow:
+            return tissue, _refuse("what is found has an outline as tissue has none")
         if solid < Limits.solid:
             text += ", but with an uneven outline: see the picture of the masks"
             return tissue, _state(text, "warning")
@@ -133,6 +138,10 @@ def touches_border(tissue: Mask) -> float:
     border = np.ones(tissue.shape, bool)
     border[1:-1, 1:-1] = False
     return float((outline & border).sum() / max(outline.sum(), 1))
+
+
+def _refuse(text: str) -> Finding:
+    return Finding("error", "tissue", f"draw tissue.png (bench init --tissue proposes it): {text}")
 
 
 def _state(text: str, severity: Severity = "missing") -> Finding:

@@ -23,6 +23,8 @@ class Limits:
     across_px: int = 5  # distance from a jump at which the flow is compared
     long: float = 0.12  # least extent of a jump over the width of the picture: more than the rim of a contact
     lost: float = 0.02  # least share of the tissue that an occluder covers
+    alike: float = 14.0  # grey levels, change of colour under which what is lost may be tissue that moved far
+    far_px: float = 10.0  # motion from which flow may lose tissue in view
     near_px: int = 8  # margin around masks that is not searched
     rounds: int = 8  # iterations of the robust fit of the surface
     wide: float = 0.15  # least width of a hand over that of the picture; instruments: 0.1
@@ -45,19 +47,18 @@ class ForegroundSearch:
         self._masked = ~tissue  # in any frame
         self._width_px = 0.0  # of the widest tool at rest
         self._hidden = np.zeros_like(tissue)  # in the rest frame
+        self._rest_rgb = np.zeros((0, 0, 3), np.uint8)
         # Where the tissue is not stated, what is in front of it from the start may be its surroundings.
         self._surroundings = np.zeros_like(tissue)
 
     def add(self, frame: FrameMotion, depth_mm: Map | None = None) -> None:
         """Searches a frame; `depth_mm`: (h, w) along the optical axis, NaN: unknown; None: monocular."""
         if frame.is_rest:
-            self._hidden = frame.hidden
-        masked = ~self._tissue | frame.hidden | self._hidden
-        self._masked |= masked
+            self._hidden, self._rest_rgb = frame.hidden, frame.rgb
         if not self._has_masks:
             self._find_wide(frame.instruments, frame)
-        free = cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0
         if depth_mm is not None:
+            free = self._find_free(frame.hidden)
             self._surface = self._surface or fit_surface(depth_mm, free)
             surface, deviation = self._surface
             with np.errstate(invalid="ignore"):
@@ -68,9 +69,14 @@ class ForegroundSearch:
             self._note("stands in front of the tissue", high, frame, Limits.front)
         if frame.is_rest or not frame.trusted:
             return
+        # Flow and confidence are at the rest frame's pixels, masks at the picture's: tissue that has moved
+        # under a mask is hidden where it was at rest.
+        free = self._find_free(_at_rest(frame.hidden, frame.flow))
         lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
         # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
         lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0
+        if self._is_far(lost, frame):
+            lost = np.zeros_like(lost)
         self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)
         motion = float(np.percentile(np.linalg.norm(frame.flow[self._tissue], axis=-1), 98))
         if motion > Limits.least_px and self._has_masks:  # else it would be that of an instrument
@@ -78,6 +84,12 @@ class ForegroundSearch:
             jump = flow_jump(frame.flow) > max(Limits.step_px, Limits.step * motion)
             edge = jump & inner & (frame.confidence > LOW_CONFIDENCE)
             self._note("moves unlike tissue", edge, frame, 0.0, Limits.long)
+
+    def _find_free(self, hidden: Mask) -> Mask:
+        """Tissue (h, w) away from what is `hidden` (h, w) or was so in the rest frame."""
+        masked = ~self._tissue | hidden | self._hidden
+        self._masked |= masked
+        return np.asarray(cv2.erode((~masked).astype(np.uint8), _square(Limits.near_px), borderValue=1) > 0)
 
     @property
     def findings(self) -> list[Finding]:
@@ -89,6 +101,18 @@ class ForegroundSearch:
             if len(unmasked) > 1:
                 found.append(Finding("warning", "foreground", max(unmasked)[1]))
         return found
+
+    def _is_far(self, lost: Mask, frame: FrameMotion) -> bool:
+        """Whether what is lost (h, w) may be tissue that moved too far for flow: its colours are the rest
+        frame's, and around it tissue moves far."""
+        rest, around = self._rest_rgb, cv2.dilate(lost.astype(np.uint8), _square(Limits.near_px)) > 0
+        if not lost.any() or frame.rgb.shape != rest.shape or not rest.size:
+            return False
+        if not float(np.percentile(np.linalg.norm(frame.flow[around], axis=-1), 90)) > Limits.far_px:
+            return False
+        side = (2 * Limits.near_px + 1,) * 2
+        now, before = (cv2.blur(picture, side)[lost].astype(np.float32) for picture in (frame.rgb, rest))
+        return float(np.percentile(np.abs(now - before).mean(axis=1), 90)) < Limits.alike
 
     def _find_wide(self, tool: Mask, frame: FrameMotion) -> None:
         """Notes a detected tool that is wider than tools are and than those at rest."""
@@ -157,6 +181,13 @@ def flow_jump(flow: Map) -> Map:
         slopes = np.linalg.norm(c - a, axis=-1) + np.linalg.norm(b - d, axis=-1)
         most = np.maximum(most, np.linalg.norm(a - b, axis=-1) - slopes * 2 / 3)
     return most
+
+
+def _at_rest(mask: Mask, flow: Map) -> Mask:
+    """A picture's mask (h, w) at the rest frame's pixels, by the flow (h, w, 2) px from there."""
+    x = flow[..., 0] + np.arange(mask.shape[1], dtype=np.float32)
+    y = flow[..., 1] + np.arange(mask.shape[0], dtype=np.float32)[:, None]
+    return np.asarray(cv2.remap(mask.astype(np.uint8) * 255, x, y, cv2.INTER_LINEAR) > 0)
 
 
 def _width(mask: Mask) -> Map:

@@ -30,7 +30,7 @@ from synth.flow.recording.decode import Footage, RecordingFlowSettings
 from synth.flow.recording.detrend import Detrend
 from synth.flow.recording.find_pulse import PulseEstimate, PulseSearch
 from synth.flow.recording.find_tissue import TissueSearch, choose_frames
-from synth.flow.recording.finding import first_fault
+from synth.flow.recording.finding import Finding, first_fault
 from synth.flow.recording.flow import LocalFlow
 from synth.flow.recording.frame_motion import FrameMotion, Size
 from synth.flow.recording.harmonic_fit import Span
@@ -181,20 +181,32 @@ def _keep(video: VideoPass, watch_frames: Callable[[VideoPass], FrameWatcher] | 
 
 
 def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
-    """The footage with the tissue that is found in a few of its frames, by flow in this process."""
+    """The footage with the tissue that is found in a few of its frames."""
+    found = find_tissue(footage, settings, watch)
+    if found is None:
+        return footage
+    mask, finding = found
+
+    def tissue(size: Size) -> Mask:
+        whole = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+        return np.asarray(whole > 0)
+
+    return replace(footage, tissue=tissue, findings=(finding,))
+
+
+def find_tissue(
+    footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch | None = None
+) -> tuple[Mask, Finding] | None:
+    """The tissue in the rest frame (h, w), downsampled, and how sure it is, by flow in this process of a few
+    frames; None if there is nothing to track. UserError: unreadable video."""
+    watch = watch or Stopwatch()
     with watch.stage("decode"):
         few = replace(footage, only=choose_frames(footage), depth=None)
     video = VideoPass(few, replace(settings, shrink=0, rate_hz=None, pulse=False), watch=watch)
     if video.rest.fault:
-        return footage
+        return None
     search = TissueSearch(video.rest)
     for frame in video.frames():
         search.add(frame)
     with watch.stage("mask"):
-        found, finding = search.find()
-
-    def tissue(size: Size) -> Mask:
-        whole = cv2.resize(found.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
-        return np.asarray(whole > 0)
-
-    return replace(footage, tissue=tissue, findings=(finding,))
+        return search.find()

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from synth.arrays import Array, Floats, Map
+from synth.arrays import Array, Floats, Map, Mask
 from synth.geometry.triangles import Shape, grid_faces
 from synth.render.anatomy import noise
 from synth.render.anatomy.chart import places
@@ -76,6 +76,29 @@ class Dura:
     soaked: tuple[float, float] = 1.6, 1.1  # its blood by the level, and by chance from place to place
 
 
+class Flap:
+    """Flaps of dura that are turned over, unevenly, and show their inner face up to a crease [mm]."""
+
+    count: tuple[int, int] = (2, 5)
+    width: tuple[float, float] = 1.2, 4.2  # of the inner face in a flap's middle
+    beyond: float = 1.6  # by how much the dura ends beyond the crease, at most
+    long: tuple[float, float] = 0.35, 1.0  # rad, half of a flap's length
+    ragged: float = 0.12  # spread of the dura's end, as cut by hand
+    height: float = 0.16  # of the crease
+    albedo: Rgb = (0.85, 0.65, 0.57)  # of the inner face: smooth and pale
+    shadow: Rgb = (0.7, 1.0, 1.0)  # absorption beside the crease
+    held: float = 0.7  # share of the stitches whose thread is seen
+
+
+class Blood:
+    """Blood on the dura: pools with a level surface, smears wiped along the edge, drops."""
+
+    pool: tuple[float, float] = 2.6, 0.45  # optical depth, and how much of the noise is one
+    smear: float = 0.8  # optical depth
+    drops: float = 26.0  # mean number on a soaked rim
+    drop_mm: tuple[float, float] = 0.12, 0.55  # radius
+
+
 class Wound:
     """Gutter behind the dura, and the wall of galea and muscle beyond it [mm]."""
 
@@ -119,16 +142,26 @@ class Rim:
     extent_mm: float  # side of the square that uv spans
     edge: Floats  # (A,) mm: radius of the opening's edge at even angles
     stitches: Floats  # (n,) rad: angles of the outline's corners
-    threads: bool  # whether threads hold them
-    dura: Floats  # (A,) mm beyond the edge: end of the dura, start of the gutter
+    held: Mask  # (n,) whether a thread holds it
+    dura: Floats  # (A,) mm beyond the edge: end of the dura, start of the gutter, as painted
+    crease: Floats  # (A,) mm beyond the edge: end of the inner face of what is turned over
     wall: Floats  # (A,) mm beyond the edge: foot of the wound's wall
     bone: bool  # whether the wall is of bone, else of muscle
     skin: Floats  # (A,) mm beyond the edge: start of the skin
     cloth: Floats  # (A,) mm beyond the edge: start of the drapes; empty without drapes
 
 
-def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_per_px: float) -> Rim:
-    """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` resolve."""
+def build(
+    surface: CortexSurface,
+    radius_mm: float,
+    appearance: Appearance,
+    mm_per_px: float,
+    seen_mm: float = np.inf,
+) -> Rim:
+    """The rim around an opening of `radius_mm` in the surface, as fine as pixels of `mm_per_px` resolve.
+
+    `seen_mm`: distance from the middle beyond which nothing is seen, so that nothing is painted there.
+    """
     rng = np.random.default_rng([appearance.rim_seed, 0])
     around = int(np.clip(2 * np.pi * radius_mm / (_SEGMENT_PX * mm_per_px), 96, _AROUND))
     part = np.linspace(0, 1, round(_OUT * (around / _AROUND) ** 0.5))
@@ -162,9 +195,33 @@ def build(surface: CortexSurface, radius_mm: float, appearance: Appearance, mm_p
     vertices = np.concatenate([xy, z[..., None]], axis=-1).reshape(-1, 3)
     painted = edge[:, None] + np.concatenate([CutEdge.painted, away[0, len(CutEdge.painted) :]])[None]
     faces = grid_faces(around, away.shape[1], "rows").reshape(-1, 3)
-    uv = (_places(angle, painted).reshape(-1, 2) / extent + 0.5).astype(np.float32)
-    threads = appearance.family != "calf"  # the dura of a specimen is not sewn back
-    return Rim(Shape(vertices, faces), uv, extent, edge, stitches, threads, dura, wall, bone, skin, cloth)
+    half = min(extent / 2, seen_mm)  # a map continues beyond its border
+    uv = (_places(angle, painted).reshape(-1, 2) / (2 * half) + 0.5).astype(np.float32)
+    rng = np.random.default_rng([appearance.rim_seed, 7])
+    crease, end = _flaps(rng, angle, dura)
+    held = rng.random(len(stitches)) < Flap.held
+    held &= appearance.family != "calf"  # the dura of a specimen is not sewn back
+    return Rim(
+        Shape(vertices, faces), uv, 2 * half, edge, stitches, held, end, crease, wall, bone, skin, cloth
+    )
+
+
+def _flaps(rng: np.random.Generator, angle: Floats, dura: Floats) -> tuple[Floats, Floats]:
+    """Ends (A,), (A,) mm beyond the edge, of the inner face and of the dura, whose cut is uneven."""
+    crease = _uneven(rng, angle, 0.5, 0.25)
+    for middle in rng.uniform(0, 2 * np.pi, rng.integers(*Flap.count)):
+        long, wide = rng.uniform(*Flap.long), rng.uniform(*Flap.width)
+        aside = _aside(angle, middle + rng.uniform(-0.3, 0.3) * np.cos(angle - middle))
+        crease = np.maximum(crease, wide * np.clip(1.3 * (1 - (aside / long) ** 2), 0, 1) ** 0.7)
+    pulled = over(np.full_like(dura, float(dura.mean())), dura, _uneven(rng, angle, 0.5, 0.35))
+    ragged = sum(
+        rng.normal(0, Flap.ragged / (order / 14) ** 0.8) * np.cos(order * angle + rng.uniform(0, 2 * np.pi))
+        for order in range(9, 60)
+    )
+    end = np.maximum(
+        pulled, crease + rng.uniform(0.3, 1) * Flap.beyond * np.abs(_uneven(rng, angle, 0.5, 0.5))
+    )
+    return crease, np.maximum(end + 0.5 * ragged, crease + 0.15)
 
 
 def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
@@ -180,9 +237,25 @@ def paint(rim: Rim, appearance: Appearance, pixels: int) -> Coat:
     x, y = np.broadcast_to(axis, (pixels, pixels)), np.broadcast_to(axis[:, None], (pixels, pixels))
     maps = [x, y, drawn(9.0, 2.4), drawn(2.5, 2.2), drawn(0.6, 1.4)]
     streaks = noise.fractal(rng, 512, 512.0, 24.0, 1.2)
+    maps += [drawn(6.0, 3.4), _drops(rng, appearance.blood, rim, pixels)]
     colour, bumps, thin = noise.in_rows(partial(_paint_rows, rim, appearance, streaks), *maps)
     dry = cv2.resize(thin, (256, 256), interpolation=cv2.INTER_AREA)
     return Coat(colour, normals(noise.blur(bumps, 0.15, extent), extent), dry)
+
+
+def _drops(rng: np.random.Generator, blood: float, rim: Rim, pixels: int) -> Map:
+    """Share (n, n) of drops of blood around the opening, round or drawn out."""
+    drops, scale = np.zeros((pixels, pixels), np.float32), pixels / rim.extent_mm
+    for _ in range(int(rng.poisson(Blood.drops * blood))):
+        angle, long = rng.uniform(0, 2 * np.pi), rng.uniform(1, 2.2)
+        radius = Blood.drop_mm[0] * (Blood.drop_mm[1] / Blood.drop_mm[0]) ** rng.random()
+        away = float(_round(rim.edge, np.float32(angle))) + rng.uniform(0.3, 7.0)
+        middle = (away * np.array([np.cos(angle), np.sin(angle)]) / rim.extent_mm + 0.5) * pixels
+        turn = float(rng.uniform(0, 360))
+        axes = (2 * radius * scale * long, 2 * radius * scale / long)
+        if min(axes) > 1:
+            cv2.ellipse(drops, (middle.tolist(), axes, turn), 1.0, -1, cv2.LINE_AA)
+    return noise.blur(drops, 0.07, rim.extent_mm)
 
 
 def shade(rim: Rim, surface: CortexSurface) -> Map:
@@ -241,7 +314,7 @@ def _uneven(rng: np.random.Generator, angle: Floats, mean: float, spread: float)
 
 def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> tuple[Map, Map, Map]:
     """Albedo (r, n, 3), bumps mm and dry share (r, n) of some rows of the maps; see `paint` for `maps`."""
-    x, y, wide, mottle, grain = maps
+    x, y, wide, mottle, grain, spilt, drops = maps
     angle, mean = np.arctan2(y, x), float(rim.edge.mean())
     away = (np.hypot(x, y) - _round(rim.edge, angle)).astype(np.float32)
     reach, past = _round(rim.dura, angle), away - _round(rim.wall, angle)
@@ -251,10 +324,23 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     stitch = np.searchsorted(0.5 * (rim.stitches[1:] + rim.stitches[:-1]), angle % (2 * np.pi))
     aside = _aside(angle, rim.stitches.astype(np.float32)[stitch])
     folds = _folds(np.abs(aside) * (mean + away), away, mottle) * (1 - outer)
-    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer)
+    crease = away - _round(rim.crease, angle) - 0.12 * mottle
+    inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
+    turned = np.clip(_round(rim.crease, angle) - 0.5, 0, 1)
+    soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * inner)
+    depth, level = Blood.pool
+    full = spilt + 0.06 * mottle + level * (3 * appearance.blood - 3.1) - 0.8 * inner
+    pool = step(4 * full - 0.3) * min(1, 6 * appearance.blood)
+    depth = depth * np.clip(0.35 + 1.2 * full, 0.25, 1)
+    wiped = np.clip(0.55 * fibres + 0.5 * wide - 0.6 + 0.8 * (appearance.blood - 0.5), 0, 1) * Blood.smear
+    bloody = (
+        soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)
+    )
     dura = speckled(appearance.dura_albedo, 0.05 * fibres, 0.06 * mottle, 0.02 * grain)
+    dura = over(dura, speckled(Flap.albedo, 0.03 * mottle, 0.03 * fibres), 0.75 * inner[..., None])
     section = np.clip(0.6 + 0.3 * wide + 0.2 * mottle, 0, 0.85) * ridge(away, width=CutEdge.width)
-    dura = through(dura, soaked * (1 - 0.7 * section), Wound.blood)
+    dura = through(dura, bloody * (1 - 0.7 * section), Wound.blood)
+    dura = through(dura, turned * step(crease / 0.1) * np.exp(-np.abs(crease) / 0.35), Flap.shadow)
     colour = over(dura, np.asarray(CutEdge.albedo, np.float32), section[..., None])
     beyond = speckled(appearance.surroundings_albedo, 0.2 * wide, 0.05 * mottle, 0.08 * fibres)
     if rim.bone:
@@ -268,13 +354,20 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     colour = through(
         colour, gutter + 0.5 * ridge(away - reach, width=0.4) - 1.5 * np.minimum(folds, 0), Wound.shadow
     )
-    bumps = folds + 0.025 * mottle + 0.006 * grain
-    dry = np.clip(0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin, 0.05, 1)
+    wet = np.maximum(pool, drops) * (1 - skin)
+    bumps = (folds + 0.025 * mottle + 0.006 * grain) * (1 - 0.75 * wet) + 0.06 * wet
+    bumps = bumps + Flap.height * turned * (
+        step(-crease / 0.5) * (1 - outer) + 0.5 * ridge(crease, width=0.4)
+    )
+    dry = np.clip(
+        0.6 + 0.3 * wide - 0.7 * soaked - 0.4 * gutter + 0.6 * skin - 0.9 * wet - 0.3 * inner, 0.02, 1
+    )
     if len(rim.cloth):
         cloth = away - _round(rim.cloth, angle)
         colour, bumps, dry = _draped(appearance, cloth, mottle, grain, colour, bumps, dry)
-    if rim.threads:
-        colour, bumps = _threaded(aside * (mean + away), away, colour, bumps)
+    if rim.held.any():
+        across = np.where(rim.held[stitch], aside * (mean + away), 99.0).astype(np.float32)
+        colour, bumps = _threaded(across, away, colour, bumps)
     colour = np.clip(colour, 0.006, 0.92).astype(np.float32)
     return colour, np.asarray(bumps, np.float32), np.asarray(dry, np.float32)
 

@@ -15,7 +15,6 @@ from scipy.ndimage import distance_transform_edt
 from synth.arrays import Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, grid_faces
-from synth.job import schema
 from synth.render.anatomy import noise, tube, vessels
 from synth.render.anatomy.chart import Chart, places, unroll
 from synth.render.anatomy.tree import Tree
@@ -56,16 +55,22 @@ class CortexSurface:
 
 
 def grow(
-    relief: Relief, anatomy: schema.AnatomySection, brain: Shape | None = None, veined: bool = True
+    relief: Relief,
+    opening_mm: float = 12.0,
+    *,
+    vertices: int = 40_000,
+    dome_mm: float = 70.0,
+    brain: Shape | None = None,
+    veined: bool = True,
 ) -> CortexSurface:
-    """A cortex under the opening, with veins that stand out of it.
+    """A cortex of some `vertices` under an opening of a radius, with veins that stand out of it.
 
-    `brain`: a user's, with folds of its own, z outwards, origin at the craniotomy's centre; any winding,
-    holes and duplicates allowed; None: random gyri on a dome. `veined`: whether veins
-    stand out. UserError: no surface under the opening.
+    `dome_mm`: radius of curvature without a brain; `brain`: a user's, with folds of its own, z outwards,
+    origin at the craniotomy's centre; any winding, holes and duplicates allowed; None: random gyri on a
+    dome. `veined`: whether veins stand out. UserError: no surface under the opening.
     """
-    extent = 2 * (anatomy.craniotomy.radius_mm + MARGIN_MM)
-    side = max(20, round(anatomy.vertices**0.5))
+    extent = 2 * (opening_mm + MARGIN_MM)
+    side = max(20, round(vertices**0.5))
     axis = np.linspace(-extent / 2, extent / 2, side)
     x, y = np.meshgrid(axis, axis)
     xy = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -80,11 +85,11 @@ def grow(
     def height(at: Floats) -> Floats:
         if brain is not None:
             return noise.sample(outer, at, extent).astype(np.float64)
-        dome = np.sqrt(np.maximum(anatomy.dome_mm**2 - (at**2).sum(axis=1), 0)) - anatomy.dome_mm
+        dome = np.sqrt(np.maximum(dome_mm**2 - (at**2).sum(axis=1), 0)) - dome_mm
         return np.asarray(dome - relief.sulcus_mm * noise.sample(sulci, at, extent))
 
     pia = height(xy)
-    chart = unroll(height, extent, anatomy.craniotomy.radius_mm + MARGIN_MM / 2)
+    chart = unroll(height, extent, opening_mm + MARGIN_MM / 2)
     tree = vessels.Vessels(*(replace(one, nodes=chart.at(one.nodes)) for one in vars(tree).values()))
     laid = chart.at(xy)
     z = pia + veined * noise.sample(bulge(tree, chart.extent_mm), laid, chart.extent_mm)
@@ -106,7 +111,7 @@ def bulge(grown: Vessels, extent_mm: float) -> Map:
     arteries cross them."""
     distance, radius = tube.raster(grown.veins, _RELIEF_PX, extent_mm, 0.1)
     inside = np.sqrt(np.maximum(radius**2 - distance**2, 0)) * 0.75
-    distance, radius = tube.raster(grown.arteries, _RELIEF_PX, extent_mm, 0.1)
+    distance, radius = tube.raster(grown.trunks, _RELIEF_PX, extent_mm, 0.1)
     pressed = _DIP * np.clip(radius / 0.25, 0, 1) * (distance < radius + 0.1)
     return noise.blur((inside * (1 - pressed)).astype(np.float32), 0.2, extent_mm)
 
@@ -183,17 +188,7 @@ def _height_map(surface: Shape, extent: float, pixels: int) -> Map:
     return height
 
 
-def shrunk(
-    section: schema.AnatomySection, relief: Relief, scale: float
-) -> tuple[schema.AnatomySection, Relief]:
-    """Section and relief of a procedural surface that `resized` by a scale takes to the wanted one."""
-    opening = {"radius_mm": section.craniotomy.radius_mm / scale}
-    small = {"craniotomy": section.craniotomy.model_copy(update=opening), "dome_mm": section.dome_mm / scale}
-    lower = replace(relief, gyrus_mm=relief.gyrus_mm / scale, sulcus_mm=relief.sulcus_mm / scale)
-    return section.model_copy(update=small), lower
-
-
-def resized(surface: CortexSurface, factor: float) -> CortexSurface:
+def resize(surface: CortexSurface, factor: float) -> CortexSurface:
     """A surface of another size; chart and vessels, which it is painted by, stay as they were grown."""
     if factor == 1:
         return surface

@@ -15,8 +15,10 @@ import numpy as np
 
 from synth.arrays import Map
 from synth.errors import UserError
+from synth.geometry import triangles
 from synth.render.anatomy import noise, tube
-from synth.render.anatomy.layers import Rgb, over, ridge, through
+from synth.render.anatomy.chart import places
+from synth.render.anatomy.layers import Rgb, over, ridge, step, through
 from synth.render.anatomy.surface import CortexSurface
 from synth.render.appearance.family import Appearance
 from synth.render.materials import Coat
@@ -26,6 +28,8 @@ Tubes = dict[str, tuple[Map, Map]]
 Random = np.random.Generator
 
 _TEXELS_A_PIXEL = 2.2
+_TILE = 512  # side of the map of the finest relief, which repeats
+_SLOPES = 512  # side of the map of the mesh's slopes
 _NARROW = 2  # exponent on the sulci's depth map, so that only clefts are dark and wet, not the slopes above
 
 
@@ -49,12 +53,16 @@ class Sulcus:
 
 
 class Bleeding:
-    """Blood under the arachnoid, ragged and thin at its edges; pairs are ranges."""
+    """Blood on the pia: thin films drawn out over it, and drops; pairs are ranges."""
 
-    count: float = 1.2  # mean on a patch whose rim is soaked with blood
-    radius: tuple[float, float] = 0.3, 1.2
-    depth: tuple[float, float] = 0.5, 1.3  # optical
-    blood: Rgb = (0.2, 1.9, 2.5)  # absorption
+    films: float = 2.2  # mean number on a patch whose rim is soaked with blood
+    drops: float = 5.0
+    radius: tuple[float, float] = 0.5, 1.8
+    drop_mm: tuple[float, float] = 0.08, 0.3
+    long: tuple[float, float] = 1.0, 2.6  # a film's length over its width
+    depth: tuple[float, float] = 0.15, 0.6  # optical, of a film
+    drop_depth: float = 1.4
+    blood: Rgb = (0.12, 1.5, 2.4)  # absorption
 
 
 class Artery:
@@ -73,14 +81,25 @@ class Vein:
     wide: tuple[float, float] = 0.12, 0.3  # radius at which a vein begins to be thick, span to fully thick
     margin: float = 0.8  # blur
     margin_dark: Rgb = (0.45, 1.0, 0.75)  # absorption
+    rim: tuple[float, float] = 0.82, 0.24  # of a thick one's radius: middle and width of its dark rims
+    rim_dark: Rgb = (0.7, 1.1, 0.8)  # absorption
+    sunk: float = 0.3  # height of a tube's middle below the pia, as a share of its radius
+    shoulder: float = 0.14  # blur of its relief
+    level: float = 0.65  # share of the pia's slope that a crest lacks: so it mirrors a lamp all along
+    dry: tuple[float, float] = 0.75, 0.2  # share of a thick one's crest under a thin film: mean, and spread
 
 
 class Film:
-    """Fluid over everything: it climbs along vessels, smooths finer relief, and undulates a little."""
+    """Fluid over everything: it climbs along vessels and at the rim, smooths finer relief, and undulates a
+    little; in pools it lies level."""
 
     climb: float = 0.16  # of a vessel's radius
     climb_mm: float = 0.16  # distance over which that falls off
     swell_mm: float = 0.004  # standard deviation of the undulation
+    rough: float = 0.17  # standard deviation of slopes where the film is thin
+    level: float = 0.9  # share of the pia's slope that a pool takes away
+    pool_mm: float = 0.35  # least size of a pool
+    rim_mm: float = 0.3  # height that it climbs at the rim
 
 
 def resolution(extent_mm: float, mm_per_px: float) -> int:
@@ -98,21 +117,26 @@ def cortex(
     """
     extent = surface.chart.extent_mm
     rng = np.random.default_rng([surface.seed, 2])
-    tubes = {name: tube.raster(one, pixels, extent) for name, one in vars(surface.vessels).items()}
+    grown = surface.vessels
+    drawn = {"veins": grown.visible_veins, "arteries": grown.arteries, "deep": grown.deep}
+    tubes = {name: tube.raster(tree, pixels, extent) for name, tree in drawn.items()}
     sulci = cv2.resize(surface.sulci**_NARROW, (pixels, pixels), interpolation=cv2.INTER_LINEAR)
     albedo = _photograph(photo, pixels) if photo else _painted(rng, appearance, tubes, sulci, extent)
     if shade is not None:
         red_least = np.array([0.7, 1.0, 1.0], np.float32)
         albedo = albedo * cv2.resize(shade, (pixels, pixels))[..., None] ** red_least
-    height, dry = _film(rng, appearance, tubes, sulci, extent)
-    return Coat(albedo, normals(height, extent), dry)
+    height, dry, level = _film(rng, appearance, tubes, sulci, shade, extent)
+    return Coat(albedo, normals(height, extent, _excess(surface, level)), dry)
 
 
-def normals(height: Map, extent_mm: float) -> Map:
-    """Unit normals (n, n, 3) of a height map (n, n) mm."""
+def normals(height: Map, extent_mm: float, less: Map | None = None) -> Map:
+    """Unit normals (n, n, 3) of a height map (n, n) mm, less slopes (m, m, 2) that are interpolated."""
     pixel = extent_mm / height.shape[0]
     dx = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * pixel))
     dy = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * pixel))
+    if less is not None:
+        wide = cv2.resize(less, height.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        dx, dy = dx - wide[..., 0], dy - wide[..., 1]
     up = 1 / np.sqrt(1 + dx * dx + dy * dy)
     return np.asarray(cv2.merge([-dx * up, -dy * up, up]), np.float32)
 
@@ -191,16 +215,23 @@ def _strands(rng: Random, sulci: Map, extent: float) -> Map:
 
 
 def _bleedings(rng: Random, blood: float, pixels: int, extent: float) -> Map:
-    """Optical depth (n, n) of a few small bleedings."""
-    small = 256
+    """Optical depth (n, n) of a few films and drops of blood; films are thickest at their borders."""
+    small = 384
     axis = noise.centres(small, extent)
-    ragged = noise.fractal(rng, small, extent, 2.5, 1.7)
+    ragged = noise.fractal(rng, small, extent, 5.0, 3.0)
     total = np.zeros((small, small), np.float32)
-    for _ in range(int(rng.poisson(Bleeding.count * blood))):
-        x, y = rng.uniform(-0.4, 0.4, 2) * extent
-        radius, depth = rng.uniform(*Bleeding.radius), rng.uniform(*Bleeding.depth)
-        away = np.hypot(axis[None] - x, axis[:, None] - y) / radius
-        total += depth * np.clip(2.5 * (1 - away + 0.35 * ragged), 0, 1).astype(np.float32)
+    numbers = rng.poisson([Bleeding.films * blood, Bleeding.drops * blood])
+    for drop, radii in zip([False] * numbers[0] + [True] * numbers[1], rng.random(sum(numbers)), strict=True):
+        (x, y), turn = rng.uniform(-0.4, 0.4, 2) * extent, rng.uniform(0, np.pi)
+        least, most = Bleeding.drop_mm if drop else Bleeding.radius
+        radius = least * (most / least) ** radii
+        long = 1.0 if drop else rng.uniform(*Bleeding.long) ** 0.5
+        u, v = axis[None] - x, axis[:, None] - y
+        along, aside = np.cos(turn) * u + np.sin(turn) * v, np.cos(turn) * v - np.sin(turn) * u
+        inside = 1 - np.hypot(along / long, aside * long) / radius + (0.1 if drop else 0.45) * ragged
+        depth = Bleeding.drop_depth if drop else rng.uniform(*Bleeding.depth)
+        film = step(inside / 0.25 - 0.3) * (1 + (0 if drop else 0.5) * ridge(inside, width=0.15, at=0.22))
+        total += (depth * film).astype(np.float32)
     return np.asarray(cv2.resize(total, (pixels, pixels), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
@@ -212,7 +243,7 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
     start, span = Vein.wide
     thick = np.clip((radius - start) / span, 0, 1)
     along = cv2.resize(noise.band(rng, 96, extent, 9.0, 0.6), size)
-    cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.05, extent)
+    cover = noise.blur(np.clip((1 - across**2) * (2.2 - thick), 0, 1).astype(np.float32), 0.09, extent)
     margin = noise.blur(((across < 1) * thick).astype(np.float32), Vein.margin, extent)
     return [across, thick, along, cover, margin]
 
@@ -220,12 +251,14 @@ def _vein_maps(rng: Random, tube: tuple[Map, Map], extent: float) -> list[Map]:
 def _veined(appearance: Appearance, albedo: Map, *maps: Map) -> Map:
     """Albedo (r, n, 3) of some rows with their veins, by the maps of `_vein_maps`."""
     across, thick, along, cover, margin = maps
-    crest = (np.clip(0.55 + 0.4 * along, 0.08, 1) * thick * ridge(across, width=0.7))[..., None]
+    crest = (np.clip(0.6 + 0.3 * along, 0.1, 1) * thick * ridge(across, width=0.62))[..., None]
     thin = np.array(Vein.thin, np.float32) + 0.06 * along[..., None]
     side = over(thin, np.asarray(appearance.vein_side_albedo, np.float32), thick[..., None])
     wall = over(side, np.asarray(appearance.vein_crest_albedo, np.float32), crest)
+    middle, width = Vein.rim
+    wall = through(wall, thick * ridge(across, width=width, at=middle), Vein.rim_dark)
     # Some stretches lie deeper, under the arachnoid.
-    cover = (cover * np.clip(0.9 + 0.15 * along, 0.5, 0.97))[..., None]
+    cover = (cover * np.clip(0.95 + 0.25 * np.minimum(along + 0.6, 0), 0.55, 0.97))[..., None]
     return np.asarray(over(through(albedo, 1.7 * margin, Vein.margin_dark), wall, cover), np.float32)
 
 
@@ -244,26 +277,62 @@ def _with_arteries(appearance: Appearance, albedo: Map, wide: Map, distance: Map
     return np.asarray(red + (0.55 * thick)[..., None] * (wall - red), np.float32)
 
 
-def _film(rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, extent: float) -> tuple[Map, Map]:
-    """Height of the wet surface above the mesh [mm], and the share of it under too thin a film, 0 to 1."""
+def _film(
+    rng: Random, appearance: Appearance, tubes: Tubes, sulci: Map, shade: Map | None, extent: float
+) -> tuple[Map, Map, Map]:
+    """Height of the wet surface above the pia [mm], the share of it under too thin a film, and the share of
+    the pia's slope that it lacks."""
     coarse = 256
+    distance, radius = tubes["veins"]
+    raised = np.sqrt(np.maximum(radius**2 - distance**2, 0)) - Vein.sunk * radius
+    veins = noise.blur(np.maximum(raised, 0).astype(np.float32), Vein.shoulder, extent)
     relief = 0.14 * thickness(tubes["arteries"]) + _meniscus(tubes["arteries"]) + _meniscus(tubes["veins"])
     relief = noise.blur(relief, appearance.fluid_smoothing_mm, extent)
-    pools = noise.fractal(rng, coarse, extent, 5.0, 1.5)
+    uneven = noise.fractal(rng, coarse, extent, 5.0, 1.5)
     # Fluid lies in pools, in sulci and along vessels; elsewhere the film mirrors next to nothing.
     blood = thickness(tubes["arteries"]) + thickness(tubes["veins"])
     around = noise.blur(cv2.resize(blood, (coarse, coarse), interpolation=cv2.INTER_AREA), 0.25, extent)
-    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 3.2 * np.minimum(around, 0.25)
+    wet = 0.9 * cv2.resize(sulci, (coarse, coarse)) + 2.4 * np.minimum(around, 0.25)
     wet = wet + 1.6 * appearance.light.glare
-    dry = np.clip(3.8 + 1.5 * pools - 3 * wet, 0.05, 1.0)
-    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm
+    if shade is not None:
+        edge = cv2.resize(1 - shade, (coarse, coarse), interpolation=cv2.INTER_AREA)
+        wet = wet + 2.0 * edge
+        relief = (
+            relief + Film.rim_mm * cv2.resize(1 - shade, sulci.shape, interpolation=cv2.INTER_LINEAR) ** 2
+        )
+    thin = 3.8 + 1.5 * uneven - 3 * wet
+    dry = np.clip(thin, 0.05, 1.0)
+    pools = np.clip(1.6 * noise.blur((0.9 - thin).astype(np.float32), Film.pool_mm, extent), 0, 1)
+    dry = np.minimum(dry, 1 - pools)
+    swell = noise.band(rng, coarse, extent, 2.2, 0.5) * Film.swell_mm * (1 - 0.9 * pools)
     swell = cv2.resize(swell, sulci.shape, interpolation=cv2.INTER_CUBIC)
-    # A vein's wall is smooth: its crest mirrors the lamp in one line.
-    distance, radius = tubes["veins"]
+    relief = relief * (1 - 0.97 * cv2.resize(pools, sulci.shape, interpolation=cv2.INTER_LINEAR)) + veins
+    # A vein's wall is smooth, and its film thin: its crest mirrors the lamp in one broad line.
     on_vein = noise.blur((distance < radius).astype(np.float32), 0.1, extent)
     height = relief + appearance.bump * (1 - 0.9 * on_vein) * swell
-    bare = dry * (1 - cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA))
-    return np.asarray(height, np.float32), np.asarray(np.clip(bare, 0, 1), np.float32)
+    rough = cv2.resize(dry.astype(np.float32), sulci.shape, interpolation=cv2.INTER_LINEAR) * (1 - on_vein)
+    tile = rng.standard_normal((_TILE, _TILE), np.float32)
+    fine = np.tile(tile, (len(sulci) // _TILE + 1,) * 2)[: len(sulci), : len(sulci)]
+    height = height + (Film.rough * extent / len(sulci)) * rough * fine
+    bare = cv2.resize(on_vein, (coarse, coarse), interpolation=cv2.INTER_AREA)
+    mean, spread = Vein.dry
+    dry = over(dry, np.clip(mean + spread * noise.band(rng, coarse, extent, 3.0, 0.6), 0.1, 1), bare)
+    level = np.maximum(Film.level * pools, Vein.level * bare)
+    return np.asarray(height, np.float32), np.asarray(np.clip(dry, 0, 1), np.float32), level
+
+
+def _excess(surface: CortexSurface, level: Map) -> Map:
+    """Slopes (m, m, 2) of the mesh that the wet surface lacks: of veins, which are drawn finer than the mesh
+    resolves, and a share `level` (k, k) of the pia's."""
+    side = len(surface.pia)
+    pia = surface.vertices.copy()
+    pia[:, 2] = surface.pia.ravel()
+    bent = [triangles.normals(triangles.Shape(at, surface.faces)) for at in (surface.vertices, pia)]
+    whole, bare = (-normal[:, :2] / normal[:, 2:] for normal in bent)
+    lacking = noise.sample(level.astype(np.float32), surface.uv.astype(np.float64) - 0.5, 1.0)[:, None]
+    slopes = (whole - bare + lacking * bare).astype(np.float32).reshape(side, side, 2)
+    at = places(surface.chart, _SLOPES)
+    return noise.sample(slopes, at, surface.extent_mm * side / (side - 1)).reshape(_SLOPES, _SLOPES, 2)
 
 
 def _meniscus(tube: tuple[Map, Map]) -> Map:

@@ -71,7 +71,7 @@ def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floa
         found = dijkstra(graph, directed=False, indices=roots, return_predecessors=True, min_only=True)
         distance, before = found[0], found[1].astype(np.int64)
         order = np.argsort(distance, kind="stable")
-        through = _gathered(before, cubes)
+        through = gather(before, cubes)
         shared = cost / (1 + sharing * np.cbrt(through) / finest)
     used = order[through[order] > 0]
     number = np.full(count + 1, -1)
@@ -80,7 +80,7 @@ def least_cost(way: Lattice, cost: Floats, roots: Ints, ends: Ints, radius: Floa
     return Tree(way.points[used], parent, np.cbrt(through[used]))
 
 
-def _gathered(before: Ints, cubes: Floats) -> Floats:
+def gather(before: Ints, cubes: Floats) -> Floats:
     """Sums (N,) of the cubes at a point and at all that come after it; `before`: negative at a root."""
     total, point = cubes.copy(), np.flatnonzero(cubes)
     amount = cubes[point]

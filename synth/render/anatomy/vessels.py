@@ -1,6 +1,7 @@
 """Vessels of the pia: veins along the sulci, arteries from trunks that cross the patch down to arterioles.
 
-Densities and calibres were compared with an intra-operative photograph; the other
+Veins and trunks of arteries follow the sulci (`tree`); finer vessels fill what these leave empty
+(`colonisation`). Densities and calibres were compared with an intra-operative photograph; the other
 numbers were chosen by eye on it.
 """
 
@@ -12,8 +13,20 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from synth.arrays import Floats, Ints, Map
-from synth.render.anatomy import noise, tube
-from synth.render.anatomy.tree import Lattice, Tree, halved, joined, lattice, least_cost, relaxed, remaining
+from synth.render.anatomy import colonisation, noise, tube
+from synth.render.anatomy.colonisation import Growth
+from synth.render.anatomy.layers import over
+from synth.render.anatomy.tree import (
+    Lattice,
+    Tree,
+    gather,
+    halved,
+    joined,
+    lattice,
+    least_cost,
+    relaxed,
+    remaining,
+)
 
 _PATCH_MM = 34.0  # side of the patch that numbers of trunks are counted on
 _FINEST_MM = 0.2  # spacing of the points that vessels pass
@@ -55,11 +68,28 @@ DEEP = Kind(
 )  # fmt: skip
 
 
+TRIBUTARIES = Growth(spacing=3.4, reach=9.0, near=1.7, step=0.25, straight=0.8, end=(0.05, 0.1))
+ARTERIOLES = (
+    Growth(spacing=2.2, reach=6.0, near=0.9, step=0.16, straight=0.9, end=(0.05, 0.07)),
+    Growth(spacing=0.95, reach=2.6, near=0.45, step=0.12, straight=0.7, end=(0.036, 0.055)),
+    Growth(spacing=0.46, reach=1.3, near=0.24, step=0.09, straight=0.5, end=(0.024, 0.04)),
+)
+_TRUNK_MM = 0.07  # least radius of the arteries that arterioles grow from
+_BESIDE_MM = 0.35  # no artery ends nearer to a wide vein than this
+_WIDE_MM = 0.18  # radius of such a vein
+_RISE_MM = 3.0  # length over which a trunk that comes up inside gets into sight
+_THIN_MM = 6.0  # length over which trunks thin to where branches go on
+_TAPER_MM = 0.45  # length over which arterioles and tributaries thin
+_WINDING = 0.07, 1.1  # shift of fine vessels, and over what distance
+
+
 @dataclass(frozen=True)
 class Vessels:
     """All vessels of one anatomy."""
 
-    veins: Tree
+    veins: Tree  # that stand out of the mesh
+    trunks: Tree  # of arteries, that press into veins
+    visible_veins: Tree  # with smooth centre lines, and with tributaries
     arteries: Tree
     deep: Tree  # below the pia, visible through the tissue
 
@@ -72,8 +102,94 @@ def grow_all(sulci: Map, extent_mm: float, rng: np.random.Generator) -> Vessels:
     rich = np.clip(0.8 + 0.35 * noise.band(rng, 128, extent_mm, 9.0, 0.5), 0.15, 1.0)
     distance, width = tube.raster(veins, 128, extent_mm)
     rich *= (distance > width + 0.3) | (width < 0.3)
-    arteries = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
-    return Vessels(veins, arteries, _grown(DEEP, sulci, everywhere, extent_mm, rng))
+    trunks = _grown(ARTERIES, sulci, rich.astype(np.float32), extent_mm, rng)
+    deep = _grown(DEEP, sulci, everywhere, extent_mm, rng)
+    smooth = _smooth(_pruned(veins, 0.05), 1.0)
+    visible = colonisation.fill(smooth, _targets(TRIBUTARIES, everywhere, extent_mm, rng), TRIBUTARIES, rng)
+    visible = _finished(visible, len(smooth.nodes), extent_mm, rng)
+    distance, width = tube.raster(visible, 512, extent_mm, _BESIDE_MM)
+    beside = (width > _WIDE_MM) & (distance < width + _BESIDE_MM)
+    free = (~beside * np.clip(0.9 + 0.3 * noise.band(rng, 512, extent_mm, 8.0, 0.5), 0.35, 1)).astype(
+        np.float32
+    )
+    arteries = main = _slender(_smooth(_pruned(trunks, _TRUNK_MM), 0.8), extent_mm)
+    for growth in ARTERIOLES:
+        arteries = colonisation.fill(arteries, _targets(growth, free, extent_mm, rng), growth, rng)
+    arteries = _finished(arteries, len(main.nodes), extent_mm, rng)
+    return Vessels(veins, trunks, visible, arteries, _with_risers(deep, main, extent_mm))
+
+
+def _targets(growth: Growth, density: Map, extent_mm: float, rng: np.random.Generator) -> Floats:
+    """Points (N, 2) mm about a growth's spacing apart, of which a share `density` (m, m) stays."""
+    points = _jittered(growth.spacing, extent_mm, rng)
+    return points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
+
+
+def _pruned(tree: Tree, least_mm: float) -> Tree:
+    """The tree without twigs of a radius below `least_mm`."""
+    kept = gather(tree.parent, (tree.radius >= least_mm).astype(np.float64)) > 0
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+    return Tree(tree.nodes[kept], number[tree.parent[kept]], tree.radius[kept])
+
+
+def _smooth(tree: Tree, over_mm: float) -> Tree:
+    """The tree with centre lines and radii smoothed over a length; its ends stay."""
+    length = np.hypot(*(tree.nodes - tree.nodes[tree.parent])[tree.parent >= 0].T)
+    rounds = round(2 * (over_mm / max(float(np.mean(length)), 0.02)) ** 2)
+    spread = np.column_stack([tree.nodes, np.log(tree.radius)])
+    spread = relaxed(spread, tree.parent, tree.radius, 1e-3, rounds)
+    return Tree(spread[:, :2], tree.parent, np.exp(spread[:, 2]))
+
+
+def _slender(tree: Tree, extent_mm: float) -> Tree:
+    """The tree thinned towards its ends, where finer branches go on, and where it comes into sight inside."""
+    left = remaining(tree.nodes, tree.parent, np.zeros(len(tree.nodes)))
+    radius = tree.radius * np.clip(left / _THIN_MM, 0.25, 1) ** 0.5
+    if len(roots := _roots_inside(tree, extent_mm)):
+        radius = radius * np.clip(0.15 + cKDTree(roots).query(tree.nodes)[0] / _RISE_MM, 0, 1)
+    return Tree(tree.nodes, tree.parent, radius)
+
+
+def _roots_inside(tree: Tree, extent_mm: float) -> Floats:
+    """Roots (n, 2) mm that are not at the patch's border."""
+    return tree.nodes[(tree.parent < 0) & (np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)]
+
+
+def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:
+    """The vessels below the pia with those by which trunks come up inside the patch, behind their roots."""
+    nodes, parent, radius = [deep.nodes], [deep.parent], [deep.radius]
+    count, tree = len(deep.nodes), cKDTree(main.nodes)
+    steps = np.arange(0.0, 2 * _RISE_MM, 0.2)
+    for root in _roots_inside(main, extent_mm):
+        near = np.array(tree.query_ball_point(root, 2.0))
+        ahead = (main.nodes[near] - root).mean(axis=0)
+        size = float(np.linalg.norm(ahead))
+        if size < 0.2:  # it branches at once to all sides: it comes straight up
+            continue
+        nodes.append(root + (2.0 - steps[:, None]) * ahead / size)
+        parent.append(np.append(-1, count + np.arange(len(steps) - 1)))
+        radius.append(main.radius[near].max() * np.sqrt(1 - steps / (2 * _RISE_MM)))
+        count += len(steps)
+    return Tree(np.concatenate(nodes), np.concatenate(parent), np.concatenate(radius))
+
+
+def _finished(tree: Tree, main: int, extent_mm: float, rng: np.random.Generator) -> Tree:
+    """The tree whose nodes from number `main` on have grown in, made to wind, and thinned to their ends."""
+    nodes = relaxed(tree.nodes, tree.parent, tree.radius, 1e-3, 6)
+    shift, wave = _WINDING
+    winding = np.stack(
+        [noise.sample(noise.band(rng, 256, extent_mm, wave, 0.5), nodes, extent_mm) for _ in range(2)], 1
+    )
+    supple = shift / (1 + (tree.radius / 0.06) ** 2)
+    left = remaining(nodes, tree.parent, np.zeros(len(nodes)))
+    thinned = np.where(np.arange(len(nodes)) < main, 1, np.clip(left / _TAPER_MM, 0.3, 1) ** 0.5)
+    # Wide vessels vary over centimetres: shorter waves look like beads.
+    short, long = (
+        noise.sample(noise.band(rng, 256, extent_mm, w, 0.6), nodes, extent_mm) for w in (2.5, 11.0)
+    )
+    wide = np.clip(tree.radius / 0.3, 0, 1)
+    radius = tree.radius * thinned * np.clip(1 + 0.12 * over(short, long, wide), 0.75, 1.3)
+    return Tree(nodes + supple[:, None] * winding, tree.parent, radius)
 
 
 def _grown(kind: Kind, sulci: Map, density: Map, extent_mm: float, rng: np.random.Generator) -> Tree:
@@ -133,8 +249,13 @@ def _trunks(
 
 def _ends(kind: Kind, way: Lattice, density: Map, extent_mm: float, rng: np.random.Generator) -> Ints:
     """Points about `kind.spacing` apart: of a jittered grid, which neither clumps nor lines up, a share."""
-    side = max(1, int(extent_mm / kind.spacing))
-    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
-    points = ((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm
+    points = _jittered(kind.spacing, extent_mm, rng)
     points = points[rng.random(len(points)) < noise.sample(density, points, extent_mm)]
     return np.unique(cKDTree(way.points).query(points)[1])
+
+
+def _jittered(spacing: float, extent_mm: float, rng: np.random.Generator) -> Floats:
+    """A point (N, 2) mm somewhere in each cell of a grid: they neither clump nor line up."""
+    side = max(1, int(extent_mm / spacing))
+    cell = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    return np.asarray(((cell + rng.random(cell.shape)) / side - 0.5) * extent_mm)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from synth.job.schema import Family
 from synth.render.appearance.light import Lighting
 from synth.render.camera.camera_sensor import CameraSensor
 
@@ -34,7 +33,7 @@ class Appearance:
     blood: float  # on the rim, from none (0) to soaked (1)
     dura_albedo: Colour
     surroundings_albedo: Colour  # outside the dura: muscle, or the bone of a specimen
-    scenery: tuple[str, ...]  # shown parts of the job's `render.scenery`
+    scenery: tuple[str, ...]  # parts of `render.scenery` that are shown
     rim_seed: int
     light: Lighting
     sensor: CameraSensor
@@ -60,13 +59,13 @@ class Ranges:
     fluid_smoothing_mm: Ends = (0.035, 0.06)
     bump: Ends = (0.8, 1.3)
     roughness: Ends = (0.012, 0.02)
-    dry_roughness: Ends = (0.22, 0.34)
+    dry_roughness: Ends = (0.11, 0.16)
     blood: Ends = (0.25, 0.75)
     dura_albedo: Colour = (0.86, 0.6, 0.5)
     surroundings_albedo: Colour = (0.40, 0.10, 0.065)
 
 
-FAMILIES: dict[Family, Ranges] = {
+FAMILIES: dict[str, Ranges] = {
     "healthy": Ranges(),
     "hyperaemic": Ranges(
         gyrus_albedo=(0.88, 0.52, 0.35),

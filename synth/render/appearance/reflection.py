@@ -1,36 +1,28 @@
-"""Reflections on instruments: of the wound, a dark theatre, the microscope's windows.
+"""Surroundings that instruments mirror: the wound, drapes, a dark theatre. The lamps are the renderer's.
 
-They are evaluated at vertices, from surroundings blurred by the roughness there: a path tracer's reflection
-of small bright lamps is noise at few paths a pixel, and the theatre lights nothing else. The theatre's
-radiances (1: white that fills the sensor) were chosen by eye; no theatre was measured.
+They are evaluated at vertices, blurred by the roughness there, and shaded by the maps at every hit: paths to
+them would be noise at few a pixel, and they light nothing else. The theatre's radiances (1: white that fills
+the sensor) were chosen by eye; no theatre was measured.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from synth.arrays import Floats, Map
 from synth.geometry.triangles import Shape, normals
-from synth.render.materials import Lamp
 
-_DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.78, 0.80, 0.82])
+_DRAPE, _CEILING = np.array([0.02, 0.045, 0.055]), np.array([0.30, 0.31, 0.33])
 _FADE_MM = 22.0  # distance from the opening's middle at which drapes begin
 _BLURRED_MM = 0.0, 1.0, 2.0, 4.0, 8.0, 16.0  # standard deviations of the blurred wounds
 _SPREAD = 1.7  # standard deviation of a reflected direction [rad] by the GGX alpha, as of its median
-_SHADED = 0.45  # share of the wound's radiance: an instrument mirrors tissue in its own shadow
-
-
-class Reflectance(NamedTuple):
-    """What a surface reflects, at its vertices."""
-
-    diffuse: Floats  # (V, 3) albedo
-    mirror: Floats  # (V, 3) reflectance at right angles
-    alpha: Floats  # (V,) GGX roughness
+_SHADED = 0.75  # share of the wound's radiance: an instrument mirrors tissue in its own shadow,
+_GRAZING = 0.4  # rise of steel's reflectance at grazing angles, less what roughness takes
+_TWICE = 1.7  # where light arrives that tissue has scattered before: a power of its colour
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,6 @@ class Theatre:
 
     wound: Map  # (n, n, 3) linear colour of cortex and rim, from above
     extent_mm: float  # side of the square that it covers
-    lamps: tuple[Lamp, ...]  # of the microscope
     light: Floats  # (3,) colour and power of the light on wound and theatre; 1 is white that fills the sensor
     lens: Floats  # (3,) mm, towards which steel mirrors them
 
@@ -54,24 +45,20 @@ class Theatre:
         return np.stack(spread, axis=1)
 
 
-def glow(shape: Shape, surface: Reflectance, theatre: Theatre) -> Floats:
-    """Radiance (V, 3) that a shape mirrors towards the theatre's lens."""
+def glow(shape: Shape, alpha: Floats | Map, theatre: Theatre) -> Floats:
+    """Radiance (V, 3) of the theatre, but for lamps, that mirrors at a shape's vertices show its lens.
+
+    `alpha`: (V,) GGX roughness of the mirrors.
+    """
     normal = normals(shape)
     towards = theatre.lens - shape.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("nc,nc->n", normal, towards)[:, None]
-    mirrored = 2 * facing * normal - towards
-    # Schlick, 1994; at grazing angles roughness limits it (S. Lagarde, "Adopting a physically based shading
-    # model", 2011).
-    most = np.maximum(1 - surface.alpha[:, None], surface.mirror)
-    share = surface.mirror + (most - surface.mirror) * np.clip(1 - facing, 0, 1) ** 5
-    mirror = _surroundings(shape.vertices, mirrored, surface.alpha, theatre) * theatre.light
-    for lamp in theatre.lamps:
-        mirror += _window(shape.vertices, normal, towards, surface.alpha, lamp)
-    return np.asarray(share * mirror)
+    seen = _surroundings(shape.vertices, 2 * facing * normal - towards, alpha, theatre) * theatre.light
+    return np.asarray(seen * (1 + _GRAZING * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
 
 
-def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
+def _surroundings(place: Floats, direction: Floats, alpha: Floats | Map, theatre: Theatre) -> Floats:
     """Radiance (N, 3) that arrives at places (N, 3) mm from around directions (N, 3)."""
     up, spread = direction[:, 2:], _SPREAD * alpha
     below = 1 / (1 + np.exp(np.clip((up + 0.05) / np.hypot(0.09, alpha)[:, None], -40, 40)))
@@ -83,27 +70,7 @@ def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Thea
     wound = np.stack([map_coordinates(one, at, order=1, mode="nearest") for one in theatre.blurred], axis=-1)
     edge = (np.linalg.norm(met, axis=1) - _FADE_MM) / (3.0 + 0.6 * width)
     lit = 1 / (1 + np.exp(np.clip(edge, -40, 40)))[:, None]
-    ground = lit * _SHADED * wound + (1 - lit) * _DRAPE
+    ground = lit * _SHADED * wound**_TWICE + (1 - lit) * _DRAPE
     high = np.clip(up, 0, 1)
     above = (1 - high) * _DRAPE + high * _CEILING
     return np.asarray(below * ground + (1 - below) * above)
-
-
-def _window(place: Floats, normal: Floats, towards: Floats, alpha: Floats, lamp: Lamp) -> Floats:
-    """Reflection (N, 3) of a microscope's window, by a GGX lobe with Smith's correlated masking.
-
-    E. Heitz, "Understanding the masking-shadowing function in microfacet-based BRDFs", 2014.
-    """
-    way = lamp.position - place
-    away2 = np.einsum("nc,nc->n", way, way)
-    way /= np.sqrt(away2)[:, None]
-    half = way + towards
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    level, facing = (np.clip(np.einsum("nc,nc->n", normal, one), 1e-3, 1) for one in (way, towards))
-    in_line, square = np.clip(np.einsum("nc,nc->n", normal, half), 0, 1) ** 2, alpha**2
-    lobe = square / (np.pi * (in_line * (square - 1) + 1) ** 2)
-    masked = 0.5 / sum(
-        a * np.sqrt(b**2 * (1 - square) + square) for a, b in ((level, facing), (facing, level))
-    )
-    lit = np.einsum("nc,nc->n", normal, way) > 0
-    return np.asarray((lit * level * lobe * masked / away2)[:, None] * lamp.intensity)

@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from synth.arrays import Floats, Map
 from synth.errors import UserError
-from synth.job.schema import RenderSection
 from synth.render.camera import camera_calibration
 
 _NEWTON = 20
@@ -32,6 +31,28 @@ class CameraView:
     roll_deg: float  # rotation of the picture about the optical axis
     focus_mm: float  # distance of the plane in focus beyond the craniotomy's centre
     off_centre: tuple[float, float] = (0.0, 0.0)  # principal point from the picture's middle, in its widths
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What is the same in all sequences of a camera."""
+
+    size: tuple[int, int] = (640, 480)
+    """Width, height [px]."""
+    aperture_mm: float = 4.0
+    """Radius of the lens aperture; 0 is a pinhole."""
+    distortion: tuple[float, ...] = (0.0,) * 5
+    """Brown-Conrady k1, k2, p1, p2, k3, and k4, k5, k6 if there are 8."""
+    K: Floats | None = None
+    """(3, 3) px of a calibrated camera; None: that of the view's field."""
+
+    def focal_px(self, view: CameraView) -> float:
+        """Focal length across [px]."""
+        return self.size[0] * view.working_distance_mm / view.field_mm if self.K is None else self.K[0, 0]
+
+    def mm_per_px(self, view: CameraView) -> float:
+        """Size of a pixel at the craniotomy's centre, across the optical axis."""
+        return float(view.working_distance_mm / self.focal_px(view))
 
 
 @dataclass(frozen=True)
@@ -66,9 +87,9 @@ class Camera:
         return np.block([[self.rotation, self.translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
-def place(view: CameraView, render: RenderSection) -> Camera:
+def place(view: CameraView, lens: Lens) -> Camera:
     """The camera of `view`, looking at the world's origin from its working distance."""
-    width, height = render.size
+    width, height = lens.size
     tilt, azimuth, roll = np.deg2rad([view.tilt_deg, view.azimuth_deg, view.roll_deg])
     backward = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     # Any axis across the view is a start; roll makes the orientation uniform.
@@ -78,27 +99,25 @@ def place(view: CameraView, render: RenderSection) -> Camera:
     frame = np.stack([right, -up, -backward])
     c, s = np.cos(roll), np.sin(roll)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ frame
-    if render.calibration is None:
-        focal = width * view.working_distance_mm / view.field_mm
+    K = lens.K
+    if K is None:
+        focal = lens.focal_px(view)
         x, y = (width - 1) / 2 + width * view.off_centre[0], (height - 1) / 2 + width * view.off_centre[1]
         K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
-        distortion = np.asarray(render.distortion, np.float64)
-    else:
-        K, distortion = camera_calibration.read(render.calibration, render.size)
     return Camera(
         K=K,
-        distortion=distortion,
+        distortion=np.asarray(lens.distortion, np.float64),
         rotation=rotation,
         translation=np.array([0.0, 0.0, view.working_distance_mm]),
         size=(width, height),
-        aperture_mm=render.aperture_mm,
+        aperture_mm=lens.aperture_mm,
         focus_mm=view.working_distance_mm + view.focus_mm,
-        mm_per_px=float(view.working_distance_mm / K[0, 0]),
+        mm_per_px=lens.mm_per_px(view),
     )
 
 
-def calibrated(view: CameraView, lens: Camera) -> CameraView:
-    """The view with the field and principal point of the calibrated lens that `place` returned for it."""
+def state_field(view: CameraView, lens: Camera) -> CameraView:
+    """The view with the field and principal point of the calibrated camera that `place` returned for it."""
     width, _ = lens.size
     x, y = (lens.K[:2, 2] - (np.array(lens.size) - 1) / 2) / width
     field_mm = float(width * view.working_distance_mm / lens.K[0, 0])
@@ -118,7 +137,7 @@ def visible_radius(camera: Camera) -> float:
     return float(np.hypot(met[:, 0], met[:, 1]).min())
 
 
-def resized(camera: Camera, size: tuple[int, int]) -> Camera:
+def resize(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera with pictures of another size (width, height) px of the same field."""
     scale = np.array(size) / camera.size
     K = camera_calibration.scaled(camera.K, scale)

@@ -9,18 +9,17 @@ import numpy as np
 
 from synth.arrays import Pixels
 from synth.errors import UserError
-from synth.job import schema
 from synth.video.write_video import encode
 
 _FORMATS = {"4:4:4": "yuv444p", "4:2:2": "yuv422p", "4:2:0": "yuv420p"}
 
 
-def recorded(pictures: Pixels, section: schema.SensorSection, fps: float) -> Pixels:
+def transmit(pictures: Pixels, fps: float, bitrate_mbps: float | None, chroma: str = "4:4:4") -> Pixels:
     """Pictures (T, H, W, 3) sRGB after the recorder's codec; the same pictures without a bitrate.
 
     Deterministic, since it runs on one thread. UserError: the codec rejects this size or kind of picture.
     """
-    if section.bitrate_mbps is None:
+    if bitrate_mbps is None:
         return pictures
     import av
 
@@ -31,8 +30,8 @@ def recorded(pictures: Pixels, section: schema.SensorSection, fps: float) -> Pix
     try:
         with av.open(buffer, "w", format="matroska") as container:
             options = {"threads": "1", "preset": "medium", "tune": "zerolatency"}
-            rate, bits_per_s = Fraction(fps).limit_denominator(1000), round(section.bitrate_mbps * 1e6)
-            encode(container, padded, rate, _FORMATS[section.chroma], options, bits_per_s=bits_per_s)
+            rate, bits_per_s = Fraction(fps).limit_denominator(1000), round(bitrate_mbps * 1e6)
+            encode(container, padded, rate, _FORMATS[chroma], options, bits_per_s=bits_per_s)
         buffer.seek(0)
         with av.open(buffer) as container:
             # Bilinear from subsampled chroma, as players do; the default of nearest leaves blocks.

@@ -22,13 +22,14 @@ from synth.arrays import Array, Floats, Indices, Map
 from synth.errors import UserError
 from synth.geometry.triangles import Shape, normals
 from synth.render.camera.camera import Camera
-from synth.render.materials import Body, Lamp, Metal, Wet
+from synth.render.materials import Body, Lamp, Metal, Wet, read_map
 from synth.render.mitsuba.direct_light import trace
 from synth.render.mitsuba.edge_filter import soften
 from synth.render.mitsuba.lens import Compiled, Scalar
 from synth.system import cache, gpu, llvm
 
 _REGISTER = 64  # bytes of a vector register
+_GLOSS = 0.88  # of a liquid's surface, as of `principled`
 _LAMPS = 2, 6, 12  # numbers of lamps, each with a kernel of its own
 
 
@@ -76,7 +77,7 @@ class Stage:
 
             dr.set_thread_count(int(threads))
         self.variant = variant
-        self._faces = {name: body.faces for name, body in bodies.items()}
+        self._bodies = bodies
         scene: dict[str, Any] = {
             "type": "scene",
             # A GPU may sort paths by what they hit, which changes the order of sums and so their last bits.
@@ -103,11 +104,12 @@ class Stage:
         """Moves a body's vertices (V, 3) mm; `film` and `glow` as of `Body` and `Metal`."""
         import mitsuba as mi
 
-        new = {"positions": vertices, "normals": _bent(vertices, self._faces[name], film), "glow": glow}
+        new = {"positions": vertices, "normals": _bent(vertices, self._bodies[name].faces, film)}
+        if glow is not None:
+            new["glow"] = _shown(mi, self._bodies[name], glow)
         for key, values in new.items():
-            if values is not None:
-                flat = _aligned(values, np.float32)
-                self._parameters[f"{name}.vertex_{key}"] = mi.Float(flat) if self._jit else flat
+            flat = _aligned(values, np.float32)
+            self._parameters[f"{name}.vertex_{key}"] = mi.Float(flat) if self._jit else flat
 
     def render(self, seed: int, camera: Camera | None = None) -> Map:
         """Linear radiance (H, W, 3) float32 of the stage as it is, from a camera with the same lens."""
@@ -154,6 +156,8 @@ def _freeze_modules() -> None:
 def _register_glow(variant: str) -> None:
     """Registers an emitter `sulcus_glow` that is visible but never sampled, in one compiled variant.
 
+    With a texture `mirror` it is a surface of that reflectance in which the radiance is seen.
+
     Mitsuba's own area light with a sampling weight of 0 is not sampled either, but its sampling would still
     be compiled, with the mesh's number of faces in the code, which takes a kernel for every scene.
     """
@@ -166,10 +170,14 @@ def _register_glow(variant: str) -> None:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.radiance = props["radiance"]
+            self.mirror = props.get("mirror", None)
             self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
 
         def eval(self, si: Any, active: Any = True) -> Any:
-            return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, self.radiance.eval(si, active), 0)
+            radiance = self.radiance.eval(si, active)
+            if self.mirror is not None:
+                radiance *= self.mirror.eval(si, active)
+            return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, radiance, 0)
 
         def sample_direction(self, it: Any, sample: Any, active: Any = True) -> tuple[Any, Any]:
             return dr.zeros(mi.DirectionSample3f), dr.zeros(mi.Color3f)
@@ -207,19 +215,21 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(_material(mi, body.material))
     # Light that is not of a lamp: reflections of metal, ambient light on tissue.
+    # Visible, but never sampled as a lamp, since its weight is 0.
+    emitter: dict[str, Any] = {"type": "sulcus_glow", "sampling_weight": 0.0}
     if isinstance(body.material, Metal):
-        radiance = {"type": "mesh_attribute", "name": "vertex_glow"}
+        emitter["radiance"] = {"type": "mesh_attribute", "name": "vertex_glow"}
+        emitter["mirror"] = _bitmap(mi, body.material.maps.mirror)
     else:
         half = cv2.resize(body.material.maps.albedo, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        radiance = _bitmap(mi, half * np.asarray(body.material.ambient, np.float32))
-    # Visible, but never sampled as a lamp, since its weight is 0.
-    kind = "area" if "scalar" in mi.variant() else "sulcus_glow"
-    properties["glow"] = mi.load_dict({"type": kind, "radiance": radiance, "sampling_weight": 0.0})
+        emitter["radiance"] = _bitmap(mi, half * np.asarray(body.material.ambient, np.float32))
+    if "scalar" in mi.variant():
+        emitter = {"type": "area", "radiance": emitter["radiance"], "sampling_weight": 0.0}
+    properties["glow"] = mi.load_dict(emitter)
     given = {"has_vertex_normals": True, "has_vertex_texcoords": True, "props": properties}
     mesh = mi.Mesh(name, vertex_count=len(body.vertices), face_count=len(body.faces), **given)
     if isinstance(body.material, Metal):
-        mesh.add_attribute("vertex_glow", 3, _aligned(body.material.glow, np.float32))
-        mesh.add_attribute("vertex_tint", 3, _aligned(body.material.tint, np.float32))
+        mesh.add_attribute("vertex_glow", 3, _aligned(_shown(mi, body, body.material.glow), np.float32))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = _aligned(body.vertices, np.float32)
     parameters["vertex_normals"] = _aligned(_bent(body.vertices, body.faces, body.film), np.float32)
@@ -227,6 +237,14 @@ def _mesh(mi: Any, name: str, body: Body) -> Any:
     parameters["vertex_texcoords"] = _aligned(body.uv, np.float32)
     parameters.update()
     return mesh
+
+
+def _shown(mi: Any, body: Body, glow: Floats) -> Floats:
+    """The radiance (V, 3) of a metal body's `vertex_glow`: that mirrored, which the scalar variant's own area
+    light takes at vertices as by the maps there."""
+    if "scalar" not in mi.variant() or not isinstance(body.material, Metal):
+        return glow
+    return np.asarray(glow * read_map(body.material.maps.mirror, body.uv))
 
 
 def _bent(vertices: Floats, faces: Indices, film: Floats | None) -> Floats:
@@ -252,8 +270,16 @@ def _aligned(values: Array, kind: type[np.generic]) -> Array:
 
 def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
     if isinstance(material, Metal):
-        scattered = {"type": "mesh_attribute", "name": "vertex_tint"}
-        return {"type": "twosided", "satin": {"type": "diffuse", "reflectance": scattered}}
+        maps, (along, across) = material.maps, np.moveaxis(material.maps.rough, -1, 0)
+        # B. Burley, "Physically based shading at Disney", 2012: a conductor where metallic, of
+        # alpha = roughness^2 / aspect along and roughness^2 aspect across; aspect^2 = 1 - 0.9 anisotropic.
+        steel = {"type": "principled", "base_color": _bitmap(mi, maps.base)}
+        steel |= {"metallic": _bitmap(mi, maps.bare), "roughness": _bitmap(mi, (along * across) ** 0.25)}
+        steel |= {"anisotropic": _bitmap(mi, (1 - across / along) / 0.9)}
+        steel |= {"clearcoat": _bitmap(mi, maps.wet), "clearcoat_gloss": _GLOSS}
+        encoded = maps.normal * np.float32(0.5) + np.float32(0.5)
+        bent = {"type": "normalmap", "normalmap": _bitmap(mi, encoded), "steel": steel}
+        return {"type": "twosided", "bent": bent}
     encoded = material.maps.normal * np.float32(0.5) + np.float32(0.5)
     albedo = mi.load_dict(_bitmap(mi, material.maps.albedo))  # shared by both coats
     plastic = {"type": "roughplastic", "distribution": "ggx", "nonlinear": True}

@@ -12,7 +12,6 @@ from bench.methods.compliance import TO_CAMERA, ElasticBlock, TissueKind, pictur
 from synth.fem.condensation import condense
 from synth.fem.mesh import tetrahedra
 from synth.fem.system import assemble
-from synth.job import schema
 
 Floats = NDArray[np.float64]
 TETS = 500
@@ -23,7 +22,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Compliances of a coarse mesh, which are forgotten afterwards."""
     monkeypatch.setattr(compliance, "_TETS", TETS)
     monkeypatch.setattr(compliance, "SETTINGS", (1.0, 1.2, TETS))
-    caches = compliance._condensed, compliance._geometry, posterior.load_basis
+    caches = compliance._condense, compliance._geometry, posterior.load_basis
     for cache in caches:
         cache.cache_clear()
     yield
@@ -55,11 +54,13 @@ def test_compliances_are_those_of_direct_solutions(coarse: None, tissue: TissueK
     for components in (2, 3):
         matrix = compliance.solve(tissue, components)
         columns = matrix.reshape(len(matrix), 3, -1)[..., some].reshape(len(matrix), -1)
-        np.testing.assert_allclose(columns, direct[: len(matrix)], atol=1e-9 * np.abs(direct).max(), rtol=0)
+        # What surrounds the window is eliminated in single precision.
+        np.testing.assert_allclose(columns, direct[: len(matrix)], atol=2e-6 * np.abs(direct).max(), rtol=0)
+        assert np.linalg.norm(columns - direct[: len(matrix)]) < 1e-5 * np.linalg.norm(direct[: len(matrix)])
 
 
 def test_a_condensed_mesh_moves_as_the_whole() -> None:
-    volume = tetrahedra.block(schema.AnatomySection(), 300)
+    volume = tetrahedra.block(300)
     system = assemble(volume, "linear", 0.45)
     rng = np.random.default_rng(0)
     kept = rng.permutation(np.flatnonzero(~volume.fixed))[:40]

@@ -1,10 +1,10 @@
 """Fusion of network and physics, against closed forms of Gaussians and draws from stated errors."""
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from bench.methods.force_fusion import Fusion
+from bench.methods.force_interval import read_table
 from bench.methods.force_mixture import ForceMixture
 from bench.methods.method_interface import ForceEstimate, MethodContext
 
@@ -41,18 +41,15 @@ def test_components_that_contradict_the_network_lose_weight() -> None:
     np.testing.assert_allclose(found.weight, [1 / (1 + odds), odds / (1 + odds)])
 
 
-def test_intervals_have_90_percent_coverage() -> None:
-    rng, inside, count = np.random.default_rng(0), 0, 400
-    for _ in range(count):
-        true = rng.normal(size=3) * 5
-        factor = np.exp(0.3 * rng.normal())
-        forces = [true * factor + deviation * rng.normal(size=3) for deviation in (1.0, 0.7)]
-        found = fuse_one(estimate([forces[0]], [1 / CAUTION], [1.0]), estimate([forces[1]], [0.7], [1.0]))
-        inside += found.low_mn <= np.linalg.norm(true) <= found.high_mn
-    assert inside / count == pytest.approx(0.9, abs=0.05)
-
-
-def test_intervals_of_small_forces_start_at_0() -> None:
+def test_without_a_calibrated_network_there_is_no_interval_but_a_reason() -> None:
     every = [estimate([np.array([size, 0.0, 0.0])], [0.01], [1.0]) for size in (10.0, 0.3, 1.0)]
-    found = Fusion("network", "physics").fuse([{"network": o, "physics": o} for o in every], SCENE, 1)
-    assert [one.low_mn > 0 for one in found] == [True, False, True]
+    frames, fusion = [{"network": o, "physics": o} for o in every], Fusion("network", "physics")
+    fused = fusion.fuse(frames, SCENE, 1)
+    known = next(iter(read_table().networks.values()))
+    for network in (known, "unknown"):
+        bound = fusion.bound(fused, frames, SCENE, 1, np.ones(3), 0.0, network)
+        assert [one.size_mn for one in bound] == [one.size_mn for one in fused]
+    assert len(fusion.warnings) == 1
+    assert np.isnan([one.high_mn for one in bound]).all()
+    assert fusion.video is not None
+    np.testing.assert_allclose(fusion.video.spread_mn, 0.01 * np.sqrt(3))

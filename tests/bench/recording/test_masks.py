@@ -9,9 +9,11 @@ import pytest
 from fake_recording import Bump, Maker
 
 from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
+from bench.recording.propose_tissue import propose_tissue
 from bench.recording.recording_folder import open_recording
 from bench.tracking.contact_free import ContactFreeSearch
 from bench.tracking.tracking import picture_masks, track_recording
+from synth.errors import UserError
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.video.read_video import read_mask
 from tests.synth.flow.recording.test_camera_motion import OPENING
@@ -81,6 +83,20 @@ def test_methods_get_the_tissue_that_is_found(make: Maker) -> None:
     assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
     assert ("missing", "tissue") in [(one.severity, one.cause) for one in found.findings]
     assert picture_masks(found) is not None  # shows its outline
+
+
+def test_a_tissue_is_proposed_and_never_written_over(make: Maker) -> None:
+    folder = make(frames=12, size=OPENING.shape)
+    files = sorted((folder / "frames").iterdir())
+    for path, one in zip(files, video(OPENING, RIM, 4, 0).pictures(), strict=True):
+        assert cv2.imwrite(str(path), one.rgb[..., ::-1])
+    mask, shown, doubt = propose_tissue(folder)
+    tissue = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) > 0
+    assert (tissue & OPENING).sum() / (tissue | OPENING).sum() > 0.9
+    assert shown.is_file()
+    assert doubt == ""
+    with pytest.raises(UserError, match="exists"):
+        propose_tissue(folder)
 
 
 @pytest.mark.parametrize("shown", [range(6, 14), range(9, 14), range(20), range(0)])

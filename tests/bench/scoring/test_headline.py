@@ -1,6 +1,7 @@
 """The headline of a report: no numbers for lost recordings, relative scores without E, the press first."""
 
 import math
+import re
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,11 @@ from fake_recording import GAIN_MN_PER_PX, Bump, Maker, force_curve, scored
 
 from bench.methods.flow_size import flow_sizes
 from bench.methods.force_fusion import Fusion
+from bench.methods.force_interval import VideoEstimates, read_table
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext
 from bench.methods.network import Model
 from bench.scoring import charts
+from bench.scoring.answers import answer, find_gains
 from bench.scoring.headline import headline
 from bench.scoring.result import Result, as_json
 from bench.scoring.score_report import render_report
@@ -117,8 +120,9 @@ def test_an_interval_has_a_level_for_motion_as_in_training(motion: str, make: Ma
     folder = write_model(tmp_path / "model", "arch.output=vector")
     write_card(folder, replace(read_card(folder), motion=[motion], intervals=fake_intervals.make()))
     result = run(make(), fusion=Fusion("network", "bump"), network=Model(folder), bump=Bump())
-    intervals = [as_json(result)["methods"][name]["interval"] for name in ("fusion", "network")]
-    assert ["level" in one for one in intervals] == [motion != "tvl1 0"] * 2
+    methods = as_json(result)["methods"]
+    assert ("level" in methods["network"]["interval"]) == (motion != "tvl1 0")
+    assert "interval" not in methods["fusion"], "calibrated for the pretrained networks alone"
     for note in read_card(folder).doubt(name_motion("tvl1")):
         assert headline(result).warnings[0] == note
         assert render_report(result).count(note) == 1
@@ -132,3 +136,33 @@ def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Make
     assert "ambiguous" in result.sync.refused
     assert "clocks" in {one.cause for one in result.findings}
     assert result.methods["bump"].scores["r"] > 0.99, "scored at the stated offset"
+
+
+def test_the_first_screen_has_four_answers_in_few_words(make: Maker) -> None:
+    """Of a recording without findings and of one with many; the rest is folded away."""
+    cases = ({7, 8, 20}, {"young_uncertainty": 0.2}), (set(range(3, 20)), {"scale_mm_per_px": 4.0})
+    for lost, meta in cases:
+        result = run(make(f"lost {len(lost)}", meta=meta), lost)
+        page = render_report(result)
+        body = re.sub(r"<svg.*?</svg>", "", page[page.index("<body>") :], flags=re.DOTALL)
+        screen = re.sub(r"<[^>]+>", " ", body[: body.index("<details")])
+        assert len(screen.split()) <= 120
+        four = answer(result)
+        assert ("held back" in four.sure) == bool(result.refused)
+        assert len(four.wrong) <= 3
+        assert bool(result.findings) == (four.wrong != ("nothing found",))
+
+
+def test_what_is_not_stated_narrows_this_interval(make: Maker) -> None:
+    result = run(make())
+    curve = result.methods["bump"].size_mn
+    way = curve[:, None] * np.array([1.0, 0.0, 0.0])
+    one = VideoEstimates(way, way, way, 0.1 * curve, 0.01 * curve, 1, 0.5)
+    result.tracked.evidence, result.tracked.stated = one, (True, False, True, False)
+    gains = find_gains(result, 10.0, 6.0, 14.0)
+    ratios = read_table().stating
+    narrower = {"camera": ratios["second camera"] < 0.98, "masks": ratios["statements"] ** 0.5 < 0.98}
+    for word, known in narrower.items():
+        assert any(word in line for line in gains) == known
+    result.tracked.evidence = replace(one, cameras=2, stated=1.0)
+    assert find_gains(result, 10.0, 6.0, 14.0) == ()

@@ -9,6 +9,7 @@ from command import run
 
 from bench.cli import app
 from bench.scoring import pool
+from bench.scoring.session_report import render_session, report_recordings
 from evidence.pooled import score_and_pool
 from synth.errors import UserError
 
@@ -76,3 +77,25 @@ def test_command_reads_folders_and_refuses_the_same_twice(tmp_path: Path) -> Non
         pool.read([both[0], both[0]])
     with pytest.raises(UserError, match="no readable score"):
         pool.read([tmp_path])
+
+
+def test_one_page_of_several_recordings_links_each_and_says_why_one_is_missing() -> None:
+    findings = ["camera: moved", "x: y"]
+    numbers = {"low_mn": 8.0, "high_mn": 17.0, "mae_of_peak": 0.071, "r": 0.98, "holds": 0.9}
+    first = {"recording": "a b", "why": "", "findings": findings, "largest_mn": 12.0, "absolute": True}
+    rows = [first | numbers, {"recording": "c", "why": "no <video>"}]
+    page = render_session(rows, pool.pool([score("a b", 1.0, "x"), score("d", 3.0, "y")]))
+    assert 'href="a%20b/report.html"' in page
+    for text in ("12", "8 to 17", "7.1%", "camera: moved", "no &lt;video&gt;"):
+        assert text in page
+    assert "<video>" not in page
+    assert "2.00" in page, "the mean over recordings"
+
+
+def test_recordings_of_one_name_are_refused_before_any_is_scored(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="a"):
+        report_recordings([tmp_path / "x" / "a", tmp_path / "y" / "a"], tmp_path / "out", "")
+    assert not (tmp_path / "out").exists()
+    (row,) = report_recordings([tmp_path / "none"], tmp_path / "out", "")
+    assert row["why"]
+    assert (tmp_path / "out" / "report.html").is_file()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import fake_model
-import foreign
+import foreign_video
 import numpy as np
 import pytest
 import zarr
@@ -41,7 +41,7 @@ def not_a_number(path: Path) -> None:
 @pytest.mark.parametrize(
     ("harm", "key"),
     [
-        (lambda path: foreign.edit_attributes(path, reseal=False, young_kpa=99.0), "attributes"),
+        (lambda path: foreign_video.edit_attributes(path, reseal=False, young_kpa=99.0), "attributes"),
         (another_flow, "flow"),
         (not_a_number, "traction"),
     ],
@@ -64,12 +64,12 @@ def test_a_copied_hash_does_not_fill_the_cache(own: Path, tmp_path: Path) -> Non
     cache = tmp_path / "cache"
     load_clips(own, GRID, ("ideal",), cache=cache)
     attrs = json.loads((own / "000000.zarr/zarr.json").read_text())["attributes"]
-    foreign.edit_attributes(own / "000005.zarr", reseal=False, content_hash=attrs["content_hash"])
+    foreign_video.edit_attributes(own / "000005.zarr", reseal=False, content_hash=attrs["content_hash"])
     for place in (cache, tmp_path / "fresh"):
         with pytest.raises(UserError, match=r"000005\.zarr"):
             load_clips(own, GRID, ("ideal",), cache=place)
     # All attributes of the other, with seals: only the values differ.
-    foreign.edit_attributes(own / "000005.zarr", reseal=False, **attrs)
+    foreign_video.edit_attributes(own / "000005.zarr", reseal=False, **attrs)
     for path in own.glob("00000[!5].zarr"):
         shutil.rmtree(path)
     with pytest.raises(UserError):

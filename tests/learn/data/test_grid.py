@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from learn.data.grid import CHANNELS, Grid, GridView, Scales, settled
-from learn.network.channels import channels, divergence, turned
+from learn.data.grid import CHANNELS, Grid, GridView, Scales, settle
+from learn.network.channels import channels, divergence, rotate
 
 GRID = Grid(64, 36.0)
 
@@ -78,23 +78,23 @@ def test_turning_turns_vectors_and_leaves_divergence_unchanged(quarter: int, mir
         return divergence(v, mask, 1.125)
 
     turn, field = quarter + 4 * mirror, torch.from_numpy(u)[None]
-    torch.testing.assert_close(div(turned(field, turn)), turned(div(field), turn), atol=1e-5, rtol=0)
+    torch.testing.assert_close(div(rotate(field, turn)), rotate(div(field), turn), atol=1e-5, rtol=0)
     # A field that points outwards everywhere still does.
     out = torch.from_numpy(np.stack([x, y]).astype(np.float32))[None]
-    torch.testing.assert_close(turned(out, turn), out, atol=1e-6, rtol=0)
+    torch.testing.assert_close(rotate(out, turn), out, atol=1e-6, rtol=0)
 
 
 def test_a_turn_is_counter_clockwise_in_the_picture() -> None:
     right = torch.zeros(1, 3, 4, 4)
     right[0, :, 1, 3] = torch.tensor([1.0, 0.0, 9.0])
-    assert turned(right, 1)[0, :, 0, 1].tolist() == [0.0, -1.0, 9.0]
+    assert rotate(right, 1)[0, :, 0, 1].tolist() == [0.0, -1.0, 9.0]
 
 
 def test_force_in_border_cells_is_moved_inside() -> None:
     mask = np.zeros((6, 6), np.float32)
     mask[1:5, 1:4] = 1
     amount = np.random.default_rng(0).normal(size=(3, 6, 6)).astype(np.float32)
-    inside = settled(amount, mask)
+    inside = settle(amount, mask)
     np.testing.assert_allclose(inside.sum((1, 2)), amount.sum((1, 2)), rtol=1e-5)
     assert (inside[:, mask == 0] == 0).all()
     # The centre has no neighbour outside; the right edge gets all of its row's.

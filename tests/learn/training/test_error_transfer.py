@@ -9,10 +9,10 @@ import torch
 
 from learn.data.clips import Clip
 from learn.data.grid import certainty
-from learn.network.channels import turned
+from learn.network.channels import rotate
 from learn.settings import preset
 from learn.training.batches import FrameDataset
-from learn.training.error_transfer import Transfer, restated, transfer
+from learn.training.error_transfer import Transfer, restate, transfer
 
 WHOLE = Transfer(0, 0, (1.0, 1.0, 1.0))
 
@@ -27,9 +27,9 @@ def press(x: int, y: int, size: float) -> torch.Tensor:
 @pytest.mark.parametrize(("turn", "size"), [*product(range(8), (0.5, -1.0))])
 def test_a_shortfall_stays_one_on_another_contact(turn: int, size: float) -> None:
     """Of a contact that is turned, elsewhere, smaller or a pull; its confidence goes with it."""
-    true, donor = press(20, 30, 1.0), turned(press(29, 37, size), turn)
+    true, donor = press(20, 30, 1.0), rotate(press(29, 37, size), turn)
     sure = torch.rand(1, 2, 64, 64, generator=torch.Generator().manual_seed(0))
-    planes = turned(sure.transpose(0, 1), turn).transpose(0, 1)
+    planes = rotate(sure.transpose(0, 1), turn).transpose(0, 1)
     moved, found = transfer(true, donor, -0.3 * donor, planes, WHOLE)
     torch.testing.assert_close(moved[..., :55, :55], 0.7 * true[..., :55, :55], atol=1e-3, rtol=0)
     torch.testing.assert_close(found[..., :50, :50], sure[..., 7:57, 9:59])
@@ -37,7 +37,7 @@ def test_a_shortfall_stays_one_on_another_contact(turn: int, size: float) -> Non
     torch.testing.assert_close(doubled[0][:, :2], true[:, :2])
     assert float(doubled[0][0, 2, 30, 20]) == pytest.approx(0.4, abs=0.01)
     once, thrice = (certainty(np.full((64, 64, 3), one)) for one in (0.05, 0.15))
-    torch.testing.assert_close(restated(torch.from_numpy(once), 3.0), torch.from_numpy(thrice))
+    torch.testing.assert_close(restate(torch.from_numpy(once), 3.0), torch.from_numpy(thrice))
 
 
 def test_labels_have_no_recovered_motion_but_errors_of_others(clips: list[Clip]) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torchmetrics
 
-from learn.loss import loss, unexplained
+from learn.loss import loss, measure_unexplained
 
 
 def maps(*values: float) -> torch.Tensor:
@@ -50,9 +50,9 @@ def test_r2_is_that_of_torchmetrics_and_drops_with_bias() -> None:
     mask = torch.ones(2, 1, 8, 8)
     metric = torchmetrics.R2Score()
     metric.update(predicted.flatten(), true.flatten())
-    found = float(1 - unexplained(predicted, true, mask, 1.0))
+    found = float(1 - measure_unexplained(predicted, true, mask, 1.0))
     assert found == pytest.approx(float(metric.compute()), rel=1e-4)
-    assert float(unexplained(true + 1, true, mask, 1.0)) > 0.5
+    assert float(measure_unexplained(true + 1, true, mask, 1.0)) > 0.5
 
 
 def test_r2_by_frame_weighs_weak_and_strong_frames_equally() -> None:
@@ -62,11 +62,15 @@ def test_r2_by_frame_weighs_weak_and_strong_frames_equally() -> None:
     ones = torch.ones(2, 1, 8, 8)
     weak = pair * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1)
     strong = pair * torch.tensor([0.5, 1.0]).view(2, 1, 1, 1)
-    both = [float(unexplained(predicted, pair, ones, 1.0, by_frame=True)) for predicted in (weak, strong)]
+    both = [
+        float(measure_unexplained(predicted, pair, ones, 1.0, by_frame=True)) for predicted in (weak, strong)
+    ]
     assert both[0] == pytest.approx(both[1], rel=1e-4)
-    whole = [float(unexplained(predicted, pair, ones, 1.0)) for predicted in (weak, strong)]
+    whole = [float(measure_unexplained(predicted, pair, ones, 1.0)) for predicted in (weak, strong)]
     assert whole[1] == pytest.approx(4 * whole[0], rel=1e-4)
-    alone = [float(unexplained(s[None], p[None], ones[:1], 1.0)) for s, p in zip(weak, pair, strict=True)]
+    alone = [
+        float(measure_unexplained(s[None], p[None], ones[:1], 1.0)) for s, p in zip(weak, pair, strict=True)
+    ]
     assert both[0] == pytest.approx(sum(alone) / 2, rel=1e-4)
 
 

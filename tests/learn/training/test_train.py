@@ -10,7 +10,7 @@ from learn import checkpoint
 from learn.data.clips import Clip
 from learn.inference.predict import load_model
 from learn.settings import TrainingSettings, as_changes, preset, replace
-from learn.split import Split, unseen
+from learn.split import Split, keep_unseen
 from learn.training.batches import Batch, FrameDataset, FrameItem, add_surface_motion, measure_scales
 from learn.training.train import select_score, train
 from synth.dataset.store import Dataset
@@ -63,9 +63,9 @@ def test_training_learns(clips: list[Clip], tmp_path: Path, monkeypatch: pytest.
 
 def test_sequences_of_training_brains_are_not_scored(clips: list[Clip], model: Path) -> None:
     card = checkpoint.read_card(model)
-    assert [c.name for c in unseen(clips, card)] == [clips[i].name for i in SPLIT.test]
+    assert [c.name for c in keep_unseen(clips, card)] == [clips[i].name for i in SPLIT.test]
     copied = dataclasses.replace(clips[SPLIT.fit[0]], content_hash="x")
-    assert unseen([copied], card) == []
+    assert keep_unseen([copied], card) == []
 
 
 def test_prediction_from_a_picture_equals_that_on_the_grid(

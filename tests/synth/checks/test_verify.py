@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import fake_work
-import foreign
+import foreign_video
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -140,7 +140,10 @@ def broken_chunk(root: Path) -> None:
         (leaking_split, {"splits", "dataset"}),
         (edited_axes, {"schema"}),
         (unnamed_version, {"dataset"}),
-        (lambda root: foreign.edit_attributes(root / "000000.zarr", False, young_kpa=2), {"seal", "dataset"}),
+        (
+            lambda root: foreign_video.edit_attributes(root / "000000.zarr", False, young_kpa=2),
+            {"seal", "dataset"},
+        ),
         (swapped_sequences, {"seal", "dataset"}),
         (replaced_value, {"checksum"}),
         (broken_chunk, {"readable"}),
@@ -158,14 +161,14 @@ def test_damage_is_found(dataset: Path, damage: Callable[[Path], object], found:
     [{"young_kpa": np.nan}, {"frames": 10**9}, {"scenario": {"gestures": "pull"}}, {"format_version": 1}],
 )
 def test_invalid_attributes_are_refused_though_sealed(dataset: Path, changes: dict[str, Any]) -> None:
-    foreign.edit_attributes(dataset / "000000.zarr", **changes)
+    foreign_video.edit_attributes(dataset / "000000.zarr", **changes)
     with pytest.raises(UserError):
         open_sequence(dataset / "000000.zarr")
     assert "readable" in failing(dataset)
 
 
 def test_an_edited_sequence_is_not_exported(dataset: Path) -> None:
-    foreign.edit_attributes(dataset / "000000.zarr", reseal=False, young_kpa=2.0)
+    foreign_video.edit_attributes(dataset / "000000.zarr", reseal=False, young_kpa=2.0)
     with pytest.raises(UserError):
         export_dataset(dataset, dataset / "to", "folder")
 

@@ -17,6 +17,7 @@ from synth.cli import app
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope
 from synth.geometry import brain_surface
+from synth.geometry.craniotomy import Craniotomy
 from synth.job import schema
 from synth.sequence.fem_mechanics import build_volume
 from synth.sequence.simulation import simulate
@@ -49,7 +50,7 @@ def test_a_surface_that_is_not_closed_at_the_craniotomy_is_refused(tmp_path: Pat
     trimesh.creation.box((50, 50, 0)).export(sheet)
     torn.write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
     bad.write_text("# vtk DataFile Version 3.0\n\nASCII\nDATASET POLYDATA\nPOINTS 2 float\n0 0 0\n")
-    outside = schema.CraniotomySection(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+    outside = Craniotomy(point=(90.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
     for path, opening in ((sheet, OPENING), (torn, OPENING), (bad, OPENING), (egg, outside)):
         with pytest.raises(UserError):
             brain_surface.load_brain(path, opening)
@@ -146,7 +147,7 @@ def test_an_opening_in_other_axes_is_refused(sign: tuple[float, ...], named: str
     for k in np.flatnonzero(BALL.vertices[:, 2] > 0.5)[::12]:
         point, out = POINTS[k] * sign, BALL.vertices[k] * sign * (-1 if named == "direction" else 1)
         try:
-            opening = schema.CraniotomySection(point=tuple(point), direction=tuple(out))
+            opening = Craniotomy(point=tuple(point), direction=tuple(out))
             brain_surface.load_brain(tmp_path / "brain.stl", opening)
             found.append("accepted")
         except UserError as error:

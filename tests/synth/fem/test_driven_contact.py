@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from dome import ANATOMY, patch
+from dome import patch
 
 from synth.fem import driven_contact, surface_embedding
 from synth.fem.deformation import Deformation
@@ -17,12 +17,11 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
-from synth.fem.motion import Clock
+from synth.fem.motion import Clock, TimeScheme
 from synth.fem.pulse import Pulse
 from synth.fem.solver import deform
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact, grip, trajectory
 from synth.geometry.triangles import Shape
-from synth.job.schema import FemSection
 
 FELUPE = json.loads((Path(__file__).parents[2] / "helpers" / "felupe_ogden.json").read_text())
 DOWN, ASIDE, UP = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -65,9 +64,8 @@ def run(
     frames: int = 11,
     relaxation: tuple[tuple[float, float], ...] = (),
 ) -> Deformation:
-    fem = FemSection(tets=500, relaxation=relaxation)
-    tets = tetrahedra.block(ANATOMY, fem.tets, list(driven.focus))
-    return deform(fem, tissue, [driven], tets, patch(), frames, 5.0)
+    tets = tetrahedra.block(500, list(driven.focus))
+    return deform(TimeScheme(relaxation=relaxation), tissue, [driven], tets, patch(), frames, 5.0)
 
 
 @lru_cache
@@ -88,7 +86,7 @@ def test_reaction_and_motion_are_felupes(scene: dict) -> None:  # type: ignore[t
     tets, surface = flat_block()
     way = np.array(scene["way"])
     length = float(np.linalg.norm(way))
-    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(10.0, 10.0))
+    one = gesture(direction=tuple((way / length).tolist()), travel=length, size=(2 * scene["radius"],) * 2)
     tissue = Tissue(1.0, scene["poisson"], "ogden", alpha=scene["alpha"])
     area = surface_embedding.vertex_area(*surface)
     embedding = surface_embedding.embed(tets, surface.vertices)
@@ -179,9 +177,9 @@ def test_two_instruments_and_a_pulse_act_at_once() -> None:
         return replace(one, contacts=(ToolContact((x, 0.0), (0.0, 0.0, 0.0)),), point_mm=(x, 0.0))
 
     both = [moved("push", -5.0, DOWN), replace(moved("pull", 5.0, UP), timing=(0.2, 0.5, 0.7, 0.95))]
-    tets = tetrahedra.block(ANATOMY, 600, [place for one in both for place in one.focus])
-    fem, pulse = FemSection(tets=600, relaxation=RELAXING), Pulse(0.3, 1.2, 0.5, 0.0, 0.3, 0.0)
-    motion = deform(fem, TISSUE, both, tets, patch(), 11, 5.0, pulse)
+    tets = tetrahedra.block(600, [place for one in both for place in one.focus])
+    scheme, pulse = TimeScheme(relaxation=RELAXING), Pulse(0.3, 1.2, 0.5, 0.0, 0.3, 0.0)
+    motion = deform(scheme, TISSUE, both, tets, patch(), 11, 5.0, pulse)
     area = surface_embedding.vertex_area(*patch())
     assert motion.by_instrument.shape == (11, 2, 3)
     most = np.abs(motion.force).max()

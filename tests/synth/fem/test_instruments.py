@@ -17,6 +17,7 @@ from synth.fem.surface_embedding import vertex_area
 from synth.job import mechanics_sections, reader, schema
 from synth.render.camera import camera
 from synth.sequence import scenario
+from synth.sequence.draw import draw_scenario, read_lens, read_scheme
 
 PUSH = {"gesture": "push", "place": [4.0, 0.0], "direction": [0.0, 0.6, -0.8], "load": 0.1}
 PUSH |= {"footprint_mm": 3.5, "timing": [0.1, 0.3, 0.6, 0.9]}
@@ -29,7 +30,7 @@ def job(*crew: dict[str, Any], **fem: Any) -> synth.Job:
 
 def test_given_values_are_used_and_the_others_drawn() -> None:
     given = job(PUSH, PULL)
-    cases = [scenario.draw_scenario(given, index) for index in range(20)]
+    cases = [draw_scenario(given, index) for index in range(20)]
     for case in cases:
         push, pull = case.gestures
         assert (push.kind, push.point_mm, push.load, push.footprint_mm) == ("push", (4.0, 0.0), 0.1, 3.5)
@@ -59,7 +60,7 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
     rng, frames, tissue = np.random.default_rng(3), 17, Tissue(1.0, 0.4, law)
     gestures = scenario.draw_gestures(fem, OPENING_MM, tissue.young_kpa, rng, rng)
     tets, surface = block(fem), patch()
-    motion = solver.deform(fem, tissue, gestures, tets, surface, frames, 25.0)
+    motion = solver.deform(read_scheme(fem), tissue, gestures, tets, surface, frames, 25.0)
     area = vertex_area(*surface)
     np.testing.assert_allclose(motion.by_instrument.sum(axis=1), motion.force, atol=1e-12)
     moved = surface.vertices + motion.displacement
@@ -77,7 +78,10 @@ def test_labels_of_two_instruments_add_up_and_both_touch(law: str) -> None:
         assert apart[pressed > 0.05 * pressed.max()].max() < 0.6  # half a vertex spacing
         assert apart[0].min() > 3
     if law == "linear":
-        alone = [solver.deform(fem, tissue, [g], tets, surface, frames, 25.0).displacement for g in gestures]
+        alone = [
+            solver.deform(read_scheme(fem), tissue, [g], tets, surface, frames, 25.0).displacement
+            for g in gestures
+        ]
         np.testing.assert_allclose(motion.displacement, sum(alone), atol=1e-8)
 
 
@@ -111,14 +115,14 @@ def test_gestures_and_instruments_are_drawn_together() -> None:
         for tool in get_args(mechanics_sections.Instrument):
             one = {"gesture": kind, "instrument": tool}
             if tool in takes or tool == "none":
-                (gesture,) = scenario.draw_scenario(job(one), 0).gestures
+                (gesture,) = draw_scenario(job(one), 0).gestures
                 assert (gesture.kind, gesture.instrument) == (kind, tool)
             else:
                 with pytest.raises(ValidationError, match=f"a {kind} takes {' or '.join(takes)}"):
                     job(one)
     blades = job(instrument="spatula")
     assert blades.fem.gestures == ("push", "slide", "retract")
-    drawn = [scenario.draw_scenario(blades, k).gestures[0] for k in range(20)]
+    drawn = [draw_scenario(blades, k).gestures[0] for k in range(20)]
     assert {one.kind for one in drawn} == {"push", "slide", "retract"}
     assert {one.instrument for one in drawn} == {"spatula"}
     with pytest.raises(ValidationError, match="a pull takes forceps"):
@@ -128,7 +132,7 @@ def test_gestures_and_instruments_are_drawn_together() -> None:
 @pytest.mark.parametrize("tool", ["forceps", "spatula", "suction", "probe"])
 def test_footprints_hold_their_force_and_have_their_form(tool: str) -> None:
     kind = "pull" if tool == "forceps" else "push"
-    drawn = scenario.draw_scenario(job({"gesture": kind, "instrument": tool, "place": [0, 0]}), 0).gestures[0]
+    drawn = draw_scenario(job({"gesture": kind, "instrument": tool, "place": [0, 0]}), 0).gestures[0]
     surface = patch(241)
     area = vertex_area(*surface)
     flat = np.column_stack([surface.vertices[:, :2], 0 * area])
@@ -147,8 +151,8 @@ def test_footprints_hold_their_force_and_have_their_form(tool: str) -> None:
 
 def test_instruments_are_apart_and_none_points_at_the_lens() -> None:
     many = synth.Job.model_validate({"sequences": 4, "fem": {"instruments": 3}, "render": {"tilt_deg": 40}})
-    for case in (scenario.draw_scenario(many, k) for k in range(4)):
-        lens = camera.place(case.view, many.render).centre
+    for case in (draw_scenario(many, k) for k in range(4)):
+        lens = camera.place(case.view, read_lens(many.render)).centre
         bars = [scenario._rings(gesture) for gesture in case.gestures]
         for k, gesture in enumerate(case.gestures):
             sight = lens - np.append(gesture.point_mm, 0)
@@ -160,7 +164,7 @@ def test_instruments_are_apart_and_none_points_at_the_lens() -> None:
 
 def test_times_are_parts_of_the_sequence_and_must_lie_in_it() -> None:
     for given in (["100 ms", "200ms", "400 ms", "600 ms"], ["0.1 s", "0.2s", "0.4 s", " .6 s"]):
-        (gesture,) = scenario.draw_scenario(job({"timing": given}), 0).gestures
+        (gesture,) = draw_scenario(job({"timing": given}), 0).gestures
         assert gesture.timing == pytest.approx(np.array([0.1, 0.2, 0.4, 0.6]) / (23 / 25))
     with pytest.raises(UserError, match=r"1200 ms.*920 ms"):
         reader.parse_job("fem: {instrument_list: [{timing: [1 ms, 2 ms, 3 ms, 1200 ms]}]}", "", Path())
@@ -169,7 +173,7 @@ def test_times_are_parts_of_the_sequence_and_must_lie_in_it() -> None:
 @pytest.mark.parametrize("frames", range(3, 25))
 def test_frames_before_the_contact_and_in_it(frames: int) -> None:
     for index in range(24):
-        case = scenario.draw_scenario(synth.Job(frames=frames, sequences=24), index)
+        case = draw_scenario(synth.Job(frames=frames, sequences=24), index)
         load = tool_gesture.trajectory(case.gestures[0], frames).load
         assert load[: 1 + (frames > 3)].max() == 0
         assert load.max() > 0.5

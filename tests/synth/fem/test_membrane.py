@@ -17,13 +17,14 @@ from synth.fem.pulse import Pulse
 from synth.fem.surface_embedding import vertex_area
 from synth.job import schema
 from synth.sequence import scenario
+from synth.sequence.draw import read_scheme
 
 Floats = np.ndarray
 
 
 @pytest.fixture(scope="module")
 def tets() -> Tets:
-    return tetrahedra.block(ANATOMY, 250, ((2.0, 1.0, 4.0),))
+    return tetrahedra.block(250, ((2.0, 1.0, 4.0),))
 
 
 def pulled(sheet: Membrane, u: Floats) -> tuple[float, Floats]:
@@ -45,7 +46,7 @@ def test_force_is_the_slope_of_energy_and_stiffness_that_of_force_at_rest(tets: 
 
 def test_stretch_pull_and_wrinkles_are_those_of_the_textbook(tets: Tets) -> None:
     """Tension of an incompressible neo-Hookean sheet: even stretch, uniaxial tension, compression."""
-    flat = tetrahedra.block(schema.AnatomySection(dome_mm=1e9), 250)
+    flat = tetrahedra.block(250, dome_mm=1e9)
     sheet = cover(flat, MembraneSheet(6.0, 1.0), linear=False)
     area = float(sheet.weight.sum())
     assert area == pytest.approx(1e4, rel=1e-9)
@@ -71,8 +72,8 @@ def test_work_over_a_load_cycle_is_the_stored_energy() -> None:
     fem = schema.FemSection(gestures=("push",), load=(0.25, 0.25), membrane=sheet)
     tissue = replace(scenario.draw_tissue(fem, np.random.default_rng(1)), membrane=Pia(300.0, 0.1, 1.02))
     gesture = scenario.draw_gesture(fem, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 700, gesture.focus)
-    found = solver.deform(fem, tissue, [gesture], tets, patch(121), 97, 25.0)
+    tets = tetrahedra.block(700, gesture.focus)
+    found = solver.deform(read_scheme(fem), tissue, [gesture], tets, patch(121), 97, 25.0)
     assert found.energy is not None
     force = vertex_area(*patch(121))[:, None] * found.traction
     step = np.diff(found.displacement, axis=0)
@@ -89,8 +90,10 @@ def moved(pulse: Pulse | None, law: str, **fem: object) -> Deformation:
     section = schema.FemSection.model_validate({"gestures": ("pull",), "load": 0.1, "law": law} | fem)
     tissue = scenario.draw_tissue(section, np.random.default_rng(1))
     gesture = scenario.draw_gesture(section, OPENING_MM, tissue.young_kpa, np.random.default_rng(2))
-    tets = tetrahedra.block(ANATOMY, 300, gesture.focus)
-    return solver.deform(section, tissue, [gesture], tets, patch(), FRAMES, RATE, pulse, OPENING_MM)
+    tets = tetrahedra.block(300, gesture.focus)
+    return solver.deform(
+        read_scheme(section), tissue, [gesture], tets, patch(), FRAMES, RATE, pulse, OPENING_MM
+    )
 
 
 @pytest.mark.parametrize(("law", "within"), [("linear", 1e-6), ("neo-hookean", 0.1)])

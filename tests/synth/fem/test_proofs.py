@@ -13,14 +13,13 @@ from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet
 
 from synth.fem import equilibrium, surface_embedding, tool_gesture
+from synth.fem.law_choice import LEAST_JACOBIAN
 from synth.fem.laws import lame
 from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.element import bary_slope, shape
 from synth.fem.mesh.refine import refine
 from synth.fem.mesh.tetrahedra import Tets
 from synth.fem.system import System, assemble
-from synth.job import schema
-from synth.job.law_choice import LEAST_JACOBIAN
 
 Floats = np.ndarray
 
@@ -139,8 +138,7 @@ def _manufactured(n: int) -> float:
 
 def loaded(law: str, load: float, kind: str) -> tuple[System, Floats]:
     """A block under one contact, and the load for E = 1 kPa."""
-    anatomy = schema.AnatomySection()
-    tets = tetrahedra.block(anatomy, 700, ((2.0, 1.0, 4.0),))
+    tets = tetrahedra.block(700, ((2.0, 1.0, 4.0),))
     vertices, faces = patch()
     area = surface_embedding.vertex_area(vertices, faces)
     kernel = tool_gesture.footprint(np.array([2.0, 1.0]), 4.0, vertices, area) * area

@@ -35,13 +35,13 @@ def gap(tets: Tets, height: HeightMap) -> float:
 @pytest.mark.slow
 def test_the_boundary_lies_on_the_relief() -> None:
     height = sulci(1.4, 10.0)
-    assert gap(tetrahedra.block(ANATOMY, 1600, FOCUS, height), height) < 0.02
-    assert gap(tetrahedra.block(ANATOMY, 1600, FOCUS), height) > 0.4
+    assert gap(tetrahedra.block(1600, FOCUS, height), height) < 0.02
+    assert gap(tetrahedra.block(1600, FOCUS), height) > 0.4
 
 
 def test_steep_clefts_leave_the_elements_sound_and_are_followed_closer_by_finer_meshes() -> None:
     clefts = sulci(2.0, 3.0)  # walls of up to 64 degrees
-    coarse, fine = (tetrahedra.block(ANATOMY, n, FOCUS, clefts) for n in (1600, 5000))
+    coarse, fine = (tetrahedra.block(n, FOCUS, clefts) for n in (1600, 5000))
     for tets in (coarse, fine):
         assert quality(tets.points[tets.cells[:, :4]]).min() > 0.2
         assert jacobians(tets.points, tets.cells).min() > 0.4
@@ -50,8 +50,8 @@ def test_steep_clefts_leave_the_elements_sound_and_are_followed_closer_by_finer_
 
 def test_a_wild_relief_leaves_the_elements_sound() -> None:
     rough = HeightMap(np.random.default_rng(0).normal(0, 30.0, (SIDE, SIDE)), EXTENT)
-    plain = tetrahedra.block(ANATOMY, 400, FOCUS)
+    plain = tetrahedra.block(400, FOCUS)
     least = quality(plain.points[plain.cells[:, :4]]).min()
-    for tets in (tetrahedra.block(ANATOMY, n, FOCUS, rough) for n in (400, 3000)):
+    for tets in (tetrahedra.block(n, FOCUS, rough) for n in (400, 3000)):
         assert quality(tets.points[tets.cells[:, :4]]).min() >= min(0.2, least) - 1e-9
         assert jacobians(tets.points, tets.cells).min() >= 0.4

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dome import ANATOMY, OPENING_MM, block, patch
+from dome import OPENING_MM, block, patch
 from pydantic import ValidationError
 
 from synth.errors import UserError
-from synth.fem import surface_embedding
+from synth.fem import law_choice, surface_embedding
 from synth.fem.deformation import Deformation
 from synth.fem.equilibrium import InvertedElement
 from synth.fem.material import Tissue
@@ -16,8 +16,9 @@ from synth.fem.mesh import tetrahedra
 from synth.fem.mesh.refine import EDGES
 from synth.fem.solver import deform
 from synth.fem.tool_gesture import Gesture
-from synth.job import law_choice, schema
+from synth.job import schema
 from synth.sequence import scenario
+from synth.sequence.draw import read_scheme
 
 
 def drawn(fem: schema.FemSection, tissue: Tissue) -> Gesture:
@@ -26,11 +27,13 @@ def drawn(fem: schema.FemSection, tissue: Tissue) -> Gesture:
 
 def run(fem: schema.FemSection, gesture: Gesture | None = None, frames: int = 12) -> Deformation:
     tissue = scenario.draw_tissue(fem, np.random.default_rng(5))
-    return deform(fem, tissue, [gesture or drawn(fem, tissue)], block(fem), patch(), frames, 25.0)
+    return deform(
+        read_scheme(fem), tissue, [gesture or drawn(fem, tissue)], block(fem), patch(), frames, 25.0
+    )
 
 
 def test_transfer_keeps_force_and_moment() -> None:
-    tets = tetrahedra.block(ANATOMY, 400)
+    tets = tetrahedra.block(400)
     vertices, _ = patch()
     vertices = vertices + np.random.default_rng(0).uniform(-0.7, 0.7, vertices.shape)  # off the surface
     embedding = surface_embedding.embed(tets, vertices)
@@ -43,7 +46,7 @@ def test_transfer_keeps_force_and_moment() -> None:
 
 
 def test_embedding_reproduces_what_the_elements_can_hold() -> None:
-    tets = tetrahedra.block(ANATOMY, 400)
+    tets = tetrahedra.block(400)
     ends = tets.points[tets.cells[:, EDGES]]
     tets.points[tets.cells[:, 4:]] = ends.mean(axis=2)  # curved sides hold no quadratic field
     rng = np.random.default_rng(0)
@@ -80,7 +83,7 @@ def test_rest_frame_is_at_rest_and_the_tool_comes_touches_and_leaves(kind: str) 
 def test_motion_depends_on_force_over_stiffness_alone() -> None:
     fem = schema.FemSection(tets=400)
     tissues = [Tissue(young, 0.4, "neo-hookean") for young in (1.0, 2.5)]
-    one, other = (deform(fem, t, [drawn(fem, t)], block(fem), patch(), 6, 25.0) for t in tissues)
+    one, other = (deform(read_scheme(fem), t, [drawn(fem, t)], block(fem), patch(), 6, 25.0) for t in tissues)
     np.testing.assert_allclose(one.displacement, other.displacement, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(2.5 * one.traction, other.traction, rtol=1e-12, atol=1e-15)
 

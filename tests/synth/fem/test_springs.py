@@ -1,5 +1,7 @@
 """Springs of attachments and of the skull; inertia and relaxation against the equations they step."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -12,9 +14,10 @@ from synth.fem.mesh import attachments, tetrahedra
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.fem.motion import Clock, march_in_time, nodal_mass
 from synth.fem.system import assemble
+from synth.geometry.craniotomy import Attachment
 from synth.job import schema
 
-FALX = schema.AttachmentSection(point=(14, 0, -20), normal=(1, 0, 0), radius_mm=18, thickness_mm=6)
+FALX = Attachment(point=(14, 0, -20), normal=(1, 0, 0), radius_mm=18, thickness_mm=6)
 
 
 def moved(tets: Tets) -> np.ndarray:
@@ -27,12 +30,12 @@ def moved(tets: Tets) -> np.ndarray:
 @pytest.mark.slow
 def test_an_attachment_holds_its_region_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attachments, "FIRM_PER_MM", 20.0)
-    free = tetrahedra.block(schema.AnatomySection(), 2500)
-    held = tetrahedra.block(schema.AnatomySection(attachments=(FALX,)), 2500)
+    free = tetrahedra.block(2500)
+    held = tetrahedra.block(2500, attachments=(FALX,))
     before, after = (np.linalg.norm(moved(tets), axis=1) for tets in (free, held))
     wide = {"radius_mm": FALX.radius_mm + 8, "thickness_mm": FALX.thickness_mm + 16}
     inside = attachments.within(FALX, free.points)
-    beyond = ~attachments.within(FALX.model_copy(update=wide), free.points)
+    beyond = ~attachments.within(replace(FALX, **wide), free.points)
     assert inside.sum() >= 3
     assert after[inside].sum() < 0.1 * before[inside].sum()
     assert after[beyond].sum() > 0.6 * before[beyond].sum()
@@ -40,25 +43,25 @@ def test_an_attachment_holds_its_region_alone(monkeypatch: pytest.MonkeyPatch) -
 
 def test_springs_scale_with_the_attachments_volume() -> None:
     """A rigid shift by 1 mm costs firm/thickness times the volume of the sheet."""
-    tets = tetrahedra.block(schema.AnatomySection(), 1500)
-    disc = schema.AttachmentSection(point=(0, 0, -25), normal=(0, 0.6, 0.8), radius_mm=15, thickness_mm=4)
+    tets = tetrahedra.block(1500)
+    disc = Attachment(point=(0, 0, -25), normal=(0, 0.6, 0.8), radius_mm=15, thickness_mm=4)
     ones = np.ones(len(tets.points))
     total = ones @ (attachments.springs(tets.points, tets.cells, (disc,)) @ ones)
     assert total == pytest.approx(2 * np.pi * 15**2, rel=0.05)
 
 
 def test_an_attachment_without_tissue_or_direction_is_refused() -> None:
-    nowhere = schema.AttachmentSection(point=(0, 0, 40), radius_mm=5)
+    nowhere = Attachment(point=(0, 0, 40), radius_mm=5)
     with pytest.raises(UserError, match="attachments"):
-        tetrahedra.block(schema.AnatomySection(attachments=(nowhere,)), 300)
+        tetrahedra.block(300, attachments=(nowhere,))
     for wrong in ({"normal": (0, 0, 0)}, {"radius_mm": -1}):
         with pytest.raises(ValidationError):
             schema.AttachmentSection.model_validate({"point": (0, 0, -20), "radius_mm": 5} | wrong)
 
 
 def test_slip_is_as_firm_along_the_normal_and_free_along_the_surface() -> None:
-    bonded = tetrahedra.block(ANATOMY, 300)
-    slipping = tetrahedra.block(ANATOMY, 300, slips=True)
+    bonded = tetrahedra.block(300)
+    slipping = tetrahedra.block(300, slips=True)
     assert bonded.slip is None
     assert slipping.slip is not None
     soft, firm = assemble(slipping, "linear", 0.4), assemble(bonded, "linear", 0.4)
@@ -81,7 +84,7 @@ def test_slip_is_as_firm_along_the_normal_and_free_along_the_surface() -> None:
 
 
 def test_damped_motion_comes_to_rest_in_equilibrium() -> None:
-    tets = tetrahedra.block(ANATOMY, 300, slips=True)
+    tets = tetrahedra.block(300, slips=True)
     load = np.zeros_like(tets.points)
     load[np.hypot(*tets.points[:, :2].T) < 15] = [0.05, 0.0, -0.02]
     loads, tissue = np.stack([load] * 40), Tissue(1.0, 0.4, "linear")

@@ -1,13 +1,15 @@
 """Job files: read as written, errors reported with their place; named jobs can all be drawn."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from synth.errors import UserError
 from synth.job import identity, job_writer, reader
-from synth.job.schema import Job
-from synth.sequence import scenario
+from synth.job.schema import Family, Job
+from synth.render.appearance.family import FAMILIES
+from synth.sequence.draw import draw_scenario
 
 BAD = """\
 seed: -1
@@ -76,7 +78,7 @@ HOME = Path(__file__).resolve().parents[3]
 def test_a_named_job_is_read_and_drawn(name: str) -> None:
     job = reader.load_job(name)
     for index in range(min(job.sequences, 5)):
-        assert scenario.draw_scenario(job, index).gestures
+        assert draw_scenario(job, index).gestures
 
 
 def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data() -> None:
@@ -87,3 +89,7 @@ def test_out_of_distribution_appearance_and_anatomy_are_not_in_the_training_data
     assert ood.anatomy.sulcus_mm[1] <= train.anatomy.sulcus_mm[0]
     assert ood.fem == train.fem == bench.fem
     assert len({job.seed for job in (train, bench, ood)}) == 3
+
+
+def test_every_family_has_its_ranges() -> None:
+    assert get_args(Family) == tuple(FAMILIES)

@@ -15,6 +15,7 @@ from synth.render.anatomy.surface import CortexSurface, Relief
 from synth.render.appearance import light
 from synth.render.camera import camera
 from synth.sequence import scenario
+from synth.sequence.draw import read_lens
 
 JOB = Job.model_validate({"anatomy": {"vertices": 2500}, "render": {"size": (64, 48)}})
 
@@ -28,7 +29,7 @@ def brain() -> CortexSurface:
     corners = points[ball.faces].reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3).astype(np.int32)
     faces[::2] = faces[::2, ::-1]
-    return anatomy.grow(Relief(3, 12.0, 1.0), JOB.anatomy, Shape(corners, faces))
+    return anatomy.grow(Relief(3, 12.0, 1.0), vertices=2500, brain=Shape(corners, faces))
 
 
 def test_a_users_brain_keeps_its_shape(brain: CortexSurface) -> None:
@@ -52,7 +53,7 @@ def test_a_photograph_is_the_albedo(brain: CortexSurface, tmp_path: Path) -> Non
 
 def test_the_spot_moves_with_the_microscope_and_is_the_same_for_both_cameras() -> None:
     render = RenderSection(stereo_mm=24.0)
-    lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), render)
+    lens = camera.place(scenario.draw_view(render, np.random.default_rng(2)), read_lens(render))
     drawn = scenario.draw_light(LightSection(even=(0.3, 0.3)), np.random.default_rng(0))
     right = camera.right_camera(lens, 24.0)
     field = lens.size[0] * lens.mm_per_px

@@ -10,15 +10,16 @@ from synth.errors import UserError
 from synth.job.schema import RenderSection
 from synth.render.camera import camera
 from synth.sequence import scenario
+from synth.sequence.draw import read_lens
 
 STRONG = (-0.3, 0.2, 0.01, -0.02, 0.1)
 RENDER = RenderSection(tilt_deg=(15.0, 15.0), drift_mm=(0.4, 0.4))
-LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), RENDER)
+LENS = camera.place(scenario.draw_view(RENDER, np.random.default_rng(1)), read_lens(RENDER))
 
 
 def distorted(distortion: tuple[float, ...]) -> camera.Camera:
     render = RenderSection(size=(160, 120), distortion=distortion, field_mm=(150.0, 150.0))
-    return camera.place(scenario.draw_view(render, np.random.default_rng(3)), render)
+    return camera.place(scenario.draw_view(render, np.random.default_rng(3)), read_lens(render))
 
 
 def assert_projects_as_opencv(lens: camera.Camera, points: np.ndarray) -> None:
@@ -41,7 +42,7 @@ def test_a_ray_comes_back_to_its_pixel(distortion: tuple[float, ...]) -> None:
 
 def test_it_looks_at_the_craniotomy_from_its_distance_and_tilt() -> None:
     render = RenderSection(tilt_deg=(15.0, 15.0), working_distance_mm=(300.0, 300.0), field_mm=(35.0, 35.0))
-    lens = camera.place(scenario.draw_view(render, np.random.default_rng(1)), render)
+    lens = camera.place(scenario.draw_view(render, np.random.default_rng(1)), read_lens(render))
     np.testing.assert_allclose(camera.project(lens, np.zeros((1, 3)))[0], [319.5, 239.5])
     assert np.linalg.norm(lens.centre) == pytest.approx(300)
     assert np.degrees(np.arccos(lens.centre[2] / 300)) == pytest.approx(15)

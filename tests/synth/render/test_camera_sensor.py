@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from synth.job.schema import SensorSection
-from synth.render.camera import camera_sensor, video_link
+from synth.render.camera import camera_sensor
 from synth.render.camera.camera_sensor import CameraSensor, processed, record
 from synth.render.camera.colour_processing import CAMERAS, KNOTS, encoded
 from synth.render.camera.colour_processing import PLAIN as ORDINARY
+from synth.render.camera.video_link import transmit
 
 SRGB = (tuple(encoded(np.array(KNOTS)).tolist()),) * 3
 PLAIN = CameraSensor(vignette=0.0, bloom=0.0, curves=SRGB, sharpening=0.0)
@@ -104,9 +105,9 @@ def test_the_codec_is_deterministic_and_loses_more_at_a_lower_bitrate(chroma: st
     errors = []
     for rate in (0.02, 5.0):
         section = SensorSection.model_validate({"bitrate_mbps": rate, "chroma": chroma})
-        back = video_link.recorded(video, section, 25.0)
+        back = transmit(video, 25.0, section.bitrate_mbps, section.chroma)
         assert back.shape == video.shape
-        assert (back == video_link.recorded(video, section, 25.0)).all()
+        assert (back == transmit(video, 25.0, section.bitrate_mbps, section.chroma)).all()
         errors.append(np.abs(back.astype(int) - video).mean())
     assert errors[1] < 4
     assert errors[0] > 2 * errors[1]
@@ -115,8 +116,8 @@ def test_the_codec_is_deterministic_and_loses_more_at_a_lower_bitrate(chroma: st
 def test_odd_sizes_and_no_codec() -> None:
     video = np.full((3, 33, 35, 3), 90, np.uint8)
     section = SensorSection.model_validate({"bitrate_mbps": 1.0, "chroma": "4:2:0"})
-    assert np.abs(video_link.recorded(video, section, 25.0).astype(int) - 90).max() <= 4
-    assert video_link.recorded(video, SensorSection(), 25.0) is video
+    assert np.abs(transmit(video, 25.0, section.bitrate_mbps, section.chroma).astype(int) - 90).max() <= 4
+    assert transmit(video, 25.0, None) is video
 
 
 def test_the_sensor_is_the_chain_of_its_parts() -> None:

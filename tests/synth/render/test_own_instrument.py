@@ -10,17 +10,20 @@ import trimesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial import ConvexHull
 
-from synth.dataset.dataset_folder import Part
+from synth.dataset import dataset_folder
 from synth.engine.run import render_job
 from synth.errors import Caution, UserError
 from synth.job import identity, job_writer, reader
 from synth.job.schema import Job
 from synth.render.camera.camera import project
-from synth.render.instrument import place
-from synth.render.own_instrument import outline_mesh, place_mesh, read_own_instruments
+from synth.render.finish import Finish
+from synth.render.finish_maps import unfold, wrap
+from synth.render.instrument import Part, place
+from synth.render.own_instrument import outline_mesh, place_mesh
 from synth.render.scene import SceneState
+from synth.sequence.draw import draw_scenario
+from synth.sequence.job_instruments import read_job_instruments
 from synth.sequence.rest_scene import at_rest
-from synth.sequence.scenario import draw_scenario
 
 TIP, HAND = (5.0, -3.0, 2.0), (5.0, -3.0, 122.0)
 
@@ -56,7 +59,7 @@ def test_formats_give_one_shape(tmp_path: Path, suffix: str) -> None:
         if suffix != "obj"
         else trimesh.exchange.obj.export_obj(rod()).encode()
     )
-    own = read_own_instruments(job_of(file).fem)[file.name]
+    own = read_job_instruments(job_of(file).fem)[file.name]
     corners = own.part.profile[own.part.shape.faces]
     volume = np.einsum("fc,fc->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
     assert volume == pytest.approx(rod().volume, rel=1e-5)
@@ -67,7 +70,7 @@ def test_formats_give_one_shape(tmp_path: Path, suffix: str) -> None:
 def test_faces_that_turn_inwards_are_turned(tmp_path: Path) -> None:
     mesh = rod()
     trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False).export(tmp_path / "in.stl")
-    shape = read_own_instruments(job_of(tmp_path / "in.stl").fem)["in.stl"].part.shape
+    shape = read_job_instruments(job_of(tmp_path / "in.stl").fem)["in.stl"].part.shape
     assert trimesh.Trimesh(*shape, process=False).volume == pytest.approx(mesh.volume, rel=1e-5)
 
 
@@ -80,6 +83,18 @@ def test_an_outline_encloses_its_mesh() -> None:
     away = np.linalg.norm(points[:, :2] - middle[slice_, :2], axis=1)
     assert (away <= radius[slice_] + 1e-6).all()
     assert radius.max() < 6  # of a leaning rod of 1.5 mm, in slices of 2.3 mm
+
+
+def test_its_texture_is_placed_as_that_of_the_rings_around_it() -> None:
+    mesh = rod(((1, 2, 0), (1, 2, 60)))
+    outline = outline_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    own = Part(np.asarray(mesh.vertices), 0, faces=np.asarray(mesh.faces, np.int32), outline=outline)
+    ends = np.interp(own.profile[:, 2], [0, 60], [0.5 / 49, 48.5 / 49])
+    np.testing.assert_allclose(own.uv[:, 0], ends, atol=1e-6)  # linear in z
+    np.testing.assert_allclose(wrap(outline, outline), unfold(outline, 0), atol=1e-6)
+    maps = own.maps(Finish((0.6, 0.6, 0.6), 0.2), "rod.stl", np.random.default_rng(0), 0.1)
+    assert np.isfinite(maps.base).all()
+    np.testing.assert_allclose(own.resize(2.0).uv, own.uv, atol=1e-6)
 
 
 def damaged(file: Path) -> None:
@@ -210,7 +225,7 @@ def test_it_is_drawn_and_shades_where_it_touches(tmp_path: Path) -> None:
     gesture = rest.scenario.gestures[0]
     under = rest.surface.vertices[np.hypot(*rest.surface.vertices[:, :2].T).argmin()]
     tips, shafts = np.stack([under, under]), np.stack([gesture.shaft, gesture.shaft])
-    (vertices,) = place([read_own_instruments(job.fem)["rod.stl"].part], tips, shafts)
+    (vertices,) = place([read_job_instruments(job.fem)["rod.stl"].part], tips, shafts)
     end = vertices[np.linalg.norm(vertices - under, axis=1) < 2]
     np.testing.assert_allclose(end.mean(axis=0), under, atol=0.3)  # its end's rim is around the contact
     shown = rest.renderer.render(SceneState(rest.surface.vertices, tips, shafts), 0)
@@ -234,7 +249,7 @@ def test_parts_and_workers_draw_it(tmp_path: Path) -> None:
     rod().export(tmp_path / "rod.stl")
     job = job_of(tmp_path / "rod.stl").model_copy(update={"sequences": 2})
     whole = render_job(job, tmp_path / "whole", workers=1)
-    parts = [render_job(job, tmp_path / "parts", workers=1, part=Part(k, 2)) for k in (1, 2)]
+    parts = [render_job(job, tmp_path / "parts", workers=1, part=dataset_folder.Part(k, 2)) for k in (1, 2)]
     assert not whole.failed
     assert parts[1].content_hash == whole.content_hash
     rod(radius=1.0).export(tmp_path / "rod.stl")

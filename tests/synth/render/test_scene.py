@@ -20,6 +20,7 @@ from synth.render.craniotomy import craniotomy
 from synth.render.mitsuba.adapter import pick
 from synth.render.scene import Renderer, SceneState
 from synth.sequence import scenario
+from synth.sequence.draw import place_right, read_lens
 from synth.sequence.rest_scene import at_rest
 from synth.system import gpu, llvm
 
@@ -33,15 +34,17 @@ SHAFTS = np.array([[0.6, 0.3, 0.74], [0.6, 0.3, 0.74]])
 def made(
     variant: str, spp: int = 4, extra: tuple[str, ...] = (), tool: bool = True, **render: object
 ) -> tuple[Renderer, np.ndarray]:
-    settings = {"size": (96, 72), "spp": spp, "variant": variant, **render}
+    settings = {"size": (96, 72), "spp": spp, "variant": variant, "scenery": (), **render}
     job = Job(anatomy=AnatomySection(vertices=2500), render=RenderSection.model_validate(settings))
-    surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), job.anatomy)
+    surface = anatomy.grow(scenario.draw_relief(job.anatomy, np.random.default_rng(4)), vertices=2500)
     view = scenario.draw_view(job.render, np.random.default_rng(4))
     appearance = scenario.draw_appearance(job, "healthy", np.random.default_rng(4))
     appearance = replace(appearance, scenery=job.render.scenery)
-    lens = camera.place(view, job.render)
-    content = craniotomy(surface, appearance, lens, job, [("forceps" if tool else "none", 4.0)])
-    return Renderer(content, lens, appearance.sensor, job.render, extra), surface.vertices
+    lens = camera.place(view, read_lens(job.render))
+    content = craniotomy(surface, appearance, lens, 12.0, [("forceps" if tool else "none", 4.0)])
+    right = place_right(job.render, lens)
+    ours = Renderer(content, lens, appearance.sensor, extra, right, spp=spp, variant=variant)
+    return ours, surface.vertices
 
 
 def test_same_seed_same_bytes() -> None:
@@ -223,7 +226,7 @@ def test_scenes_share_their_kernels_with_scenery_and_without() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     bare = reader.load_job("demo", SMALL)
-    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, bone, drape]"])
+    dressed = reader.load_job("demo", [*SMALL, "render.scenery=[retractor, bone, drape, clips]"])
     large = []
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
@@ -246,7 +249,7 @@ def test_idle_instruments_hide_tissue_and_touch_none() -> None:
     tissue = cKDTree(rest.surface.vertices[:, :2])
     for seed in range(5):
         waiting = idle.draw_idle(1.0, np.random.default_rng(seed), 14.0, 15.0, np.zeros((0, 2, 3)))
-        scene = replace(rest, scenario=replace(rest.scenario, idle=waiting))
+        scene = replace(rest, draw=replace(rest.draw, scenario=replace(rest.scenario, idle=waiting)))
         mesh = scene.renderer.content.instruments
         for seconds in (0.0, 1.3, 2.9) if waiting else ():
             pose = idle.with_idle(waiting, seconds, TIPS, SHAFTS)

@@ -5,14 +5,13 @@ import pytest
 import trimesh
 
 from synth.geometry.triangles import Shape, grid_faces, joined, normals
-from synth.job.schema import RenderSection
 from synth.render import instrument, truth
 from synth.render.camera import camera
 from synth.render.materials import Lamp
 from synth.render.shadow import shadow_map, window
 
 SIZE = (48, 36)
-LENS = camera.place(camera.CameraView(24.0, 150.0, 10.0, 40.0, 20.0, 0.0), RenderSection(size=SIZE))
+LENS = camera.place(camera.CameraView(24.0, 150.0, 10.0, 40.0, 20.0, 0.0), camera.Lens(SIZE))
 RAYS = camera.rays(LENS, camera.pixel_grid(SIZE))
 
 

@@ -14,19 +14,20 @@ from synth.render.anatomy import surface as anatomy
 from synth.render.camera import camera
 from synth.render.camera.camera import Camera
 from synth.sequence import scenario
+from synth.sequence.draw import read_lens
 
 NOTHING = Shape(np.array([[0.0, 0.0, -900.0]] * 3), np.array([[0, 1, 2]], np.int32))
 
 
 def grown(vertices: int) -> Shape:
     section = AnatomySection(vertices=vertices)
-    found = anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), section)
+    found = anatomy.grow(scenario.draw_relief(section, np.random.default_rng(5)), vertices=vertices)
     return Shape(found.vertices, found.faces)
 
 
 def placed(**render: object) -> Camera:
     section = RenderSection.model_validate(render)
-    return camera.place(scenario.draw_view(section, np.random.default_rng(2)), section)
+    return camera.place(scenario.draw_view(section, np.random.default_rng(2)), read_lens(section))
 
 
 @pytest.fixture(scope="module")

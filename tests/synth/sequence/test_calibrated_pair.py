@@ -17,6 +17,7 @@ from synth.publish.export import tapvid
 from synth.render.camera import camera
 from synth.render.mitsuba import lens
 from synth.sequence import scenario
+from synth.sequence.draw import read_lens
 from synth.sequence.pipeline import write_scene
 from synth.sequence.simulation import simulate
 
@@ -120,7 +121,7 @@ def test_the_compiled_lens_inverts_a_strong_distortion(tmp_path: Path) -> None:
     bent = np.array([[-0.3, 0.05, 0.0, 0.0, 0.0]])
     K = np.array([[80.0, 0, 63.5], [0, 80.0, 47.5], [0, 0, 1]])
     render = job(written(tmp_path / "pair.yaml", K1=K, D1=bent)).render
-    view = camera.place(scenario.draw_view(render, np.random.default_rng(0)), render)
+    view = camera.place(scenario.draw_view(render, np.random.default_rng(0)), read_lens(render))
     rounds = lens._rounds(view)
     assert rounds > 6
     pixels = camera.pixel_grid(view.size)

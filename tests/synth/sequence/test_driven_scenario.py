@@ -10,9 +10,10 @@ from synth.fem.tool_gesture import trajectory
 from synth.job import reader
 from synth.job.mechanics_sections import DRIVEN_SIZES_MM
 from synth.job.schema import FemSection, Job
+from synth.sequence.draw import draw_scenario
 from synth.sequence.fem_mechanics import FemMechanics
 from synth.sequence.rest_scene import RestScene
-from synth.sequence.scenario import draw_gestures, draw_scenario
+from synth.sequence.scenario import draw_gestures
 from synth.sequence.simulation import simulate
 from synth.system.stopwatch import StageCallback, Stopwatch
 
@@ -115,7 +116,29 @@ def test_motions_of_the_job_for_flow_are_spread_evenly_over_decades() -> None:
         aside = np.hypot(*gesture.direction[:2])
         per_mm = flow.render.size[0] / drawn[2].uniform(*flow.render.field_mm)
         load = trajectory(gesture, flow.frames).load
+        assert np.flatnonzero(load == 0).tolist() == [0, flow.frames - 1]
         pixels += (load[load > 0] * gesture.drive.travel_mm * aside * per_mm).tolist()
     ends = [0.1, 1, 10, 80]
     share = np.histogram(pixels, ends)[0] / np.diff(np.log10(ends))
-    assert np.abs(share / share.mean() - 1).max() < 0.3
+    assert np.abs(share / share.mean() - 1).max() < 0.2
+
+
+def test_a_job_with_both_contacts_draws_each_in_half_of_the_sequences() -> None:
+    """Forces and ways are as in jobs of one kind of contact; the law follows the contact."""
+    both = {"contact": ["loaded", "driven"], "travel_mm": [0.5, 2], "force_mn": [1, 3], "young_kpa": 2}
+    scenes = Job.model_validate({"sequences": 80, "fem": both})
+    drawn = [draw_scenario(scenes, index) for index in range(80)]
+    driven = [case for case in drawn if case.gestures[0].drive is not None]
+    loaded = [case for case in drawn if case.gestures[0].drive is None]
+    assert 25 < len(driven) < 55
+    assert {case.tissue.law for case in driven} == {"ogden"}
+    assert "ogden" not in {case.tissue.law for case in loaded}
+    assert all(0 < case.gestures[0].drive.travel_mm <= 2 for case in driven)  # type: ignore[union-attr, operator]
+    assert all(1 <= case.gestures[0].force_mn <= 3.1 for case in loaded if case.gestures[0].kind != "grasp")
+    assert "slide" in {case.gestures[0].kind for case in loaded}
+    assert "slide" not in {case.gestures[0].kind for case in driven}
+
+
+def test_driven_contacts_next_to_loaded_ones_need_their_way() -> None:
+    with pytest.raises(ValidationError):
+        FemSection.model_validate({"contact": ["loaded", "driven"], "force_mn": 3})

@@ -17,7 +17,7 @@ from synth.checks.verify import verify_dataset
 from synth.dataset.store import Dataset
 from synth.fem.pulse import Pulse
 from synth.geometry.brain_surface import load_brain, read_brain
-from synth.job.schema import CraniotomySection
+from synth.geometry.craniotomy import Craniotomy
 from synth.render.camera import camera as cameras
 from synth.sequence.rest_scene import RestScene, draw_craniotomy
 
@@ -42,7 +42,7 @@ def bare(job: synth.Job, pulse: Pulse | None = None) -> synth.Scenario:
 
 
 def test_a_placed_brain_is_mapped_back_to_the_coordinates_of_its_file(egg: Path) -> None:
-    brain = load_brain(egg, CraniotomySection.model_validate(TILTED))
+    brain = load_brain(egg, Craniotomy(**TILTED))
     back = np.linalg.inv(brain.to_world)
     found = brain.shape.vertices @ back[:3, :3].T + back[:3, 3]
     assert np.abs(found - read_brain(egg)[0]).max() < 1e-9

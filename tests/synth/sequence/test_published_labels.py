@@ -35,17 +35,17 @@ def test_intensity_peaks_at_the_total_force_and_keeps_direction() -> None:
 def test_first_stage_has_the_given_deviation() -> None:
     label = np.zeros((*SIZE, 3))
     label[..., 2] = 50.0
-    noisy = published_labels.with_noise(label, TISSUE, 0.02, np.random.default_rng(0))
+    noisy = published_labels.add_noise(label, TISSUE, 0.02, np.random.default_rng(0))
     assert not noisy[~TISSUE].any()
     assert (noisy - label)[TISSUE].std() == pytest.approx(1.0, rel=0.05)
-    still = published_labels.with_noise(label, TISSUE, 0.0, np.random.default_rng(0))
+    still = published_labels.add_noise(label, TISSUE, 0.0, np.random.default_rng(0))
     np.testing.assert_array_equal(still[TISSUE], label[TISSUE])
 
 
 def test_second_stage_disturbs_the_given_share_away_from_the_contact() -> None:
     flow, load = scene()
     label = np.linalg.norm(published_labels.intensity(load, 70.0), axis=-1)
-    noisy, left = published_labels.disturbed(flow, label, TISSUE, np.random.default_rng(0))
+    noisy, left = published_labels.disturb(flow, label, TISSUE, np.random.default_rng(0))
     moved = (noisy != flow).any(axis=-1)
     assert moved.sum() == pytest.approx(0.05 * TISSUE.sum(), abs=1)
     assert not moved[~TISSUE].any()

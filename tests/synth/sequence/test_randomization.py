@@ -16,12 +16,13 @@ from synth.job.schema import Job
 from synth.render.appearance.light import FreeLamp, lamps
 from synth.render.camera import camera
 from synth.render.camera.camera_sensor import CameraSensor, record
-from synth.render.camera.video_link import recorded
+from synth.render.camera.video_link import transmit
 from synth.render.randomized.pattern import Pattern, paint
 from synth.render.scene import Renderer
-from synth.sequence.randomization import randomized
+from synth.sequence.draw import draw, draw_scenario, read_lens
+from synth.sequence.randomization import randomize
 from synth.sequence.rest_scene import at_rest
-from synth.sequence.scenario import Scenario, draw_scenario
+from synth.sequence.scenario import Scenario
 
 COUNT = 100
 SENSOR = CameraSensor(full_well=1e9, read_noise=0.0, sharpening=0.0, bloom=0.0, vignette=0.0)
@@ -35,14 +36,15 @@ def job(strength: float = 1.0, *groups: str, **more: object) -> Job:
 @cache
 def drawn() -> list[tuple[Job, Scenario]]:
     whole = job(1.0, "texture", "surroundings", "light", "camera", "field")
-    return [(randomized(whole, k), draw_scenario(whole, k)) for k in range(COUNT)]
+    drawn = (draw(whole, k) for k in range(COUNT))
+    return [(one.job, one.scenario) for one in drawn]
 
 
 def test_strength_0_is_the_usual_draw_and_a_group_changes_no_other() -> None:
     off, plain = job(0.0, "texture", "surroundings", "light", "camera", "field", "instruments"), job()
     assert draw_scenario(off, 2) == draw_scenario(plain, 2)
     full, (once, case) = job(1.0, "texture", "surroundings", "light", "camera", "field"), drawn()[4]
-    assert randomized(once, 4) == once != full
+    assert randomize(once, 4)[0] == once != full
     assert draw_scenario(once, 4) == case
     assert draw_scenario(job(1.0, "light"), 4).appearance.light.lamps == case.appearance.light.lamps != ()
     assert identify_job(full) != identify_job(plain)
@@ -82,7 +84,7 @@ def test_draws_are_wider_than_the_usual(low: float, high: float, of) -> None:  #
 
 def test_contacts_are_in_view_and_kinds_are_all_drawn() -> None:
     for one, case in drawn():
-        lens, away = camera.place(case.view, one.render), np.array([case.view.working_distance_mm])
+        lens, away = camera.place(case.view, read_lens(one.render)), np.array([case.view.working_distance_mm])
         assert camera.blur_radius(lens, away)[0] < 2.6, "px, of defocus"
         at = camera.project(lens, np.array([(*g.point_mm, 0.0) for g in case.gestures]))
         assert ((at > 0) & (at < [95, 71])).all()
@@ -143,7 +145,7 @@ def test_a_folder_gives_each_sequence_a_picture_and_a_broken_one_ends_in_a_line(
     for name in (names := {"coffee.png", "astronaut.png", "chelsea.png"}):
         (tmp_path / name).write_bytes((Path(skimage.__file__).parent / "data" / name).read_bytes())
     given = job(appearance={"photo": tmp_path})
-    assert {randomized(given, k).appearance.photo.name for k in range(12)} == names  # type: ignore[union-attr]
+    assert {randomize(given, k)[0].appearance.photo.name for k in range(12)} == names  # type: ignore[union-attr]
     before = identify_job(given)
     for name in names:
         (tmp_path / name).write_bytes(b"none")
@@ -155,7 +157,7 @@ def test_a_folder_gives_each_sequence_a_picture_and_a_broken_one_ends_in_a_line(
 def test_lamps_are_where_they_are_drawn_never_below_the_horizon() -> None:
     (_, case), usual = drawn()[0], job()
     for tilt in (3.0, 60.0, 85.0):
-        view = camera.place(replace(case.view, tilt_deg=20.0), usual.render)
+        view = camera.place(replace(case.view, tilt_deg=20.0), read_lens(usual.render))
         one = FreeLamp(tilt, 40.0, 1.0, (1.0, 1.0, 1.0), 0.5)
         (lamp,) = lamps(view, replace(case.appearance.light, lamps=(one,), power=1.0))
         away = np.linalg.norm(lamp.position)
@@ -185,7 +187,12 @@ def test_halos_are_as_wide_as_drawn_and_subsampling_and_codec_take_detail() -> N
     assert half < 0.6 * full
     noisy = np.random.default_rng(1).integers(0, 255, (3, 72, 96, 3), dtype=np.uint8)
     coded = min((one for one, _ in drawn()), key=lambda one: one.sensor.bitrate_mbps or 9)
-    assert np.abs(recorded(noisy, coded.sensor, coded.fps).astype(int) - noisy).mean() > 10
+    assert (
+        np.abs(
+            transmit(noisy, coded.fps, coded.sensor.bitrate_mbps, coded.sensor.chroma).astype(int) - noisy
+        ).mean()
+        > 10
+    )
 
 
 def pattern(kind: str, size: float, slope: float = 1.0) -> Pattern:

@@ -1,6 +1,7 @@
 """A scenario depends on (job, index) only; its contacts lie in the opening and in the picture."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,14 +9,16 @@ import pytest
 from synth.fem import equilibrium
 from synth.job.schema import Job
 from synth.render.camera import camera
-from synth.sequence.scenario import draw_scenario, frame_seeds
+from synth.sequence import randomization
+from synth.sequence.draw import draw, draw_scenario, read_lens
+from synth.sequence.rest_scene import at_rest
 from synth.sequence.simulation import simulate
 
 
 def test_same_job_and_index_draw_the_same_scenario_however_many_sequences_there_are() -> None:
     few, many = Job(seed=7, sequences=3), Job(seed=7, sequences=300)
     assert draw_scenario(few, 2) == draw_scenario(many, 2)
-    assert frame_seeds(few, 2) == frame_seeds(many, 2)
+    assert draw(few, 2).frame_seeds == draw(many, 2).frame_seeds
 
 
 def test_shares_are_drawn_and_unused_quantities_change_no_draw() -> None:
@@ -55,7 +58,7 @@ def test_contacts_keep_to_what_the_camera_shows_of_a_wide_opening(size: tuple[in
     turn = np.linspace(0, 2 * np.pi, 100)
     reach = []
     for case in (draw_scenario(wide, k) for k in range(wide.sequences)):
-        lens, reach_mm = camera.place(case.view, wide.render), case.gestures[0].reach_mm
+        lens, reach_mm = camera.place(case.view, read_lens(wide.render)), case.gestures[0].reach_mm
         circle = reach_mm * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
         pixels = camera.project(lens, circle)
         assert (pixels > -0.6).all()
@@ -88,3 +91,19 @@ def test_a_stated_load_that_the_mesh_does_not_bear_is_refused(brittle: Job) -> N
     fem = brittle.fem.model_validate({"tets": 300, "instrument_list": [given]})
     with pytest.raises(equilibrium.InvertedElement, match=r"load 0\.4"):
         simulate(brittle.model_copy(update={"fem": fem}))
+
+
+def test_a_scene_is_drawn_and_placed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = {name: 0 for name in ("randomize", "place")}
+    for module, name in ((randomization, "randomize"), (camera, "place")):
+        original = getattr(module, name)
+
+        def counted(*args: object, name: str = name, original: Any = original) -> Any:
+            calls[name] += 1
+            return original(*args)
+
+        monkeypatch.setattr(module, name, counted)
+    groups = {"field": 1, "camera": 1, "surroundings": 1}
+    rest = at_rest(Job.model_validate({"anatomy": {"vertices": 900}, "randomize": groups}), 3)
+    assert calls == {"randomize": 1, "place": 1}
+    assert rest.draw.camera is rest.view

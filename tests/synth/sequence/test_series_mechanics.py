@@ -14,11 +14,12 @@ from synth.arrays import Floats
 from synth.checks.verify import verify_dataset
 from synth.cli import app
 from synth.errors import Caution, UserError
-from synth.fem.external.read_series import read_job_series
 from synth.job import identity
 from synth.job.schema import Job
 from synth.render.camera import camera
+from synth.sequence.job_series import read_job_series
 from synth.sequence.rest_scene import draw_craniotomy
+from synth.system import series_files
 
 SMALL = [
     "sequences=1",
@@ -204,7 +205,7 @@ def test_files_enter_the_identity_by_content_and_folders_take_turns(tmp_path: Pa
     for name in ("run_a", "run_b"):
         write(tmp_path / name, "ascii")
     job = job_of(tmp_path / "run_*", *FORCE, "sequences=3")
-    assert [one.name for one in identity.list_sources(job.mechanics)] == ["run_a", "run_b"]
+    assert [one.name for one in series_files.list_sources(tmp_path / "run_*")] == ["run_a", "run_b"]
     before, file = identity.identify_job(job), tmp_path / "run_b" / "block_3.vtu"
     (tmp_path / "elsewhere").mkdir()
     for name in ("run_a", "run_b"):

@@ -50,6 +50,15 @@ def test_tissue_is_found(case: str) -> None:
     assert last.rest.findings[0].cause == "tissue"
 
 
+def test_a_blob_is_held_back() -> None:
+    """What alone moves is a small disc, as an instrument is: no force is stated on it."""
+    disc = np.hypot(X - 70, Y - 60) < 16
+    last = track_video(video(disc, disc.astype(float), 4, 0), SETTINGS).video
+    assert last.rest.tissue.mean() < 0.05
+    assert [one.severity for one in last.rest.findings] == ["error"]
+    assert "tissue.png" in last.rest.findings[0].message
+
+
 def test_the_border_of_the_picture_is_no_edge() -> None:
     assert touches_border(EVERYWHERE) == 1
     assert touches_border(OPENING) == 0

@@ -64,3 +64,28 @@ def test_the_surface_follows_the_tissue_and_a_slope_is_not_a_jump() -> None:
     step = np.stack([0 * X, 5.0 * (X > 80)], -1).astype(np.float32)
     assert flow_jump(step)[20:-20, 60:100].max() == pytest.approx(5.0)
     assert flow_jump(np.stack([X / 9, Y / 7], -1))[20:-20, 20:-20].max() < 1e-3
+
+
+@pytest.mark.parametrize("away_px", [0, 14])
+def test_what_has_moved_under_a_mask_is_held_by_it_and_an_object_beside_it_is_not(away_px: int) -> None:
+    """Tissue moves 20 px down, under a rod's mask; or under a wider object that the mask covers in part."""
+    shift = np.stack([0 * X, np.full_like(Y, 20.0)], -1)
+    picture, rest = np.abs(Y - 80) < 8, np.abs(Y - 60) < 8
+    lost = rest if away_px == 0 else np.abs(Y - 60 - away_px) < 8 + away_px
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
+    for k in range(4):
+        sure = np.where(lost & (k > 0), 0.1, 1).astype(np.float32)
+        search.add(FrameMotion(min(k, 1) * shift, sure, is_rest=k == 0, index=k, masked=picture & (k > 0)))
+    assert bool(search.findings) is (away_px > 0)
+
+
+@pytest.mark.parametrize("grey", [120, 190])
+def test_tissue_that_flow_loses_as_it_moves_far_is_no_object_and_another_colour_is(grey: int) -> None:
+    rest, lost = np.full((*SHAPE, 3), 120, np.uint8), np.hypot(Y - 60, X - 80) < 25
+    now = np.where(lost[..., None], grey, rest).astype(np.uint8)
+    search = ForegroundSearch(np.ones(SHAPE, bool), 1, is_stated=True, has_masks=True)
+    for k in range(4):
+        sure = np.where(lost & (k > 0), 0.1, 1).astype(np.float32)
+        motion = min(k, 1) * load(25.0)
+        search.add(FrameMotion(motion, sure, is_rest=k == 0, index=k, rgb=now if k else rest))
+    assert bool(search.findings) is (grey > 120)

@@ -1,0 +1,162 @@
+"""One 90% interval of the leading force, from what a video shows and states without the truth.
+
+Half the width is P s(x) q. P is the video's largest estimate. s is the expected error over P, log-linear in
+features x of a frame and of its video (`ErrorModel`): the size of the estimate, how far network, physics and
+mean flow disagree, the spread of physics' posterior, and what is stated. q are the 5% and 95% quantiles of
+the error over P s, which differ as force is rather missed than invented, by hierarchical split conformal
+prediction over recordings of several makes (`learn.uncertainty.conformal`). `weights.interval_table` fits
+them, cross-validates them by make, and writes the table. A video whose features lie beyond those of the
+table's recordings has no interval.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from pydantic import ConfigDict, FiniteFloat, TypeAdapter
+
+from bench.methods.force_mixture import ForceMixture
+from learn.uncertainty.error_model import ErrorModel
+from synth.arrays import Floats
+from synth.job.types import Positive
+
+LEVEL = 0.9
+TABLE = Path(__file__).with_suffix(".json")
+NAMES = {
+    "size": "size of the force",
+    "disagreement": "disagreement of network and physics",
+    "spread": "spread of physics' posterior",
+    "overall disagreement": "disagreement of network and physics over the video",
+    "overall spread": "spread of physics' posterior over the video",
+    "shape": "disagreement of force and mean flow",
+    "motion": "amount of motion",
+    "stated": "what is stated",
+}
+"""What each feature is, in words."""
+OF_VIDEO = ("overall disagreement", "overall spread", "shape", "motion")
+"""Features of a video, on which it depends whether the table holds for it."""
+# Added before logarithms, so that small values aren't distinguished; of the largest force, and mm.
+_SIZE, _APART, _SPREAD, _SHAPE, _MOTION_MM = 0.05, 0.03, 0.02, 0.02, 0.005
+_LARGEST = 0.98  # quantile over the frames that is the largest: without outliers
+_BEYOND = 0.15  # share of a feature's range by which a video may lie outside it
+_NORMAL = 1.645  # 95% quantile of the normal distribution
+
+
+@dataclass(frozen=True, eq=False)
+class VideoEstimates:
+    """The forces of a video's T tracked frames, and what is known of them."""
+
+    leading_mn: Floats  # (T, 3)
+    network_mn: Floats  # (T, 3)
+    physics_mn: Floats  # (T, 3)
+    spread_mn: Floats  # (T,) standard deviation of physics' posterior
+    motion_mm: Floats  # (T,) mean length of the flow over the tissue
+    cameras: int
+    stated: float
+    """Share of tissue, instruments, membrane and rest (or ex vivo) that the recording states, 0 to 1."""
+
+    @property
+    def largest_mn(self) -> float:
+        """The largest leading force."""
+        return float(np.quantile(np.linalg.norm(self.leading_mn, axis=1), _LARGEST))
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """Error model and quantiles for recordings of one number of cameras."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    error: ErrorModel
+    below: Positive  # factors of the expected error, to the lower end
+    above: Positive  # and to the upper
+    recordings: int
+    scores: int  # recordings, each with more and with less stated
+
+
+@dataclass(frozen=True)
+class IntervalTable:
+    """Calibration of the interval, as stored in the package."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    features: tuple[str, ...]
+    by_cameras: dict[int, CameraModel]
+    makes: dict[str, int]  # recordings of each make
+    networks: dict[str, str]  # identities of the calibrated networks, by name
+    stating: dict[str, Positive]
+    """Mean width of the intervals with what a recording may state over that without it."""
+    reached: dict[str, dict[str, FiniteFloat]]
+    """Counts, holds and widths by cross-validation: each make is calibrated without its recordings."""
+
+    def bound(self, video: VideoEstimates, gain: float) -> tuple[Floats, Floats]:
+        """Lower and upper ends (T,) mN. `gain`: relative standard deviation of every force, from E."""
+        model, size = self.by_cameras[video.cameras], np.linalg.norm(video.leading_mn, axis=1)
+        half = video.largest_mn * model.error.predict(describe(video))
+        common = _NORMAL * gain * size
+        low = size - np.hypot(model.below * half, common)
+        return np.maximum(low, 0.0), size + np.hypot(model.above * half, common)
+
+    def find_gaps(self, video: VideoEstimates) -> list[str]:
+        """The features in which a video is beyond the table's recordings, in words; empty: none."""
+        if video.cameras not in self.by_cameras:
+            return [f"{video.cameras} cameras"]
+        error, values = self.by_cameras[video.cameras].error, describe(video)[0]
+        gaps = []
+        for k, name in enumerate(self.features):
+            spare = _BEYOND * (error.high[k] - error.low[k])
+            if name in OF_VIDEO and not error.low[k] - spare <= values[k] <= error.high[k] + spare:
+                gaps.append(f"{NAMES[name]} ({'low' if values[k] < error.low[k] else 'high'})")
+        return gaps
+
+    def find_reason(self, video: VideoEstimates, network: str) -> str:
+        """Why a video's force has no interval; empty if it has one. `network`: its identity."""
+        if network not in self.networks.values():
+            return "no interval: it is calibrated for the pretrained networks"
+        if gaps := self.find_gaps(video):
+            return f"no interval: beyond the recordings that it is calibrated on in {' and '.join(gaps)}"
+        return ""
+
+
+@lru_cache(maxsize=1)
+def read_table() -> IntervalTable:
+    """The package's calibration."""
+    return TypeAdapter(IntervalTable).validate_python(json.loads(TABLE.read_text("utf-8")))
+
+
+def describe(video: VideoEstimates) -> Floats:
+    """Features (T, F) of a video's frames, in the order of `NAMES`."""
+    size, most = np.linalg.norm(video.leading_mn, axis=1), max(video.largest_mn, 1e-9)
+    apart = np.linalg.norm(video.network_mn - video.physics_mn, axis=1)
+    whole = max(_rms(size), 1e-9)
+    moves = np.ptp(video.motion_mm) > 0 and np.ptp(size) > 0
+    r = float(np.corrcoef(video.motion_mm, size)[0, 1]) if moves else 0.0
+    of_video = (
+        np.log(_rms(apart) / whole + _APART),
+        np.log(_rms(video.spread_mn) / whole + _SPREAD),
+        np.log(1 + _SHAPE - r),
+        np.log(float(np.quantile(video.motion_mm, _LARGEST)) + _MOTION_MM),
+        video.stated,
+    )
+    columns = (
+        np.log(size / most + _SIZE),
+        np.log(apart / most + _APART),
+        np.log(video.spread_mn / most + _SPREAD),
+        *(np.full(len(size), value) for value in of_video),
+    )
+    return np.stack(columns, axis=1)
+
+
+def find_spread(likely: ForceMixture) -> float:
+    """Standard deviation of a distribution of force: root of the trace of its covariance."""
+    off = likely.force - likely.mean
+    within = np.trace(likely.covariance, axis1=1, axis2=2)
+    return float(np.sqrt(likely.weight @ (within + np.square(off).sum(axis=1))))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,132 @@
+"""Fine branches that grow from a tree of vessels into the space that it leaves empty.
+
+Space colonisation: points that need supply pull the nearest vessel towards them, and are satisfied once it is
+near. A. Runions et al., "Modeling and visualization of leaf venation patterns", 2005; "Modeling trees with a
+space colonization algorithm", 2007. New here: a branch keeps a part of its heading, and strays from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from synth.arrays import Floats, Ints
+from synth.render.anatomy.tree import Tree, gather
+from synth.system.jit import argument_types, compiled
+
+_MOST = 60_000  # nodes
+_NEAR = 0.35  # of a step: a branch that ends nearer to its sister than this is the sister
+_PUSHED = 0.4  # of a step, standard deviation of what a branch strays
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How branches of one order grow; lengths in mm, pairs are ranges."""
+
+    spacing: float  # of the points that need supply
+    reach: float  # distance from which a point pulls
+    near: float  # distance of a vessel that satisfies a point
+    step: float
+    straight: float  # weight of a branch's heading, as a multiple of the pull
+    end: tuple[float, float]  # radius of the finest
+
+
+def fill(tree: Tree, targets: Floats, growth: Growth, rng: np.random.Generator) -> Tree:
+    """The tree with branches grown to targets (N, 2) mm; a vessel's r^3 is the sum of its branches'."""
+    count = len(tree.nodes)
+    room = max(_MOST, 2 * count)
+    nodes, parent = np.zeros((room, 2)), np.full(room, -1)
+    nodes[:count], parent[:count] = tree.nodes, tree.parent
+    heading = np.zeros((room, 2))
+    along = tree.parent >= 0
+    heading[:count][along] = tree.nodes[along] - tree.nodes[tree.parent[along]]
+    heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-12)
+    targets = np.ascontiguousarray(targets)
+    stray = _PUSHED * rng.standard_normal((room, 2))
+    used = _grow(
+        nodes, parent, heading, count, targets, stray, growth.reach, growth.near, growth.step, growth.straight
+    )
+    nodes, parent = nodes[:used], parent[:used]
+    cubes = np.zeros(used)
+    ends = np.flatnonzero(np.bincount(parent + 1, minlength=used + 1)[1:] == 0)
+    ends = ends[ends >= count]
+    cubes[ends] = rng.uniform(*growth.end, len(ends)) ** 3
+    radius = np.cbrt(gather(parent, cubes) + np.append(tree.radius, np.zeros(used - count)) ** 3)
+    return Tree(nodes, parent, radius)
+
+
+@argument_types("f8[:,::1], i8[::1], f8[:,::1], i8, f8[:,::1], f8[:,::1], f8, f8, f8, f8")
+@compiled
+def _grow(
+    nodes: Floats,
+    parent: Ints,
+    heading: Floats,
+    count: int,
+    targets: Floats,
+    stray: Floats,
+    reach: float,
+    near: float,
+    step: float,
+    straight: float,
+) -> int:
+    """Adds nodes to the first `count` of `nodes` (M, 2), with parents and headings; returns their number."""
+    most = len(nodes)
+    total = len(targets)
+    if total == 0 or count == 0:
+        return count
+    left, low = targets[:, 0].min(), targets[:, 1].min()
+    columns = int((targets[:, 0].max() - left) / reach) + 1
+    rows = int((targets[:, 1].max() - low) / reach) + 1
+    first = np.zeros(columns * rows + 1, np.int64)
+    cell = np.zeros(total, np.int64)
+    for i in range(total):
+        cell[i] = int((targets[i, 1] - low) / reach) * columns + int((targets[i, 0] - left) / reach)
+        first[cell[i] + 1] += 1
+    for c in range(columns * rows):
+        first[c + 1] += first[c]
+    order = np.argsort(cell)
+    distance = np.full(total, reach)
+    nearest = np.full(total, -1, np.int64)
+    pull = np.zeros((most, 2))
+    child = np.full(most, -1, np.int64)
+    fresh, wave = 0, 0
+    while fresh < count and count < most:
+        for k in range(fresh, count):
+            u, v = int(np.floor((nodes[k, 0] - left) / reach)), int(np.floor((nodes[k, 1] - low) / reach))
+            for row in range(max(0, v - 1), min(rows, v + 2)):
+                for column in range(max(0, u - 1), min(columns, u + 2)):
+                    c = row * columns + column
+                    for j in range(first[c], first[c + 1]):
+                        i = order[j]
+                        away = np.hypot(targets[i, 0] - nodes[k, 0], targets[i, 1] - nodes[k, 1])
+                        if away < distance[i]:
+                            distance[i], nearest[i] = away, k
+        wave = count
+        for i in range(total):
+            k = nearest[i]
+            if k >= 0 and distance[i] > near:
+                pull[k, 0] += (targets[i, 0] - nodes[k, 0]) / distance[i]
+                pull[k, 1] += (targets[i, 1] - nodes[k, 1]) / distance[i]
+        for i in range(total):
+            k = nearest[i]
+            if k < 0 or distance[i] <= near or (pull[k, 0] == 0.0 and pull[k, 1] == 0.0) or count >= most:
+                continue
+            size = np.hypot(pull[k, 0], pull[k, 1]) + 1e-9
+            keep = straight if k >= 0 and child[k] < 0 else 0.0
+            x = pull[k, 0] / size + keep * heading[k, 0] + stray[count, 0]
+            y = pull[k, 1] / size + keep * heading[k, 1] + stray[count, 1]
+            pull[k, 0], pull[k, 1] = 0.0, 0.0
+            size = np.hypot(x, y) + 1e-9
+            x, y = x / size, y / size
+            at_x, at_y = nodes[k, 0] + step * x, nodes[k, 1] + step * y
+            c = child[k]
+            if c >= 0 and np.hypot(nodes[c, 0] - at_x, nodes[c, 1] - at_y) < _NEAR * step:
+                nearest[i] = -1  # left to a vessel that comes nearer
+                continue
+            nodes[count, 0], nodes[count, 1], parent[count] = at_x, at_y, k
+            heading[count, 0], heading[count, 1] = x, y
+            child[k] = count
+            count += 1
+        fresh = wave
+    return count

@@ -1,0 +1,343 @@
+"""The calibration of the force's interval: recordings of several makes, scored, fitted, cross-validated.
+
+`python -m weights intervals WORK --foreign FOLDER` renders recordings, scores each as it states much or
+little and with one camera or two, and writes `bench/methods/force_interval.json`. Recordings and scores are
+kept in WORK, so that a later run continues, also with further recordings.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from ruamel.yaml import YAML
+
+from bench.methods import force_interval
+from bench.methods.comparison import FUSION, MAIN, PHYSICS
+from bench.methods.force_fusion import Fusion
+from bench.methods.force_interval import CameraModel, IntervalTable, VideoEstimates, describe
+from bench.methods.network import Model
+from bench.methods.physics import Physics
+from bench.recording import recording_scale, recording_writer
+from bench.recording.from_sequence import export_recording
+from bench.recording.recording_folder import open_recording
+from bench.scoring.evaluate_recording import evaluate_recording
+from learn.inference.shipped_networks import NAMES, choose_model
+from learn.uncertainty.error_model import fit_error_model
+from synth.arrays import Floats
+from synth.dataset.store import Dataset
+from synth.dataset.store import Sequence as Stored
+from synth.engine.run import render_job
+from synth.errors import UserError
+from synth.flow.recording.decode import RecordingFlowSettings
+from synth.job import reader
+from synth.job.schema import Job
+from synth.system.checked_file import write_whole
+
+Tree = dict[str, Any]
+MAKES: Mapping[str, tuple[str, Tree]] = {
+    "plain": ("mission", {"fem": {"membrane": {"probability": 0.0}}}),
+    "membrane": ("mission", {"fem": {"membrane": {"probability": 1.0}}}),
+    "pulse": (
+        "mission",
+        {
+            "fem": {
+                "membrane": {"probability": 0.5},
+                "pulse": {"heart_mm": [0.1, 0.4], "breath_mm": [0.1, 0.5]},
+            }
+        },
+    ),
+    "unseen": (
+        "mission",
+        {
+            "anatomy": {"dome_mm": 90, "gyrus_mm": [7, 10], "sulcus_mm": [0.8, 1.4]},
+            "appearance": {"families": ["calf"]},
+            "fem": {"membrane": {"probability": 0.5}},
+        },
+    ),
+    "two instruments": ("mission", {"fem": {"instruments": [2, 2], "membrane": {"probability": 0.3}}}),
+    "clinical": ("clinical", {}),
+    "calf": ("ex-vivo-calf", {}),
+}
+"""Makes of our own: a named job, and what differs from it. No network was trained on the last four."""
+_VIDEO: Tree = {
+    "frames": 16,
+    "fps": 5,
+    "anatomy": {"vertices": 12000},
+    "flow": {"backend": "ideal"},
+    "render": {"size": [320, 240], "stereo_mm": 24},
+}
+_SEED = 7001
+FOREIGN = "foreign"
+_LEAST_ERROR = 0.01  # of the largest force: smaller errors are not told apart
+_LEAST_FRAMES = 8
+_SIDE = 0.95  # each end holds so many
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One recording as it was scored, with the truth in T frames."""
+
+    make: str
+    recording: str
+    video: VideoEstimates
+    true_mn: Floats  # (T,) size of the force; NaN: not scored
+
+    @property
+    def used(self) -> Any:
+        """(T,) whether the truth is known."""
+        return np.isfinite(self.true_mn)
+
+    @property
+    def error(self) -> Floats:
+        """(n,) of the used frames: true less estimated size, over the largest estimate."""
+        size = np.linalg.norm(self.video.leading_mn, axis=1)
+        return np.asarray(((self.true_mn - size) / max(self.video.largest_mn, 1e-9))[self.used])
+
+    @property
+    def features(self) -> Floats:
+        """(n, F) of the used frames."""
+        return describe(self.video)[self.used]
+
+
+def intervals(
+    work: Path,
+    foreign: Annotated[Path | None, typer.Option(help="Folder of evidence.foreign's recordings.")] = None,
+    count: int = 4,
+    makes: str = ",".join(MAKES),
+    only_fit: Annotated[bool, typer.Option("--only-fit", help="Use the scores that WORK has.")] = False,
+) -> None:
+    """Calibrates the interval of the force and writes its table into the package."""
+    if not only_fit:
+        for folder, make, stated in _recordings(work, foreign, count, makes.split(",")):
+            for much, cameras in product((True, False), (2, 1)):
+                _score(work, folder, make, stated if much else None, cameras)
+    table = fit_table(read_examples(work / "scores"), _networks())
+    text = json.dumps(asdict(table), indent=1, allow_nan=False)
+    write_whole(force_interval.TABLE, text + "\n", durable=False)
+    for name, row in table.reached.items():
+        print(name, {key: round(value, 3) for key, value in row.items()})
+
+
+def _networks() -> dict[str, str]:
+    return {name: Model(choose_model(name == NAMES[1])).identity for name in NAMES}
+
+
+def _merge(tree: Tree, other: Mapping[str, Any]) -> Tree:
+    both = dict(tree)
+    for key, value in other.items():
+        both[key] = _merge(both[key], value) if isinstance(both.get(key), dict) else value
+    return both
+
+
+def _recordings(
+    work: Path, foreign: Path | None, count: int, makes: Sequence[str]
+) -> Iterator[tuple[Path, str, Tree]]:
+    """Folder, make, and what can be stated of each recording."""
+    for number, make in enumerate(MAKES):
+        if make not in makes:
+            continue
+        data, (named, change) = work / "data" / make, MAKES[make]
+        tree = reader.load_job(named).model_dump(mode="json", exclude_unset=True)
+        tree = _merge(_merge(_merge(tree, _VIDEO), change), {"sequences": count, "seed": _SEED + number})
+        render_job(Job.model_validate(tree), data, workers=1)
+        for sequence in Dataset(data):
+            folder = work / "recordings" / make / f"{sequence.index:03d}"
+            if not folder.exists():
+                export_recording(sequence, folder)
+            yield folder, make, _stated(sequence)
+    for file in sorted([] if foreign is None else foreign.glob("**/truth.npz")):
+        kind = file.parent.name.split("-")[0]
+        membrane = "intact" if kind == "membrane" else "stripped"
+        yield (
+            file.parent,
+            FOREIGN,
+            {"membrane": membrane, "tissue": "brain" if kind == "pulse" else "ex-vivo"},
+        )
+
+
+def _stated(sequence: Stored) -> Tree:
+    """Keys of meta.yaml for what an experimenter could state of a sequence."""
+    covered = sequence.attrs["scenario"]["tissue"].get("membrane")
+    size = np.linalg.norm(np.asarray(sequence["force"][:], np.float64), axis=1)
+    rest_s = float(sequence["time"][max(int(np.flatnonzero(size > 0)[0]) - 1, 0)]) if size.any() else 0.0
+    free_s = [[0.0, rest_s]] if rest_s > 0 else []
+    sensor = {"axes": "camera", "acts_on": "tissue", "low_pass_hz": None, "free_s": free_s}
+    return {"membrane": "intact" if covered else "stripped", "sensor": sensor}
+
+
+def _score(work: Path, source: Path, make: str, stated: Tree | None, cameras: int) -> None:
+    """Scores a copy of a recording that states this, None: scale and E alone; kept in WORK/scores."""
+    much = "little" if stated is None else "much"
+    file = work / "scores" / f"{make}-{source.name}-{much}-{cameras}.npz"
+    if file.exists():
+        return
+    folder = work / "copy"
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(source, folder)
+    meta = YAML(typ="safe").load((folder / "meta.yaml").read_text("utf-8"))
+    if stated is None:
+        shutil.rmtree(folder / "masks", ignore_errors=True)
+        (folder / "tissue.png").unlink(missing_ok=True)
+        meta["sensor"].pop("free_s", None)
+        meta["tissue"] = "brain"
+    if cameras == 1:
+        meta.pop("stereo", None)
+        shutil.rmtree(folder / "right", ignore_errors=True)
+        (folder / "right.mp4").unlink(missing_ok=True)
+    recording_writer.write_meta(folder, meta | (stated or {}))
+    fusion = Fusion(MAIN, PHYSICS)
+    methods = {FUSION: fusion, MAIN: Model(choose_model(cameras == 2)), PHYSICS: Physics()}
+    recording = open_recording(folder)
+    scale = recording_scale.find_scale(recording.meta, folder)
+    arrays: dict[str, Any] = {"make": make, "recording": source.name}
+    try:
+        result = evaluate_recording(recording, methods, FUSION, scale, RecordingFlowSettings(), {})
+        if fusion.video is not None and result.sensor_mn is not None and not result.refused:
+            trusted = np.array(result.tracked.trusted)
+            arrays |= vars(fusion.video)
+            arrays["true_mn"] = np.where(result.scored, result.sensor_mn, np.nan)[trusted]
+    except UserError as error:
+        arrays["failed"] = str(error)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(file, **arrays)
+    print(file.stem, flush=True)
+
+
+def read_examples(folder: Path) -> list[Example]:
+    """The scores of a folder that have a force and a truth."""
+    examples = []
+    for file in sorted(folder.glob("*.npz")):
+        with np.load(file) as stored:
+            if "true_mn" not in stored:
+                continue
+            names = "leading_mn", "network_mn", "physics_mn", "spread_mn", "motion_mm"
+            about = int(stored["cameras"]), float(stored["stated"])
+            video = VideoEstimates(*(stored[name] for name in names), *about)
+            one = Example(str(stored["make"]), str(stored["recording"]), video, stored["true_mn"])
+            if one.used.sum() >= _LEAST_FRAMES:
+                examples.append(one)
+    return examples
+
+
+def fit_table(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTable:
+    """The calibration on all examples, and what it reaches on each make without that make."""
+    table = _fit(examples, networks)
+    crossed = {make: _fit([e for e in examples if e.make != make], networks) for make in table.makes}
+    rows = {id(one): _judge(one, crossed[one.make]) for one in examples}
+
+    def pool(some: Sequence[Example]) -> dict[str, float]:
+        return _pool(some, [rows[id(one)] for one in some])
+
+    reached = {}
+    for cameras, much in product((2, 1), (True, False)):
+        some = [e for e in examples if e.video.cameras == cameras and (e.video.stated > 0) is much]
+        if some:
+            reached[f"{cameras} cameras, {'much' if much else 'little'} stated"] = pool(some)
+    reached |= {make: pool([e for e in examples if e.make == make]) for make in table.makes}
+    reached["all"] = pool(examples)
+    return IntervalTable(
+        table.features, table.by_cameras, table.makes, table.networks, _find_gains(examples, rows), reached
+    )
+
+
+def _fit(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTable:
+    by_cameras = {}
+    for cameras in (1, 2):
+        some = [one for one in examples if one.video.cameras == cameras]
+        if some:
+            by_cameras[cameras] = _fit_model(some)
+    makes = sorted({one.make for one in examples})
+    count = {make: len({one.recording for one in examples if one.make == make}) for make in makes}
+    return IntervalTable(tuple(force_interval.NAMES), by_cameras, count, dict(networks), {}, {})
+
+
+def _fit_model(examples: Sequence[Example]) -> CameraModel:
+    """Error model and quantiles: makes weigh equally, so do a make's recordings, and a recording's frames."""
+    makes = sorted({one.make for one in examples})
+    recordings = {make: {one.recording for one in examples if one.make == make} for make in makes}
+    weight = []
+    for one in examples:
+        same = sum(e.make == one.make and e.recording == one.recording for e in examples)
+        weight.append(1 / (len(makes) * len(recordings[one.make]) * same))
+    parts = [np.full(len(e.error), w / len(e.error)) for e, w in zip(examples, weight, strict=True)]
+    features, error = (np.concatenate([getattr(e, name) for e in examples]) for name in ("features", "error"))
+    frames = np.concatenate(parts)
+    model = fit_error_model(features, np.abs(error), frames, _LEAST_ERROR)
+    count = sum(map(len, recordings.values()))
+    # The new recording is one more of as many.
+    order, share = error / model.predict(features), frames * count / (count + 1)
+    ends = [max(_quantile(sign * order, share), 1e-3) for sign in (-1, 1)]
+    return CameraModel(model, *ends, count, len(examples))
+
+
+def _quantile(values: Floats, weight: Floats) -> float:
+    """The value at which the weights reach `_SIDE`; the largest if they don't, with too few recordings."""
+    order = np.argsort(values)
+    reached = np.cumsum(weight[order]) >= _SIDE - 1e-9
+    return float(values[order][np.argmax(reached)] if reached.any() else values.max())
+
+
+def _judge(one: Example, table: IntervalTable) -> dict[str, float]:
+    """Of one recording, over its largest true force: share that its interval holds, width, interval score
+    (Gneiting and Raftery, JASA 102, 2007, eq. 43), error; and whether it has a number."""
+    low, high = (end[one.used] for end in table.bound(one.video, 0.0))
+    true, size = one.true_mn[one.used], np.linalg.norm(one.video.leading_mn, axis=1)[one.used]
+    peak = float(true.max())
+    return {
+        "holds": float(((low <= true) & (true <= high)).mean()),
+        "width": float((high - low).mean()) / peak,
+        "score": float(_interval_score(low, high, true).mean()) / peak,
+        "error": float(np.abs(size - true).mean()) / peak,
+        "reached": float(not table.find_gaps(one.video)),
+    }
+
+
+def _interval_score(low: Floats, high: Floats, true: Floats) -> Floats:
+    out = np.maximum(low - true, 0) + np.maximum(true - high, 0)
+    return np.asarray(high - low + 2 / (1 - force_interval.LEVEL) * out)
+
+
+def _pool(examples: Sequence[Example], rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Counts and means of those with a number; the score over that of the best constant width."""
+    pairs = [(e, row) for e, row in zip(examples, rows, strict=True) if row["reached"]]
+    counts = {"scores": float(len(examples)), "without a number": float(len(examples) - len(pairs))}
+    if not pairs:
+        return counts
+    means = {key: float(np.mean([row[key] for _, row in pairs])) for key in ("error", "holds", "width")}
+    score = float(np.mean([row["score"] for _, row in pairs]))
+    best = min(_constant([e for e, _ in pairs], half) for half in np.linspace(0.01, 1.5, 150))
+    recordings = float(len({(e.make, e.recording) for e in examples}))
+    return {"recordings": recordings, **counts, **means, "score over a constant width's": score / best}
+
+
+def _constant(examples: Sequence[Example], half: float) -> float:
+    """Mean interval score with a half width of this share of the largest estimate everywhere."""
+    scores = []
+    for one in examples:
+        size, true = np.linalg.norm(one.video.leading_mn, axis=1)[one.used], one.true_mn[one.used]
+        wide = half * one.video.largest_mn
+        scores.append(_interval_score(np.maximum(size - wide, 0), size + wide, true).mean() / true.max())
+    return float(np.mean(scores))
+
+
+def _find_gains(examples: Sequence[Example], rows: Mapping[int, Mapping[str, float]]) -> dict[str, float]:
+    """Mean width with a second camera, and with all that can be stated, over that without it."""
+    widths: dict[tuple[str, str, int, bool], float] = {}
+    for one in examples:
+        widths[one.make, one.recording, one.video.cameras, one.video.stated > 0] = rows[id(one)]["width"]
+
+    def ratio(with_it: Mapping[Any, float], without: Mapping[Any, float]) -> float:
+        both = [np.log(width / without[key]) for key, width in with_it.items() if key in without]
+        return float(np.exp(np.mean(both))) if both else 1.0
+
+    cameras = [{(m, r, s): w for (m, r, c, s), w in widths.items() if c == n} for n in (2, 1)]
+    stated = [{(m, r, c): w for (m, r, c, s), w in widths.items() if s is much} for much in (True, False)]
+    return {"second camera": ratio(*cameras), "statements": ratio(*stated)}
