@@ -109,7 +109,7 @@ class InstrumentMesh:
     theatre: Theatre  # that they mirror
 
     @cached_property
-    def alpha(self) -> Map:
+    def alpha(self) -> Floats:
         """(V,) roughness at the vertices, for what they mirror."""
         texels = np.sqrt(self.maps.rough[..., 0] * self.maps.rough[..., 1])
         return read_map(texels, self.uv)

@@ -45,7 +45,7 @@ class Theatre:
         return np.stack(spread, axis=1)
 
 
-def glow(shape: Shape, alpha: Floats | Map, theatre: Theatre) -> Floats:
+def glow(shape: Shape, alpha: Floats, theatre: Theatre) -> Floats:
     """Radiance (V, 3) of the theatre, but for lamps, that mirrors at a shape's vertices show its lens.
 
     `alpha`: (V,) GGX roughness of the mirrors.
@@ -58,7 +58,7 @@ def glow(shape: Shape, alpha: Floats | Map, theatre: Theatre) -> Floats:
     return np.asarray(seen * (1 + _GRAZING * np.clip(1 - facing, 0, 1) ** 5))  # C. Schlick, 1994
 
 
-def _surroundings(place: Floats, direction: Floats, alpha: Floats | Map, theatre: Theatre) -> Floats:
+def _surroundings(place: Floats, direction: Floats, alpha: Floats, theatre: Theatre) -> Floats:
     """Radiance (N, 3) that arrives at places (N, 3) mm from around directions (N, 3)."""
     up, spread = direction[:, 2:], _SPREAD * alpha
     below = 1 / (1 + np.exp(np.clip((up + 0.05) / np.hypot(0.09, alpha)[:, None], -40, 40)))
