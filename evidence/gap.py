@@ -2,16 +2,17 @@
 
 Trainings on one split: ideal flow (I), recovered flow (R), ideal flow plus noise fitted to the error of the
 recovered flow (N), and as a control recovered flow with another sequence's force (S). Each is tested on ideal
-and on recovered flow: in distribution, out of distribution ('), and on recordings simulated and rendered by
-other programs ('').
+and on recovered flow of held-out sequences, of an unseen appearance and anatomy, of clinical loads, and of
+recordings simulated and rendered by other programs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -20,14 +21,14 @@ from bench.recording.recording_folder import open_recording
 from bench.recording.recording_scale import find_scale
 from bench.tracking.tracking import track_recording
 from evidence import report, result_cache, result_status, training
-from evidence.bootstrap import difference
+from evidence.bootstrap import difference, mean_of
 from evidence.foreign.recordings import TRUTH
 from evidence.pooled import FOLDERS
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid, GridView
 from learn.evaluation.evaluate import evaluate
-from learn.evaluation.statistics import interval
+from learn.inference.predict import Predictor
 from learn.settings import TrainingSettings, preset
 from learn.settings import replace as changed
 from learn.split import Split, groups
@@ -36,75 +37,84 @@ from synth.errors import UserError
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.flow.recording.frame_motion import FrameMotion
 
-Errors = Mapping[str, list[float | None]]  # by test, of each sequence [mN]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Errors = dict[str, list[float]]  # by test, of each sequence [mN]
 Tests = Mapping[str, tuple[Sequence[Clip], str]]  # by name: tested clips, and name of their displacement
 KINDS = ("I", "R", "N", "S")
+FLOWS = ("ideal", "recovered")
+PLACES = {
+    "own": "held-out sequences",
+    "unseen": "unseen appearance and anatomy",
+    "clinical": "clinical loads",
+    "foreign": "recordings by other programs",
+}
+"""What is tested on; each on ideal and on recovered flow."""
+NONE = "no force"  # the trivial baseline
 _KEY = "force_mae"  # error of a sequence: of the total force [mN]
 _RESAMPLES = 2000
 _INPUTS = {"I": "ideal", "R": "recovered", "N": "recovered", "S": "recovered"}
-_TESTS = {
-    "I": "ideal flow",
-    "R": "recovered flow",
-    "I'": "ideal flow, out of distribution",
-    "R'": "recovered flow, out of distribution",
-    "I''": "true flow of foreign recordings",
-    "R''": "recovered flow of foreign recordings",
-}
-_PLACES = {"'": "out of distribution", "''": "foreign recordings"}
-_UNIT = "mean error of the total force [mN]"
+_SHOWN = (2, 4, 8, 16, 32, 64, 96, 128, 192, 256)  # epochs of the curve
+_UNIT = "mean error of the total force, as a share of the sequence's mean force"
 
 
 def measure(
     dataset: Path,
     unseen: Path,
+    clinical: Path,
     recordings: Path,
     work: Path = Path("runs/gap"),
-    fit: int = 200,
-    epochs: int = 24,
+    fit: int = 375,
+    epochs: int = 96,
     seeds: int = 1,
     device: str = "cpu",
 ) -> dict[str, Any]:
     """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise.
 
-    `dataset`: of which `fit` sequences are used; `unseen`: out of distribution, only tested on; `recordings`:
-    folder of `foreign.recordings`, likewise; `work`: folder of intermediate results; `seeds`: networks a
-    training; `device`: that trains. The gap opens with convergence: on a GPU use `--fit 560 --epochs 96`.
+    `dataset`: of which `fit` sequences are used, a fifth of them held out; `unseen`, `clinical`: only tested
+    on; `recordings`: folder of `foreign.recordings`, likewise; `work`: folder of intermediate results, from
+    which an interrupted run continues; `seeds`: networks a training; `device`: that trains.
     """
     tiny = preset("tiny", epochs=epochs)
-    settings = changed(tiny, arch=changed(tiny.arch, output="vector", relative=True))
-    known, others = (
-        load_clips(root, settings.grid, ("ideal", "recovered"), cache=work) for root in (dataset, unseen)
+    arch = changed(tiny.arch, output="vector", relative=True)
+    # By frame, as forces span three decades.
+    settings = changed(tiny, arch=arch, loss="mse-frame")
+    known, others, loaded = (
+        load_clips(root, settings.grid, FLOWS, cache=work) for root in (dataset, unseen, clinical)
     )
     known = known[:fit]
-    split, own_test = parts(known, others)
-    clips = [*known, *others]
+    split, held_out = parts(known, [*others, *loaded])
+    clips = [*known, *others, *loaded]
     folders = sorted(file.parent for file in (recordings / FOLDERS[1]).glob(f"*/{TRUTH}"))
     if not folders:
         raise UserError(f"{recordings}: no recording of foreign.recordings with its {TRUTH}")
-    tested = (
-        [clips[i] for i in own_test],
-        [clips[i] for i in split.test],
-        [foreign(one, settings.grid) for one in folders],
-    )
-    tests = {name: (tested[name.count("'")], "ideal" if name[0] == "I" else "recovered") for name in _TESTS}
-    seeded = [changed(settings, seed=seed) for seed in range(seeds)]
-    trained = {
-        kind: [errors(kind, clips, split, one, tests, work, device) for one in seeded] for kind in KINDS
+    tested: dict[str, Sequence[Clip]] = {
+        "own": [clips[i] for i in held_out],
+        "unseen": others,
+        "clinical": loaded,
+        "foreign": [foreign(folder, settings.grid) for folder in folders],
     }
+    tests = {f"{place}, {flow}": (part, flow) for place, part in tested.items() for flow in FLOWS}
+    trained: dict[str, list[Errors]] = {kind: [] for kind in KINDS}
+    curve: dict[str, list[list[float]]] = {}
+    for seed in range(seeds):
+        for kind in KINDS:
+            seeded = changed(settings, seed=seed, input=_INPUTS[kind])
+            made = errors(kind, clips, split, seeded, tests, work, device)
+            trained[kind].append(made["errors"])
+            curve.setdefault(kind, made["curve"])
     noise = fit_noise([clips[i] for i in split.fit])
-    nothing = {
-        test: [float(np.linalg.norm(clip.force, axis=1).mean()) for clip in part]
-        for test, (part, _) in tests.items()
-    }
-    sizes = (split.fit, split.select, *tested)
+    force = {place: [_mean_force(clip) for clip in part] for place, part in tested.items()}
+    sizes = {"fit": len(split.fit), "select": len(split.select)}
     return {
-        "data": result_status.data(dataset, unseen),
+        "data": result_status.data(dataset, unseen, clinical),
         "settings": settings.model_dump(),
-        "held_out": unseen.name,
-        "sequences": dict(zip(("fit", "select", "test", "unseen", "foreign"), map(len, sizes), strict=True)),
+        "sequences": sizes | {place: len(part) for place, part in tested.items()},
         "seeds": seeds,
-        "flows": {"tvl1": {"noise": asdict(noise)} | summary(trained, nothing)},
-    }
+        "noise": asdict(noise),
+        "curve": {kind: curve[kind] for kind in ("I", "R")},
+    } | summary(trained, force)
 
 
 def foreign(folder: Path, grid: Grid) -> Clip:
@@ -161,12 +171,20 @@ def errors(
     tests: Tests,
     work: Path,
     device: str = "cpu",
-) -> Errors:
-    """Errors in every test of a network trained as one of `KINDS` on fit and select of `split`, cached."""
-    settings = changed(settings, input=_INPUTS[kind])
+) -> dict[str, Any]:
+    """Errors of a network trained as one of `KINDS` on fit and select of `split`, cached.
+
+    Returns:
+        `errors`: of every test, those of its sequences [mN]; `curve`: rows of an epoch, and the mean errors
+        on ideal and on recovered flow of the held-out sequences as shares of their mean forces.
+    """
     name = f"{kind}-seed{settings.seed}"
 
-    def compute() -> Errors:
+    def score(predictor: Predictor, test: str) -> list[float]:
+        part, source = tests[test]
+        return [row[_KEY] for row in evaluate(predictor, part, source).per_clip()]
+
+    def compute() -> dict[str, Any]:
         own = list(clips)
         if kind == "S":
             half = len(clips) // 2
@@ -181,36 +199,58 @@ def errors(
                 rng = np.random.default_rng([settings.seed, k])
                 noisy = noise.add(np.asarray(clip.displacement["ideal"]), clip.mask, rng)
                 own[k] = replace(clip, displacement=clip.displacement | {"recovered": noisy})
-        predictor = training.fit(name, own, split, settings, work / "models", device)
-        found = {test: evaluate(predictor, part, source).per_clip() for test, (part, source) in tests.items()}
-        return {test: [row[_KEY] for row in rows] for test, rows in found.items()}
+        final, earlier = training.fit_with_epochs(name, own, split, settings, work / "models", _SHOWN, device)
+        curve = []
+        for epoch, predictor in earlier.items():
+            means = []
+            for flow in FLOWS:
+                part, _ = tests[f"own, {flow}"]
+                off = score(predictor, f"own, {flow}")
+                means.append(float(np.mean(np.array(off) / [_mean_force(clip) for clip in part])))
+            curve.append([epoch, *means])
+        return {"errors": {test: score(final, test) for test in tests}, "curve": curve}
 
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
     tested = {test: [clip.content_hash for clip in part] for test, (part, _) in tests.items()}
     key = result_cache.key(name, settings.model_dump(), used, tested)
-    done: Errors = result_cache.result(work / "runs", name, key, compute)
+    done: dict[str, Any] = result_cache.result(work / "runs", name, key, compute)
     return done
 
 
-def summary(
-    trained: Mapping[str, Sequence[Errors]], nothing: Mapping[str, Sequence[float]]
-) -> dict[str, Any]:
-    """Errors with intervals, also of no force (`nothing`), and the share of the gap that each one closes."""
-    of: dict[str, dict[str, Floats]] = {  # means over seeds
-        kind: {test: np.mean([np.array(run[test], float) for run in runs], axis=0) for test in _TESTS}
+def _mean_force(clip: Clip) -> float:
+    """Mean size of the total force [mN]: also the error of estimating none."""
+    return float(np.linalg.norm(clip.force, axis=1).mean())
+
+
+def summary(trained: Mapping[str, Sequence[Errors]], force: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """Errors with intervals, also of no force, the factor by which the gap opens, and the shares closed.
+
+    `force`: of each place, the mean forces of its sequences [mN].
+    """
+    absolute = {  # means over seeds
+        kind: {test: np.mean([run[test] for run in runs], axis=0) for test in runs[0]}
         for kind, runs in trained.items()
     }
-    spread = {
-        kind: {test: asdict(interval(own, np.random.default_rng(0))) for test, own in tests.items()}
-        for kind, tests in (of | {"no force": {test: np.array(own) for test, own in nothing.items()}}).items()
+    absolute[NONE] = {test: np.array(force[test.split(",")[0]]) for test in absolute[KINDS[0]]}
+    share = {
+        kind: {test: values / np.array(force[test.split(",")[0]]) for test, values in tests.items()}
+        for kind, tests in absolute.items()
     }
-    found: dict[str, Any] = {"errors": {_KEY: spread}}
-    for where, name in _PLACES.items():
-        own = {kind: of[kind][f"R{where}"] for kind in KINDS}
-        gap = own["I"] - of["I"][f"I{where}"]
-        shares = {kind: closed(gap, own["I"] - own[kind]) for kind in KINDS[1:]}
-        found[name] = {"closed": shares, "noise_less_real": difference(own["R"], own["N"])[1:]}
-    return found
+    places = {}
+    for place in force:
+        ideal = share["I"][f"{place}, ideal"]
+        recovered = {kind: share[kind][f"{place}, recovered"] for kind in KINDS}
+        gap = recovered["I"] - ideal
+        places[place] = {
+            "opened": float(recovered["I"].mean() / ideal.mean()),
+            "closed": {kind: closed(gap, recovered["I"] - recovered[kind]) for kind in KINDS[1:]},
+            "noise_less_real": difference(recovered["R"], recovered["N"]),
+        }
+    spread, spread_mn = (
+        {kind: {test: mean_of(values) for test, values in tests.items()} for kind, tests in part.items()}
+        for part in (share, absolute)
+    )
+    return {"errors": spread, "errors_mn": spread_mn, "places": places}
 
 
 def closed(gap: Floats, gain: Floats) -> dict[str, Any]:
@@ -279,58 +319,91 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
 
 
 def page(found: Mapping[str, Any]) -> report.Page:
-    """Errors of the trainings on the flow of recordings, and the tables."""
-    ((flow, one),) = found["flows"].items()
-    charts: list[tuple[str, str, dict[str, Any]]] = []
+    """The curve of the trainings, errors by place, and the tables."""
+    bars = {
+        name: {
+            f"{kind} on {flow} flow": found["errors"][kind][f"{place}, {flow}"]
+            for kind, flow in (("I", "ideal"), *((kind, "recovered") for kind in KINDS))
+        }
+        for place, name in PLACES.items()
+    }
     words = []
-    for where, name in _PLACES.items():
-        bars = {}
-        for kind, test in (("I", f"I{where}"), *((kind, f"R{where}") for kind in KINDS)):
-            value = one["errors"][_KEY][kind][test]
-            bars[f"{kind} on {test}"] = value["mean"], value["low"], value["high"]
-        charts.append((name, _UNIT, bars))
-        shares, (low, high) = (one[name][key] for key in ("closed", "noise_less_real"))
+    for place, name in PLACES.items():
+        at_place = found["places"][place]
+        low, high = (100 * end for end in at_place["noise_less_real"][1:])
         words.append(
-            f"{name}: training on recovered flow closes {_closed(shares['R'])} of the gap, with fitted noise "
-            f"{_closed(shares['N'])}; the error with noise less that with recovered flow is {low:.3g} to "
-            f"{high:.3g} mN"
+            f"- *{name.capitalize()}*: on recovered flow the network trained on ideal flow errs "
+            f"{at_place['opened']:.2g} times as much as on ideal flow; training on recovered flow closes "
+            f"{_closed(at_place['closed']['R'])} of that gap, with fitted noise "
+            f"{_closed(at_place['closed']['N'])} (with noise the error is {low:.2g} to {high:.2g} percentage "
+            "points larger)."
         )
-    rows = [
-        {"trained on": kind}
-        | {_TESTS[test]: report.mean_cell([*value.values()][:3]) for test, value in tests.items()}
-        | {f"closed, {name}": _closed(one[name]["closed"].get(kind)) for name in _PLACES.values()}
-        for kind, tests in one["errors"][_KEY].items()
+    tables = []
+    for heading, errors, factor in (
+        ("Errors as shares of the mean force", found["errors"], 100.0),
+        ("Errors [mN]", found["errors_mn"], 1.0),
+    ):
+        rows = [
+            {"trained on": kind, "tested on": flow}
+            | {
+                name: report.mean_cell(tests[f"{place}, {flow}"], factor=factor)
+                for place, name in PLACES.items()
+            }
+            for kind, tests in errors.items()
+            for flow in (FLOWS if kind != NONE else FLOWS[:1])
+        ]
+        tables.append(report.Section(heading + (", in percent" if factor > 1 else ""), rows))
+    shares = [
+        {"training": kind}
+        | {name: _closed(found["places"][place]["closed"][kind]) for place, name in PLACES.items()}
+        for kind in KINDS[1:]
     ]
+    count = ", ".join(f"{number} {name}" for name, number in found["sequences"].items())
     return report.Page(
         "Sim-to-real gap: training on recovered flow",
         found,
         (
-            f"**Flow by {flow}; {'. '.join(words)}.**",
+            *words,
             "Gap: error on recovered flow less error on ideal flow, after training on ideal flow. I: trained "
             "on ideal flow, R: on recovered, N: on ideal with noise fitted to the recovered flow's error, S: "
-            "(a control) on recovered flow with the forces of other sequences; ': "
-            f"out of distribution ({found['held_out']}), '': recordings by felupe and Blender's Cycles, "
-            "whose ideal flow is that of the contacts alone. "
-            f"Sequences: {', '.join(f'{n} {name}' for name, n in found['sequences'].items())}; "
-            f"networks a training: {found['seeds']}; 95% BCa intervals. "
+            "(a control) on recovered flow with the forces of other sequences. The ideal flow of recordings "
+            "by felupe and Blender's Cycles is that of the contacts alone. Errors are of the total force, as "
+            "shares of a sequence's mean force, so that each sequence counts alike whatever its load. "
+            f"Sequences: {count}; networks a training: {found['seeds']}; 95% BCa intervals. "
             "[The same question by four commands](../../howto/gap.md).",
         ),
-        [report.Section(f"{flow}: {_UNIT}", rows)],
-        report.interval_charts(*charts),
+        [report.Section("Share of the gap closed", shares), *tables],
+        report.chart(
+            partial(_draw_curve, curve=found["curve"]),
+            *(
+                partial(report.draw_intervals, title=name, unit=_UNIT, rows=rows)
+                for name, rows in bars.items()
+            ),
+            heights=[330.0, *(70.0 + 19 * len(rows) for rows in bars.values())],
+            width=960,
+        ),
     )
 
 
-def _closed(found: Mapping[str, Any] | None) -> str | None:
-    """A cell; None for the training that the gap is defined by."""
-    if found is None:
-        return None
-    return "undefined" if found["undefined"] else report.percent([found["share"], *found["interval"]])
+def _draw_curve(axes: Axes, curve: Mapping[str, Sequence[Sequence[float]]]) -> None:
+    """Errors on the held-out sequences against epochs, of networks trained on ideal and recovered flow."""
+    for color, (kind, rows) in zip(("C1", "C0"), curve.items(), strict=True):
+        epochs, *by_flow = np.transpose(rows)
+        for flow, values, line in zip(FLOWS, by_flow, ("--", "-"), strict=True):
+            axes.plot(epochs, values, line, color=color, marker="o", label=f"{kind} on {flow} flow")
+    report.set_log(axes)
+    axes.set(title=f"{PLACES['own']} while training", xlabel="epochs", ylabel="error over mean force")
+    report.legend(axes)
+
+
+def _closed(share: Mapping[str, Any]) -> str:
+    return "undefined" if share["undefined"] else report.percent([share["share"], *share["interval"]]) or ""
 
 
 STUDY = Study(
     measure,
     "gap/results.json",
     page,
-    ("{mission} {mission-ood} {work}/foreign --work {work}/gap",),
+    ("{gap-mission} {gap-ood} {gap-clinical} {work}/foreign --work {work}/gap-study",),
     needs=("mesh", "mechanics", "picture", "truth", "flow", "stereo", "network", "score-stereo"),
 )

@@ -1,18 +1,25 @@
 """Networks of studies: cross-validation folds that share no anatomy, stored trainings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from evidence import result_cache
+from learn import checkpoint
 from learn.data.clips import Clip
+from learn.inference.convert import to_onnx
 from learn.inference.predict import Predictor, load_model
+from learn.network.registry import build
 from learn.settings import TrainingSettings
 from learn.split import Split, groups
 from learn.training.train import train
 from synth.dataset.sequence_split import draw_groups
 from synth.formats import CLIPS
+
+_EPOCH = "epoch-{:03d}.pt"
+_ROUNDING = 0.01  # of the networks after the first epochs in ONNX, whose normalisation is still by few frames
 
 
 def folds(clips: Sequence[Clip], count: int, seed: int) -> list[tuple[int, ...]]:
@@ -45,8 +52,38 @@ def fit(
 
     `name`: part of the key, next to settings and the clips' hashes.
     """
+    return fit_with_epochs(name, clips, split, settings, folder, (), device)[0]
+
+
+def fit_with_epochs(
+    name: str,
+    clips: Sequence[Clip],
+    split: Split,
+    settings: TrainingSettings,
+    folder: Path,
+    epochs: Sequence[int],
+    device: str = "cpu",
+) -> tuple[Predictor, dict[int, Predictor]]:
+    """As `fit`, and the networks as they were after some of the epochs, by epoch."""
     used = [[clips[i].content_hash for i in part] for part in (split.fit, split.select)]
     key = result_cache.key(settings.model_dump(), used, CLIPS, versions=("TRAINING",))
     model = folder / f"{name}-{key}"
-    train(clips, split, settings, model, device=device)
-    return load_model(model)
+
+    def keep(numbers: Mapping[str, float]) -> None:
+        epoch = int(numbers["epoch"])
+        if epoch in epochs:
+            state = checkpoint.read_tensors(model / "last.pt")["model"]
+            checkpoint.save_tensors(
+                model / _EPOCH.format(epoch), {"model": state, "gain": numbers["select_gain"]}
+            )
+
+    card = train(clips, split, settings, model, device=device, log=keep)
+    earlier = {}
+    for epoch in epochs:
+        if (file := model / _EPOCH.format(epoch)).exists():
+            tensors = checkpoint.read_tensors(file)
+            network = build(settings.network, settings.arch)
+            network.load_state_dict(tensors["model"])
+            at_epoch = replace(card, epoch=epoch, force_gain=tensors["gain"])
+            earlier[epoch] = Predictor(at_epoch, to_onnx(network, at_epoch, tolerance=_ROUNDING)[0])
+    return load_model(model), earlier

@@ -88,10 +88,12 @@ class Fusion:
         self.video, self._reason = None, ""
         if self._alone or not fused:
             return list(fused)
-        parts = [np.array([frame[name].force_mn for frame in estimates]) for name in self.parts]
+        by_network, by_physics = (
+            np.array([frame[name].force_mn for frame in estimates]) for name in self.parts
+        )
         spread = np.array([find_spread(like) for frame in estimates if (like := frame[self.parts[1]].likely)])
-        leading = np.array([one.force_mn for one in fused])
-        self.video = VideoEstimates(leading, *parts, spread, motion_mm, cameras, stated)
+        leading = np.array([estimate.force_mn for estimate in fused])
+        self.video = VideoEstimates(leading, by_network, by_physics, spread, motion_mm, cameras, stated)
         table = read_table()
         self._reason = table.find_reason(self.video, network)
         if self._reason:

@@ -1,8 +1,8 @@
 """One 90% interval of the leading force, from what a video shows and states without the truth.
 
 Half the width is P s(x) q. P is the video's largest estimate. s is the expected error over P, log-linear in
-features x of a frame and of its video (`ErrorModel`): the size of the estimate, how far network, physics and
-mean flow disagree, the spread of physics' posterior, and what is stated. q are the 5% and 95% quantiles of
+features x of a frame (`ErrorModel`): the size of the estimate and the spread of physics' posterior, which
+knows what is stated and what two cameras see. q are the 5% and 95% quantiles of
 the error over P s, which differ as force is rather missed than invented, by hierarchical split conformal
 prediction over recordings of several makes (`learn.uncertainty.conformal`). `weights.interval_table` fits
 them, cross-validates them by make, and writes the table. A video whose features lie beyond those of the

@@ -67,16 +67,17 @@ def seen_motion(moved: Map, deviation: Map, mask: Map, grid: Grid) -> SeenMotion
         sigma = sigma_mm / grid.pitch_mm
         total = np.stack([gaussian_filter(part, sigma) for part in weight])
         mean = [gaussian_filter(w * d, sigma) for w, d in zip(weight, moved, strict=True)]
-        return np.stack(mean) / np.maximum(total, 1e-12)
+        return np.asarray(np.stack(mean) / np.maximum(total, 1e-12))
 
     least, most = _SMOOTH_MM
-    slopes = np.stack(np.gradient(smooth(most), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
+    slopes = np.array(np.gradient(smooth(most), grid.pitch_mm, axis=(1, 2)))  # (2, C, N, N)
     steep = np.linalg.norm(slopes, axis=(0, 1))[inside].max(initial=0.0)
     spread = float(np.median(deviation[:, inside].max(axis=0)))
     mean = smooth(min(max(_PER_MM * spread, least), most))
     rows, columns = np.nonzero(inside)
     places = np.stack([columns, rows], axis=1) - (grid.size - 1) / 2
-    return SeenMotion(places * grid.pitch_mm, mean[:, inside].T, grid.pitch_mm**2, float(steep))
+    points = np.asarray(places * grid.pitch_mm, np.float64)
+    return SeenMotion(points, mean[:, inside].T, grid.pitch_mm**2, float(steep))
 
 
 def reaction(motion: SeenMotion, tissue: TissueKind, opening_mm: float, alpha: float) -> Floats:

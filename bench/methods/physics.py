@@ -332,7 +332,8 @@ def find_gains(
             pass
         unsolved += ends == TISSUES.unsolved
         rows.append((size, *ends))
-    return Gains(*np.array(sorted(rows)).T, unsolved)
+    size_mn, low, high = np.array(sorted(rows)).T
+    return Gains(size_mn, low, high, unsolved)
 
 
 def find_monocular_gains(weights: TissueWeights, strongest: Observation) -> Gains:

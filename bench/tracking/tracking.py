@@ -261,9 +261,9 @@ class _Forces:
                 with self.watch.stage(name):
                     fused = method.fuse(tracked, self.scene, self.cameras, known_mn[trusted])
                     self.out.stated = _find_stated(recording, self.scene)
-                    stated, moved = float(np.mean(self.out.stated)), np.array(self.motion_mm)[trusted]
+                    share, moved = float(np.mean(self.out.stated)), np.array(self.motion_mm)[trusted]
                     network = getattr(self.methods[method.parts[0]], "identity", "")
-                    fused = method.bound(fused, tracked, self.scene, self.cameras, moved, stated, network)
+                    fused = method.bound(fused, tracked, self.scene, self.cameras, moved, share, network)
                     self.out.evidence = method.video
                 for frame, estimate in zip(tracked, fused, strict=True):
                     frame[name] = estimate

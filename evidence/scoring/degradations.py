@@ -162,8 +162,10 @@ def _invert_masks(folder: Path) -> None:
     (folder / "masks").mkdir(exist_ok=True)
     for k in range(FRAMES):
         file = folder / "masks" / f"{k:06d}.png"
-        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) if file.exists() else np.zeros((height, width))
-        cv2.imwrite(str(file), (255 - mask).astype(np.uint8))
+        mask = np.zeros((height, width), np.uint8)
+        if file.exists():
+            mask = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
+        cv2.imwrite(str(file), 255 - mask)
 
 
 def _damage(cut: bool) -> Change:

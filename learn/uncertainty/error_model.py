@@ -27,16 +27,19 @@ class ErrorModel:
         return np.asarray(np.maximum(np.exp(self.intercept + clipped @ np.array(self.slopes)), self.least))
 
 
-def fit_error_model(features: Floats, error: Floats, weight: Floats, least: float) -> ErrorModel:
-    """Least squares on the logarithm of the error, slightly regularised (ridge).
+def fit_error_model(
+    features: Floats, error: Floats, weight: Floats, least: float, ridge: float = 1.0
+) -> ErrorModel:
+    """Least squares on the logarithm of the error, regularised; by default slightly.
 
-    `features`: (n, F); `error`: (n,) ≥ 0; `weight`: (n,) > 0; `least` > 0: added to an error, in its unit.
+    `features`: (n, F); `error`: (n,) ≥ 0; `weight`: (n,) > 0; `least` > 0: added to an error, in its unit;
+    `ridge`: number of frames as which the prior counts that a feature has no effect.
     """
     spread = np.maximum(features.std(0), 1e-6)
     wanted, share = np.log(error + least), weight / weight.mean()
     middle, level = np.average(features, 0, share), float(np.average(wanted, weights=share))
     scaled = (features - middle) / spread
-    normal = scaled.T @ (share[:, None] * scaled) + np.eye(scaled.shape[1])
+    normal = scaled.T @ (share[:, None] * scaled) + ridge * np.eye(scaled.shape[1])
     slopes = np.linalg.solve(normal, scaled.T @ (share * (wanted - level))) / spread
     ends = slopes, features.min(0), features.max(0)
     per_feature, low, high = (tuple(end.tolist()) for end in ends)

@@ -28,7 +28,7 @@ from synth.render.randomized.surroundings import Randomization
 from synth.system.recent import Recent
 
 _RIM_ROUGHNESS, _RIM_DRY = 0.05, 0.33
-_SEEN = 1.4  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
+_SEEN = 1.3  # distance of what is ever seen from the middle, in halves of the picture's diagonal at rest
 _MIRRORED_PX = 48  # resolution of the wound in steel's reflections, as fine as its finish resolves
 _MOST_TEXELS = 1024  # across the maps of a randomised tissue, which may be wider than the picture
 

@@ -114,7 +114,7 @@ def paint(
         base, bumps = base * (1 - 0.6 * mark[..., None]), bumps - 0.02 * mark
     painted = np.asarray(finish.coat, np.float32) * np.clip(1 + 0.05 * mottle + 0.08 * lines, 0, 2)[..., None]
     base, bare = over(base, painted, coat[..., None]), (1 - coat) * (1 - finish.scattered)
-    rough = over(rough, np.float32(finish.coat_alpha), coat[..., None])
+    rough = over(rough, np.full(1, finish.coat_alpha, np.float32), coat[..., None])
     mirror = over(base, _PLASTIC, coat[..., None])
 
     # Blood: a film that is brightest red where it is thin, a clot where it is thick, a bead at its border.
@@ -134,24 +134,26 @@ def paint(
     wet = np.maximum.reduce([0.8 * wet, film, step(drops / 0.02 - 0.5)])
     if kind in CLOTH:
         wet = 0.3 * wet
-    rough = over(rough, np.float32(0.1), (0.6 * np.maximum(film, clot) * (kind not in CLOTH))[..., None])
+    rough = over(
+        rough, np.full(1, 0.1, np.float32), (0.6 * np.maximum(film, clot) * (kind not in CLOTH))[..., None]
+    )
     if kind in ("suction", "tube"):
         bore = (np.linspace(0, 1, size[1]) * (len(profile) // RING - 1) < _BORE_RINGS)[None, :, None]
         base, mirror = base * np.where(bore, 0.06, 1), mirror * np.where(bore, 0.02, 1)
         bumps = np.where(bore[..., 0], 0, bumps)
     rough = np.clip(rough, 0.05, 1)
     rough[..., 0] = np.clip(rough[..., 0], rough[..., 1], rough[..., 1] / _LEAST)
-    layers = (
-        np.clip(base, 0.003, 0.98),
-        np.clip(bare, 0, 1),
-        rough,
-        np.clip(wet, 0, 1),
-        np.clip(mirror, 0, 0.98),
+    return FinishMaps(
+        base=np.clip(base, 0.003, 0.98).astype(np.float32),
+        bare=np.clip(bare, 0, 1).astype(np.float32),
+        rough=rough.astype(np.float32),
+        wet=np.clip(wet, 0, 1).astype(np.float32),
+        mirror=np.clip(mirror, 0, 0.98).astype(np.float32),
+        normal=_normals(bumps, place),
     )
-    return FinishMaps(*(np.asarray(layer, np.float32) for layer in layers), _normals(bumps, place))
 
 
-def noise(at: Floats, wave_mm: float, rng: np.random.Generator) -> Map:
+def noise(at: Floats | Map, wave_mm: float, rng: np.random.Generator) -> Map:
     """Smooth noise (...) of unit variance at places (..., n) mm."""
     waves = rng.normal(size=(at.shape[-1], 16)) * 2 * np.pi / wave_mm
     phase = rng.uniform(0, 2 * np.pi, 16)

@@ -112,7 +112,7 @@ class InstrumentMesh:
     def alpha(self) -> Floats:
         """(V,) roughness at the vertices, for what they mirror."""
         texels = np.sqrt(self.maps.rough[..., 0] * self.maps.rough[..., 1])
-        return read_map(texels, self.uv)
+        return read_map(texels, self.uv).astype(np.float64)
 
     @property
     def owner(self) -> Indices:

@@ -177,6 +177,51 @@ def test_share_closed_of_known_errors() -> None:
     assert none["undefined"]
 
 
+def test_the_gap_of_known_errors() -> None:
+    """Twice the error on recovered flow, of which training on it takes three quarters of the excess away."""
+    rng = np.random.default_rng(0)
+    force = rng.uniform(1, 100, 12)
+    tests = [f"{place}, {flow}" for place in gap.PLACES for flow in gap.FLOWS]
+
+    def run(*by_flow: float) -> gap.Errors:
+        of = dict(zip(gap.FLOWS, by_flow, strict=True))
+        return {test: (of[test.split(", ")[1]] * force).tolist() for test in tests}
+
+    trained = {"I": [run(0.1, 0.2)], "R": [run(0.11, 0.125)], "N": [run(0.1, 0.15)], "S": [run(1.0, 1.0)]}
+    found = gap.summary(trained, dict.fromkeys(gap.PLACES, force.tolist()))
+    assert set(found["places"]) == set(gap.PLACES)
+    for place in found["places"].values():
+        assert place["opened"] == pytest.approx(2)
+        shares = {kind: share["share"] for kind, share in place["closed"].items()}
+        assert shares == pytest.approx({"R": 0.75, "N": 0.5, "S": -8})
+        assert place["noise_less_real"][0] == pytest.approx(0.025)
+    assert found["errors"]["no force"]["own, ideal"][0] == pytest.approx(1)
+    assert found["errors_mn"]["I"]["own, recovered"][0] == pytest.approx(0.2 * force.mean())
+
+
+def test_a_training_of_the_gap_keeps_the_errors_of_its_epochs(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[-1:1:16j, -1:1:16j]
+    bump = np.exp(-4 * (x**2 + y**2)) * np.stack([x, y])
+    pressed = []
+    for k in range(12):
+        size = rng.uniform(0.5, 2, (T, 1, 1, 1))
+        clip = made_clip(k, size * bump, np.zeros((T, 3)))
+        density = np.zeros(clip.density.shape, np.float32)
+        density[:, 2, 6:10, 6:10] = size[:, 0]
+        force = 2.0 * density.sum(axis=(2, 3)).astype(np.float64)
+        pressed.append(replace(clip, density=density, force=force))
+    settings = preset("tiny", size=16, input="recovered", epochs=3)
+    split = Split(tuple(range(8)), (8, 9), (10, 11))
+    tests = {f"own, {flow}": (pressed[10:], flow) for flow in gap.FLOWS}
+    made = gap.errors("R", pressed, split, settings, tests, tmp_path)
+    assert [row[0] for row in made["curve"]] == [2]
+    assert all(len(values) == 2 and np.isfinite(values).all() for values in made["errors"].values())
+    models = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.safetensors")}
+    assert gap.errors("R", pressed, split, settings, tests, tmp_path) == made
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.safetensors")} == models
+
+
 def test_fitted_noise_is_that_added() -> None:
     rng = np.random.default_rng(1)
     mask = np.zeros((48, 48), np.float32)

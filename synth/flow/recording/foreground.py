@@ -72,9 +72,10 @@ class ForegroundSearch:
         # Flow and confidence are at the rest frame's pixels, masks at the picture's: tissue that has moved
         # under a mask is hidden where it was at rest.
         free = self._find_free(_at_rest(frame.hidden, frame.flow))
-        lost = (free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)).astype(np.uint8)
+        doubtful = free & (frame.confidence > 0) & (frame.confidence < LOW_CONFIDENCE)
         # A textured object hides tissue in patches only, as some of its texture resembles the tissue's.
-        lost = cv2.morphologyEx(lost, cv2.MORPH_CLOSE, _square(Limits.near_px)) > 0
+        whole = cv2.morphologyEx(doubtful.astype(np.uint8), cv2.MORPH_CLOSE, _square(Limits.near_px))
+        lost = np.asarray(whole > 0)
         if self._is_far(lost, frame):
             lost = np.zeros_like(lost)
         self._note("hides tissue that is visible at rest", lost, frame, Limits.lost)

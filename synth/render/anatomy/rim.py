@@ -249,7 +249,7 @@ def _drops(rng: np.random.Generator, blood: float, rim: Rim, pixels: int) -> Map
     for _ in range(int(rng.poisson(Blood.drops * blood))):
         angle, long = rng.uniform(0, 2 * np.pi), rng.uniform(1, 2.2)
         radius = Blood.drop_mm[0] * (Blood.drop_mm[1] / Blood.drop_mm[0]) ** rng.random()
-        away = float(_round(rim.edge, np.float32(angle))) + rng.uniform(0.3, 7.0)
+        away = float(_round(rim.edge, np.full(1, angle, np.float32))[0]) + rng.uniform(0.3, 7.0)
         middle = (away * np.array([np.cos(angle), np.sin(angle)]) / rim.extent_mm + 0.5) * pixels
         turn = float(rng.uniform(0, 360))
         axes = (2 * radius * scale * long, 2 * radius * scale / long)
@@ -328,10 +328,10 @@ def _paint_rows(rim: Rim, appearance: Appearance, streaks: Map, *maps: Map) -> t
     inner = step(-crease / 0.15) * step(away / 0.3 - 0.2)
     turned = np.clip(_round(rim.crease, angle) - 0.5, 0, 1)
     soaked = _soaked(appearance.blood, 0.8 * wide + 0.35 * mottle + 0.25 * fibres + 0.1 * outer - 0.7 * inner)
-    depth, level = Blood.pool
+    deepest, level = Blood.pool
     full = spilt + 0.06 * mottle + level * (3 * appearance.blood - 3.1) - 0.8 * inner
     pool = step(4 * full - 0.3) * min(1, 6 * appearance.blood)
-    depth = depth * np.clip(0.35 + 1.2 * full, 0.25, 1)
+    depth = deepest * np.clip(0.35 + 1.2 * full, 0.25, 1)
     wiped = np.clip(0.55 * fibres + 0.5 * wide - 0.6 + 0.8 * (appearance.blood - 0.5), 0, 1) * Blood.smear
     bloody = (
         soaked * (1 - 0.4 * pool) + depth * np.maximum(pool, drops) + wiped * min(1, 4 * appearance.blood)

@@ -152,7 +152,8 @@ def _slender(tree: Tree, extent_mm: float) -> Tree:
 
 def _roots_inside(tree: Tree, extent_mm: float) -> Floats:
     """Roots (n, 2) mm that are not at the patch's border."""
-    return tree.nodes[(tree.parent < 0) & (np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm)]
+    inside = np.abs(tree.nodes).max(axis=1) < 0.42 * extent_mm
+    return np.asarray(tree.nodes[(tree.parent < 0) & inside])
 
 
 def _with_risers(deep: Tree, main: Tree, extent_mm: float) -> Tree:

@@ -273,7 +273,7 @@ def _material(mi: Any, material: Wet | Metal) -> dict[str, Any]:
         maps, (along, across) = material.maps, np.moveaxis(material.maps.rough, -1, 0)
         # B. Burley, "Physically based shading at Disney", 2012: a conductor where metallic, of
         # alpha = roughness^2 / aspect along and roughness^2 aspect across; aspect^2 = 1 - 0.9 anisotropic.
-        steel = {"type": "principled", "base_color": _bitmap(mi, maps.base)}
+        steel: dict[str, Any] = {"type": "principled", "base_color": _bitmap(mi, maps.base)}
         steel |= {"metallic": _bitmap(mi, maps.bare), "roughness": _bitmap(mi, (along * across) ** 0.25)}
         steel |= {"anisotropic": _bitmap(mi, (1 - across / along) / 0.9)}
         steel |= {"clearcoat": _bitmap(mi, maps.wet), "clearcoat_gloss": _GLOSS}
