@@ -73,10 +73,12 @@ class _Extracted:
         for fragment in list(generate_fragments(about.PixelData))[1:]:  # after the table of offsets
             self._file.write(fragment)
         self._file.flush()
+        self._negative = str(getattr(about, "PhotometricInterpretation", "")) == "MONOCHROME1"
         self.path = Path(self._file.name)
 
     def __call__(self) -> Iterator[Array]:
-        return (picture.rgb for picture in read_video(self.path))
+        pictures = (picture.rgb for picture in read_video(self.path))
+        return (255 - rgb for rgb in pictures) if self._negative else pictures
 
 
 def _times(about: Any, count: int, notes: list[str]) -> Floats | None:

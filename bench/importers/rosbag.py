@@ -19,6 +19,7 @@ from bench.importers.importer_registry import LARGEST_BYTES, Intake, SecondView,
 from synth.arrays import Array, Floats, Ints
 from synth.errors import UserError
 from synth.system import checked_file
+from synth.system.camera_file import crop_matrix
 from synth.system.checked_file import refuse_large
 
 _PICTURES = (
@@ -405,19 +406,37 @@ def _read_lens(topic: str, info: Any, pictures: str, size: tuple[int, int]) -> _
     """The camera of a calibration message of ROS 1 or 2, for a topic of pictures of width and height `size`;
     those named `image_rect...` are rectified. UserError for no calibration, or one for another size."""
     K, D, R, P = (np.asarray(getattr(info, n, getattr(info, n.upper(), ())), np.float64) for n in "kdrp")
-    if (info.width, info.height) != size:
+    corner, binned, shown = _region(info)
+    if (shown != size).any():
         calibrated = f"{info.width} x {info.height}"
+        if tuple(shown) != (info.width, info.height):
+            calibrated += f", its region (roi) and binning give {shown[0]} x {shown[1]}"
         raise UserError(f"{topic}: calibrated at {calibrated} px, but {pictures} has {size[0]} x {size[1]}")
     K, P = K.reshape(3, 3), P.reshape(3, 4)
     if not (np.isfinite([*K.flat, *P.flat]).all() and min(K[0, 0], K[1, 1], P[0, 0], P[1, 1]) > 0):
         raise UserError(f"{topic}: the camera isn't calibrated (K or P is 0)")
     shift_mm = 1000 * float(P[0, 3] / P[0, 0])
+    K, rectified = (crop_matrix(matrix, corner, binned) for matrix in (K, P[:, :3]))
     if _image_name(pictures).startswith("image_rect"):
-        return _Lens(P[:, :3], np.zeros(5), np.eye(3), shift_mm)
+        return _Lens(rectified, np.zeros(5), np.eye(3), shift_mm)
     if D.any() and len(D) not in _TERMS.get(info.distortion_model, ()):
         model = f"{info.distortion_model} with {len(D)} terms"
         raise UserError(f"{topic}: distortion {model} is not one of OpenCV's models")
     return _Lens(K, D if D.any() else np.zeros(5), R.reshape(3, 3), shift_mm)
+
+
+def _region(info: Any) -> tuple[Floats, Floats, Ints]:
+    """Corner (x, y) px of the sensor's region in a calibration message, its binning, and its pictures' size.
+
+    Width and height of the message are the whole sensor's; 0 stands for all of it, and for no binning.
+    """
+    binning = [max(int(getattr(info, name, 0)), 1) for name in ("binning_x", "binning_y")]
+    area, whole = getattr(info, "roi", None), (int(info.width), int(info.height))
+    corner, part = (0, 0), whole
+    if area is not None and area.width and area.height:
+        corner, part = (int(area.x_offset), int(area.y_offset)), (int(area.width), int(area.height))
+    binned = np.array(binning, np.float64)
+    return np.array(corner, np.float64), binned, np.array(part) // np.array(binning)
 
 
 def _image_name(topic: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.recording.meta import Depth
 from bench.recording.recording_folder import Recording
+from bench.recording.tip_poses import read_tips
 from synth.arrays import Floats, Map
 from synth.errors import UserError, as_user_error
 from synth.flow.recording.decode import Footage
@@ -32,6 +33,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
         )
     elif (lens := recording.meta.depth) is not None:
         depth = DepthVideo(partial(_depth, recording, lens.mm_per_unit), partial(_K, lens), mm_per_px)
+    tips = recording.meta.tips
     return Footage(
         recording.frames,
         str(recording.folder),
@@ -41,6 +43,7 @@ def as_footage(recording: Recording, mm_per_px: float) -> Footage:
         depth=depth,
         findings=() if recording.tissue or not recording.region else (_REGION,),
         may_pulsate=recording.meta.may_pulsate,
+        expected=None if tips is None else read_tips(recording.folder / "poses.csv", tips, mm_per_px).expect,
     )
 
 

@@ -31,6 +31,7 @@ OgdenExponent = Annotated[FiniteFloat, Field(ge=-40, le=40), AfterValidator(_mus
 PoissonsRatio = Annotated[FiniteFloat, Field(ge=0, lt=0.5)]
 Corners = Annotated[int, Field(ge=2, le=1000)]
 Row = tuple[Number, Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
 
 
 def _must_run_forward(span: tuple[float, float]) -> tuple[float, float]:
@@ -177,6 +178,28 @@ class Depth(Section):
     """Millimetres per unit of the pictures: 1 for the 16-bit PNG of most depth cameras."""
 
 
+class Tips(Section):
+    """Poses of instruments in `poses.csv`, by which they are looked for in the pictures."""
+
+    projection: tuple[Row4, Row4, Row4]
+    """Rows of the 3 x 4 matrix from a point in the tracker's axes to the picture [px]: K [R | t] of OpenCV's
+    solvePnP between the tracker's points and their pixels."""
+    axis: Row | None = None
+    """Direction from the tip to the hand, in the tool's own axes. Empty: only the tips are looked for."""
+    names: tuple[str, ...] = ()
+    """Names of the poses, as `TipToWorldTransform` of `TipToWorldTransform_x`. Empty: all."""
+    radius_mm: Positive = 2.5
+    """Half the width of an instrument, with the error of its pose [mm at the tissue]."""
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> Tips:
+        if np.linalg.matrix_rank(np.array(self.projection)[:, :3]) < 3:
+            raise ValueError("projection: its first three columns have to be of full rank")
+        if self.axis is not None and not any(self.axis):
+            raise ValueError("axis: a direction must not be zero")
+        return self
+
+
 class Meta(Section):
     """One recording."""
 
@@ -220,6 +243,8 @@ class Meta(Section):
     """For a recording with a right camera."""
     depth: Depth | None = None
     """For a recording with a depth camera."""
+    tips: Tips | None = None
+    """For a recording with poses of instruments (poses.csv): where masks expect them."""
     sensor: SensorMeta = SensorMeta()
     sync: Sync = Sync()
     pulse: PulseMeta = PulseMeta()

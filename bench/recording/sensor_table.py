@@ -59,6 +59,8 @@ _HEAD_RATE = re.compile(r"sampl\w*[ _](?:rate|freq\w*)", re.IGNORECASE)
 _HEAD_STEP = re.compile(r"delta_x", re.IGNORECASE)
 _HEAD_NUMBER = re.compile(r"[-+]?(?:\d[\d.,'’\u00a0\u2009\u202f]*|\.\d+)(?:[eEdD][-+]?\d+)?")
 _PER_SECOND = re.compile(r"\b1 ?/ ?s(?:ec\w*)?\b|\bs ?\^? ?[-−] ?1\b", re.IGNORECASE)
+_TWO_NUMBERS = re.compile(r"\d+,[1-9]\d{3,}")
+_FASTEST_HZ = 1e5  # of force sensors; beyond, a comma parts two rates
 _OF_TIME = re.compile(r"\b(?:[mnuµμ]s|m?sec|min)\b", re.IGNORECASE)
 _BRACKETS = re.compile(r"\([^)]*\)|\[[^\]]*\]")
 SINCE_1970_S, _LATEST_S = 0.9e9, 5e9  # of the years 1998 to 2128
@@ -338,9 +340,14 @@ def _head_number(table: SensorTable, label: re.Pattern[str]) -> float:
             raise table.error(f"a rate in a unit of time: {lines[-1]!r}: write it as 'Sampling rate: 500 Hz'")
         factor = 1000.0 if "khz" in text.lower() else 1.0
         try:
-            values |= {factor * _stated_number(number) for number in numbers}
+            stated = {number: factor * _stated_number(number) for number in numbers}
         except ValueError:
             raise table.error(f"{lines[-1]!r} states no number that can be read") from None
+        for number, value in stated.items():
+            # "500,500" and "500,1000" are two rates as well as one.
+            if label is _HEAD_RATE and (_TWO_NUMBERS.fullmatch(number) or value > _FASTEST_HZ):
+                raise table.error(f"{lines[-1]!r}: one rate or two? write it as 'Sampling rate: 500 Hz'")
+        values |= set(stated.values())
     if len(values) > 1:
         raise table.error(f"which number is meant can't be told: {' | '.join(lines)}: leave one")
     return values.pop() if values else 0.0

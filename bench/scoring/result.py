@@ -8,6 +8,7 @@ from typing import Any
 
 from bench.bootstrap import Interval
 from bench.recording.recording_scale import PixelScale
+from bench.scoring.skill import skill_of
 from bench.sensor.clock_sync import Offset
 from bench.sensor.rotation import SensorRotation
 from bench.tracking.tracking import TrackedRecording
@@ -152,6 +153,7 @@ def as_json(result: Result) -> dict[str, Any]:
         "scale": result.scale,
         "relative_uncertainty": result.relative_uncertainty,
         "noise_floor_mn": result.noise_floor_mn,
+        "skill": skill_of(result),
         "pulse": done.pulse,
         "right_camera": done.stereo,
         "aligned": result.aligned,

@@ -18,6 +18,7 @@ from bench.scoring.answers import answer
 from bench.scoring.force_metrics import METRICS
 from bench.scoring.headline import headline
 from bench.scoring.result import Result
+from bench.scoring.skill import FIGURES, skill_of
 from bench.tracking.tracking import Snapshot, TrackedRecording, picture_masks
 from learn.evaluation.metrics import Metric
 from learn.evaluation.tables import open_table
@@ -68,6 +69,8 @@ def render_report(result: Result, title: str = "") -> str:
         masks=None if (masked := picture_masks(result.tracked)) is None else _jpeg(masked),
         force_kpa=force_kpa,
         settings=_flat(result.settings),
+        skill=skill_of(result),
+        skill_figures=FIGURES,
     )
 
 

@@ -110,7 +110,7 @@ class Folder:
         if not self.is_begun or (described := self.described())["identity"] == name:
             return
         if not _changes(described["job"], job.model_dump(mode="json")):
-            files = "mechanics.source, anatomy.mesh, appearance.photo or render.calibration"
+            files = "mechanics.source, anatomy.mesh, appearance.photo, render.calibration or fem.instrument"
             why = f"a file of {files} was replaced since the dataset was begun"
             raise UserError(f"{self.root}: {why}; restore it, or choose another folder")
 

@@ -8,7 +8,7 @@ instruments, shadows and objects drawn over other pictures (D. Dwibedi et al., "
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -49,6 +49,13 @@ class Segmentation:
     def shines(self) -> Mask:
         """(H, W) highlights and a pixel around."""
         return _grown(self.highlight > _FOUND)
+
+    def expect(self, there: Mask) -> Segmentation:
+        """The classes where an object is expected (H, W): its odds there are those of 0.9 where they were
+        even."""
+        odds = _HIDING / (1 - _HIDING)
+        likely = odds * self.instrument / (1 + (odds - 1) * self.instrument)
+        return replace(self, instrument=np.where(there, likely, self.instrument).astype(np.float32))
 
 
 def segment(rest: Pixels, frame: Pixels) -> Segmentation:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-import struct
 import warnings
 import zlib
 from collections.abc import Sequence
@@ -207,7 +206,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
                 raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
             # From bytes, trimesh can't open further files that are named in this one.
-            held = io.BytesIO(_whole(data) if kind == "stl" else check_surface(data, kind))
+            held = io.BytesIO(check_surface(data, kind))
             mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
@@ -264,16 +263,6 @@ def _refuse_expansion(data: bytes) -> None:
             packed = unpacker.unconsumed_tail
             if left < 0:
                 raise ValueError("its arrays expand to more than 1 GB")
-
-
-def _whole(data: bytes) -> bytes:
-    """An STL with the number of faces that its size gives. ValueError if its header counts others."""
-    if len(data) < 84 or (data[:5].lower() == b"solid" and b"facet" in data[:1000].lower()):
-        return data
-    count, held = struct.unpack_from("<I", data, 80)[0], (len(data) - 84) // 50
-    if count not in (0, held):
-        raise ValueError(f"its header counts {count} faces, its size {held}")
-    return data[:80] + struct.pack("<I", held) + data[84 : 84 + 50 * held]
 
 
 def _orient(vertices: Floats, faces: Ints) -> Ints:

@@ -11,6 +11,7 @@ import io
 import json
 import lzma
 import re
+import struct
 import warnings
 import xml.etree.ElementTree as ET
 import zlib
@@ -141,6 +142,8 @@ def check_surface(data: bytes, suffix: str) -> bytes:
         _refuse_hollow(data)
     if suffix == "ply":
         _refuse_overcount(data)
+    if suffix == "stl":
+        return _complete_stl(data)
     if suffix in ("obj", "off") or (suffix == "ply" and b"format ascii" in data[:1000]):
         if suffix == "obj":
             data = _shape_of_obj(data)
@@ -151,6 +154,16 @@ def check_surface(data: bytes, suffix: str) -> bytes:
         except UnicodeDecodeError:  # of names and comments
             return data.decode("latin-1").encode("utf-8")
     return data
+
+
+def _complete_stl(data: bytes) -> bytes:
+    """An STL with the number of faces that its size gives. ValueError if its header counts others."""
+    if len(data) < 84 or (data[:5].lower() == b"solid" and b"facet" in data[:1000].lower()):
+        return data
+    count, held = struct.unpack_from("<I", data, 80)[0], (len(data) - 84) // 50
+    if count not in (0, held):
+        raise ValueError(f"its header counts {count} faces, its size {held}")
+    return data[:80] + struct.pack("<I", held) + data[84 : 84 + 50 * held]
 
 
 def _shape_of_obj(data: bytes) -> bytes:

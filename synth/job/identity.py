@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import UserError
+from synth.job.mechanics_sections import is_mesh_name
 from synth.job.schema import Job
 from synth.system import camera_file, checked_file
 from synth.system.series_files import LARGEST_STATE, list_files
@@ -41,10 +42,37 @@ def identify_job(job: Job) -> str:
     del described["sequences"], described["card"]
     for (block, name), largest in FILES.items():
         described[block][name] = _digest_file(getattr(getattr(job, block), name), largest)
+    for *steps, key in find_meshes(described):
+        holder: Any = described
+        for step in steps:
+            holder = holder[step]
+        file = Path(holder[key])
+        holder[key] = [file.name, _digest_file(file, checked_file.LARGEST_INSTRUMENT)]
     if job.mechanics.source is not None:
         files = list_files(job.mechanics.source, job.mechanics.force, job.mechanics.instruments)
         described["mechanics"]["source"] = [_digest_file(file, LARGEST_STATE) for file in files]
     return digest(described)
+
+
+def find_meshes(values: dict[str, Any]) -> list[tuple[str | int, ...]]:
+    """Places of the files of instruments in a job's values, as read or as dumped."""
+    fem = values.get("fem")
+    if not isinstance(fem, dict):
+        return []
+    tools, lines = fem.get("instrument"), fem.get("instrument_list")
+    each: list[tuple[tuple[str | int, ...], Any]] = [(("fem", "instrument"), tools)]
+    if isinstance(tools, list | tuple):
+        each = [(("fem", "instrument", k), tool) for k, tool in enumerate(tools)]
+    for k, line in enumerate(lines if isinstance(lines, list | tuple) else ()):
+        if isinstance(line, dict):
+            each.append((("fem", "instrument_list", k, "instrument"), line.get("instrument")))
+    places = list[tuple[str | int, ...]]()
+    for place, tool in each:
+        if is_mesh_name(tool):
+            places.append(place)
+        elif isinstance(tool, dict) and isinstance(tool.get("file"), str):
+            places.append((*place, "file"))
+    return places
 
 
 def list_pictures(folder: Path) -> list[Path]:

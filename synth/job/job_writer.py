@@ -74,6 +74,7 @@ def limits(model: type[BaseModel], key: str) -> str:
         described, signs = described["anyOf"][0], {}
     described = described.get("propertyNames", described)
     described = (described.get("prefixItems") or [described.get("items", described)])[0]
+    described = described.get("anyOf", [described])[0]
     if "enum" in described:
         return f"({' | '.join(map(str, described['enum']))})"
     bounds = [(sign, described[name]) for name, sign in signs.items() if name in described]

@@ -4,16 +4,69 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Annotated, Literal, get_args
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    FiniteFloat,
+    Tag,
+    ValidationInfo,
+    model_validator,
+)
 
 from synth.fem.law_choice import LAWS, LoadRange, check_load_range, choose_law
-from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share
+from synth.job.types import Direction, NonNegative, PlugInName, Positive, Range, Section, Share, Vector
 from synth.plugins import STORED
 
 Kind = Literal["pull", "push", "slide", "grasp", "retract", "tap"]
 Instrument = Literal["forceps", "bayonet", "dissector", "suction", "spatula", "probe", "none"]
+
+
+class OwnInstrument(Section):
+    """An instrument of your own: a mesh whose tip rests on the middle of the contact."""
+
+    file: Path
+    """Its mesh (STL, OBJ, PLY), relative to the job file."""
+    tip: Vector = (0.0, 0.0, 0.0)
+    """Its tip, in the file's axes and unit."""
+    axis: Direction = (0.0, 0.0, 1.0)
+    """Direction from the tip to the hand, in the file's axes."""
+    up: Direction | None = None
+    """Direction that faces away from the tissue, in the file's axes. Empty: its z, or x if axis is z."""
+    unit_mm: Positive = 1.0
+    """Millimetres in the file's unit of length: 1000 for m."""
+
+
+def is_mesh_name(value: object) -> bool:
+    """Whether an instrument is named as a file, such as hook.stl, instead of as a kind."""
+    return isinstance(value, str) and ("." in value or "/" in value)
+
+
+def _as_own(value: Any) -> Any:
+    return {"file": value} if is_mesh_name(value) else value
+
+
+def _tag(value: Any) -> str:
+    return "mesh" if isinstance(value, dict | OwnInstrument) else "kind"
+
+
+Tool = Instrument | OwnInstrument
+_MeshName = Annotated[str, Field(pattern=r"\.(stl|STL|obj|OBJ|ply|PLY)$")]
+_AnyTool = Annotated[
+    Annotated[Instrument, Tag("kind")] | Annotated[OwnInstrument, Tag("mesh")],
+    Discriminator(_tag),
+    BeforeValidator(_as_own, json_schema_input_type=Instrument | OwnInstrument | _MeshName),
+]
+
+
+def name_of(tool: Tool) -> str:
+    """Name of an instrument, as sequences store it; of one's own that of its file."""
+    return tool if isinstance(tool, str) else tool.file.name
+
 
 INSTRUMENTS: dict[Kind, dict[Instrument, float]] = {
     "pull": {"forceps": 0.5, "bayonet": 0.5, "suction": 0.0},
@@ -64,8 +117,9 @@ class InstrumentSection(Section):
 
     gesture: Kind | None = None
     """Kind of gesture. Empty: drawn from `fem.gestures`."""
-    instrument: Instrument | None = None
-    """The instrument, one that the gesture takes; none: not drawn. Empty: drawn as by `fem.instrument`."""
+    instrument: _AnyTool | None = None
+    """The instrument, one that the gesture takes, or your own; none: not drawn. Empty: drawn as by
+    `fem.instrument`."""
     place: tuple[FiniteFloat, FiniteFloat] | None = None
     """Centre of its contact at rest [mm]: x and y in world axes, from the centre of the opening."""
     direction: Direction | None = None
@@ -142,7 +196,8 @@ class PulseSection(Section):
     """Amplitude of the respiratory motion [mm]."""
 
 
-_OneOrMore = BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)
+_SINGLE = (str, dict, OwnInstrument)
+_OneOrMore = BeforeValidator(lambda value: (value,) if isinstance(value, _SINGLE) else value)
 Contact = Literal["loaded", "driven"]
 Contacts = Annotated[tuple[Contact, ...], Field(min_length=1), _OneOrMore]
 Skulls = Annotated[tuple[Literal["bonded", "slip"], ...], Field(min_length=1), _OneOrMore]
@@ -203,9 +258,10 @@ class FemSection(Section):
     gestures: Annotated[tuple[Kind, ...], Field(min_length=1)] = get_args(Kind)
     """Kinds of gesture that sequences are drawn from, in equal shares. Not given: those that the named
     instruments suit."""
-    instrument: Annotated[tuple[Instrument, ...], _OneOrMore] = ()
+    instrument: Annotated[tuple[_AnyTool, ...], _OneOrMore] = ()
     """Instruments, one or more: each gesture is made with one that it takes, in equal shares; one named twice
-    has two. None: it is not drawn. Empty: those usual for each gesture."""
+    has two. None: it is not drawn. Your own: a mesh such as hook.stl, or {file, tip, axis, up, unit_mm} (see
+    docs/howto/instruments.md), which suits all but grasps. Empty: those usual for each gesture."""
     instruments: Range[Annotated[int, Field(ge=1, le=3)]] = (1, 1)
     """How many instruments act at once, each with a gesture, load, direction and timing of its own."""
     instrument_list: Annotated[tuple[InstrumentSection, ...], Field(max_length=3)] = ()
@@ -276,14 +332,29 @@ class FemSection(Section):
             raise ValueError("; ".join(dict.fromkeys(takes)))
         return self
 
-    def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Instrument, float]]:
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the instruments in `instrument`."""
+        return tuple(map(name_of, self.instrument))
+
+    @property
+    def own_instruments(self) -> dict[str, OwnInstrument]:
+        """The instruments that are meshes of one's own, by name. ValueError: two share one."""
+        meshes: dict[str, OwnInstrument] = {}
+        for tool in (*self.instrument, *(line.instrument for line in self.instrument_list)):
+            if isinstance(tool, OwnInstrument) and meshes.setdefault(name_of(tool), tool) != tool:
+                raise ValueError(f"instrument: two are called {name_of(tool)}; rename one's file")
+        return meshes
+
+    def choices(self, one: InstrumentSection = InstrumentSection()) -> dict[Kind, dict[Tool, float]]:
         """Gestures that an instrument may be drawn with, each with its instruments and their shares."""
         named = self.instrument if one.instrument is None else (one.instrument,)
-        found: dict[Kind, dict[Instrument, float]] = {}
+        found: dict[Kind, dict[Tool, float]] = {}
         for kind in self.gestures if one.gesture is None else (one.gesture,):
-            shares = INSTRUMENTS[kind]
+            shares: dict[Tool, float] = {name: share for name, share in INSTRUMENTS[kind].items()}
             if named:
-                shares = {name: float(named.count(name)) for name in named if name in (*shares, "none")}
+                takes = {*shares, "none", *(() if kind == "grasp" else self.own_instruments.values())}
+                shares = {name: float(named.count(name)) for name in named if name in takes}
             total = sum(shares.values())
             found[kind] = {name: share / total for name, share in shares.items() if share}
         if self.contact == ("driven",):

@@ -6,13 +6,14 @@ import os
 from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from synth.arguments import checked
 from synth.errors import UserError, did_you_mean
 from synth.job import identity
 from synth.job.schema import Job
 from synth.system import checked_file
-from synth.system.config_file import ConfigFile, Mistake
+from synth.system.config_file import ConfigFile, Loc, Mistake
 
 
 def names() -> list[str]:
@@ -65,19 +66,32 @@ def parse_job(text: str, label: str, folder: Path, overrides: Sequence[str] = ()
 
 def _find_files(config: ConfigFile, folder: Path) -> Iterator[Mistake]:
     """Makes the paths in a job absolute; yields the errors of those that can't be used."""
-    for at, largest in [*identity.FILES.items(), (("mechanics", "source"), None)]:
-        block = config.values.get(at[0])
-        name = block.get(at[1]) if isinstance(block, dict) else None
+    places: list[tuple[Loc, int | None]] = [*identity.FILES.items(), (("mechanics", "source"), None)]
+    places += [(at, checked_file.LARGEST_INSTRUMENT) for at in identity.find_meshes(config.values)]
+    for at, largest in places:
+        block = _inside(config.values, at[:-1])
+        name = _inside(block, at[-1:])
         if not isinstance(name, str):
             continue
+        given = any(at[: len(change)] == change for change in config.changes)
         try:
-            path = ((Path.cwd() if at in config.changes else folder) / Path(name).expanduser()).resolve()
+            path = ((Path.cwd() if given else folder) / Path(name).expanduser()).resolve()
             if at == ("appearance", "photo") and path.is_dir():
                 identity.list_pictures(path)
             elif largest is not None:  # else a pattern, or a folder
                 checked_file.check_file(path, largest)
-            config.values[at[0]][at[1]] = str(path)
+            block[at[-1]] = str(path)
         except UserError as error:
             yield Mistake(at, str(error))
         except (RuntimeError, ValueError, OSError):  # no such home, a NUL, a loop of links, too long
             yield Mistake(at, f"{name[:80]!r} is not a valid path")
+
+
+def _inside(values: Any, at: Loc) -> Any:
+    """The value at a place in blocks and lists; None if there is none."""
+    for step in at:
+        try:
+            values = values[step]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return values

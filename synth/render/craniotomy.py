@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from synth.render.appearance.reflection import Theatre
 from synth.render.camera.camera import Camera
 from synth.render.content import SceneContent
 from synth.render.idle import IdleInstrument
+from synth.render.instrument import NO_MESHES, OwnMesh
 from synth.render.materials import Body, Coat, Wet
 from synth.render.randomized import pattern, surroundings
 from synth.render.randomized.surroundings import Randomization
@@ -46,12 +47,14 @@ def craniotomy(
     *,
     photo: Path | None = None,
     wear: float = 0.0,
+    meshes: Mapping[str, OwnMesh] = NO_MESHES,
 ) -> SceneContent:
     """The content of one sequence at rest; UserError: the photograph cannot be read.
 
     `opening_mm`: radius of the opening; `drawn`: kind of each acting instrument, `none` for one that is not
     drawn, and the radius of its contacts [mm]; `idle`: those that touch nothing; `how`: what is randomised;
-    `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their steel.
+    `photo`: a photograph as albedo; `wear`: strength of `randomize.instruments`, that of their steel;
+    `meshes`: of kinds of one's own.
     """
     how = how or Randomization()
     lit = appearance.light.power * light.blackbody(appearance.light.kelvin)
@@ -99,7 +102,7 @@ def craniotomy(
         tissue=Body(surface.vertices, surface.faces, surface.uv, cortex),
         lamps=lamps,
         static=static,
-        instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px),
+        instruments=instrument.build(drawn, theatre, hand, wear, idle, ground, camera.mm_per_px, meshes),
         spot=appearance.light.even,
     )
 

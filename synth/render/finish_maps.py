@@ -41,6 +41,17 @@ def unfold(profile: Floats, turn: int) -> Map:
     return np.column_stack([np.repeat(np.linspace(0, 1, len(rings)), RING), across]).astype(np.float32)
 
 
+def wrap(points: Floats, outline: Floats) -> Map:
+    """Place (V, 2), from 0 to 1, in the texture of round rings (R * RING, 3) mm of points (V, 3) mm in them.
+
+    It is linear in z, as is the texture of rings at even distances, so that large faces fit too.
+    """
+    middles = outline.reshape(-1, RING, 3).mean(axis=1)
+    x, y = (points[:, k] - np.interp(points[:, 2], middles[:, 2], middles[:, k]) for k in (0, 1))
+    along = np.interp(points[:, 2], middles[:, 2], np.linspace(0, 1, len(middles)))
+    return np.column_stack([along, 0.5 - np.arctan2(y, np.abs(x)) / np.pi]).astype(np.float32)
+
+
 def paint(
     finish: Finish,
     profile: Floats,

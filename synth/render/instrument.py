@@ -5,9 +5,10 @@ Sizes in mm are those of common neurosurgical instruments, chosen by eye, not fr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from types import MappingProxyType
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -41,9 +42,13 @@ class Part:
     profile: Floats  # (V, 3) mm
     side: int  # tip of the instrument that it follows: 1, -1; 0: their middle
     rows: int = 0  # of a sheet of cloth; 0: closed rings
+    faces: Indices | None = None  # of a mesh without rings; None: a grid's
+    outline: Floats | None = None  # (R * RING, 3) mm of such a mesh: rings around it, which have its texture
 
     @property
     def shape(self) -> Shape:
+        if self.faces is not None:
+            return Shape(self.profile, self.faces)
         rows = self.rows or len(self.profile) // RING
         faces = grid_faces(rows, len(self.profile) // rows, "" if self.rows else "columns")
         return Shape(self.profile, faces.reshape(-1, 3))
@@ -51,6 +56,8 @@ class Part:
     @property
     def uv(self) -> Map:
         """(V, 2) place in its maps, see `finish_maps`."""
+        if self.outline is not None:
+            return finish_maps.wrap(self.profile, self.outline)
         if not self.rows:
             return finish_maps.unfold(self.profile, self.turn)
         sizes = self.rows, len(self.profile) // self.rows
@@ -65,7 +72,30 @@ class Part:
 
     def maps(self, skin: Finish, kind: str, rng: np.random.Generator, mm_per_px: float) -> FinishMaps:
         """Its texture in a finish."""
-        return finish_maps.paint(skin, self.profile, self.rows, self.turn, kind, rng, mm_per_px)
+        rings = self.profile if self.outline is None else self.outline
+        return finish_maps.paint(skin, rings, self.rows, self.turn, kind, rng, mm_per_px)
+
+    def resize(self, size: float) -> Part:
+        """The part, larger by a factor."""
+        outline = None if self.outline is None else size * self.outline
+        return replace(self, profile=size * self.profile, outline=outline)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMesh:
+    """An instrument of one's own; see `own_instrument`."""
+
+    part: Part
+    half: float  # half the width of its tip, mm
+
+    @property
+    def outline(self) -> Part:
+        """Rings around it, for its distance from other instruments."""
+        assert self.part.outline is not None
+        return Part(self.part.outline, 0)
+
+
+NO_MESHES: Mapping[str, OwnMesh] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -139,11 +169,15 @@ def place(parts: Sequence[Part], ends: Floats, ways: Floats) -> list[Floats]:
     return placed
 
 
-def shape_of(kind: str, footprint_mm: float, size: float = 1.0) -> tuple[tuple[Part, ...], float]:
+def shape_of(
+    kind: str, footprint_mm: float, size: float = 1.0, meshes: Mapping[str, OwnMesh] = NO_MESHES
+) -> tuple[tuple[Part, ...], float]:
     """Parts of an instrument for contacts of that radius a, and half the width [mm] of its tip; both times
-    `size`."""
+    `size`. `meshes`: of further kinds, which have the size of their files."""
     if kind == "none":
         return (), 0.0
+    if kind in meshes:
+        return (meshes[kind].part.resize(size),), size * meshes[kind].half
     make, share, least, most = SHAPES[kind]
     half = size * float(np.clip(share * footprint_mm, least, most))
     return make(half), half
@@ -157,14 +191,16 @@ def build(
     idle: Sequence[IdleInstrument] = (),
     ground: Floats = np.zeros((1, 3)),
     mm_per_px: float = 0.05,
+    meshes: Mapping[str, OwnMesh] = NO_MESHES,
 ) -> InstrumentMesh | None:
     """Instruments in a theatre, with finishes drawn for each; None if there is none.
 
     `drawn`: kind of each acting one and the radius a of its contacts, mm; `strength`: of the randomization of
-    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `mm_per_px`: of the picture.
+    sizes and finishes; `ground`: points (N, 3) mm that cloth lies on; `mm_per_px`: of the picture; `meshes`:
+    as of `shape_of`.
     """
     sizes = 1 + strength * (rng.uniform(*_OTHER_SIZES, len(drawn)) - 1)
-    made = [shape_of(kind, a, size) for (kind, a), size in zip(drawn, sizes, strict=True)]
+    made = [shape_of(kind, a, size, meshes) for (kind, a), size in zip(drawn, sizes, strict=True)]
     made += [
         ((_laid(one, ground, rng),), 0.0) if one.kind in CLOTH else shape_of(one.kind, one.radius_mm)
         for one in idle

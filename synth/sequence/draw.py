@@ -23,6 +23,7 @@ from synth.render.camera import camera_calibration
 from synth.render.camera.camera import Camera, Lens, visible_radius
 from synth.render.idle import draw_idle
 from synth.sequence import randomization, scenario
+from synth.sequence.job_instruments import read_job_instruments
 from synth.sequence.scenario import Scenario
 from synth.system import camera_file
 
@@ -90,6 +91,7 @@ def draw(job: Job, index: int, attempt: int = 0, *, case: Scenario | None = None
     """
     if index < 0:
         raise UserError(f"index {index}: sequences are numbered from 0")
+    read_job_instruments(job.fem)  # those that can't be drawn are refused before anything is computed
     dataset, (job, randomized, off_centre) = job, randomization.randomize(job, index)
     lens = read_lens(job.render)
 

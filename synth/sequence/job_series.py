@@ -8,7 +8,7 @@ from synth.fem.external.series import MeshSeries, Units
 from synth.job.schema import Job
 from synth.system import series_files
 
-_PULLING = {"forceps", "bayonet", "suction", "none"}  # instruments that may pull
+_PULLING = {"forceps", "bayonet", "suction", "none"}  # that may pull, as may one's own
 
 
 def read_job_series(job: Job, index: int) -> MeshSeries:
@@ -19,7 +19,7 @@ def read_job_series(job: Job, index: int) -> MeshSeries:
     given, fem = job.mechanics, job.fem
     assert given.source is not None
     sources = series_files.list_sources(given.source)
-    pulls = not _PULLING.isdisjoint(fem.instrument)
+    pulls = not _PULLING.isdisjoint(fem.names) or bool(fem.own_instruments)
     return read_checked_series(
         sources[index % len(sources)],
         Units(given.unit_mm, given.unit_mn, given.dt_s),

@@ -29,6 +29,7 @@ from synth.render.content import SceneContent
 from synth.render.craniotomy import craniotomy
 from synth.render.scene import RenderedFrame, Renderer, SceneState
 from synth.sequence.draw import Draw, draw
+from synth.sequence.job_instruments import read_job_instruments
 from synth.sequence.job_series import read_job_series
 from synth.sequence.scenario import Scenario
 from synth.sequence.timeline import Timeline
@@ -111,7 +112,7 @@ class RestScene:
             return [
                 (gesture.kind, gesture.instrument, gesture.footprint_mm) for gesture in self.scenario.gestures
             ] + idle
-        kinds, radius = self.job.fem.instrument or ("probe",), self.job.fem.footprint_mm[0]
+        kinds, radius = self.job.fem.names or ("probe",), self.job.fem.footprint_mm[0]
         return [("external", kinds[k % len(kinds)], radius) for k in range(self.series.tip.shape[1])] + idle
 
     @property
@@ -250,6 +251,7 @@ def draw_craniotomy(rest: RestScene) -> SceneContent:
         case.randomized,
         photo=job.appearance.photo,
         wear=job.randomize.get("instruments", 0.0),
+        meshes=read_job_instruments(job.fem),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -16,7 +17,7 @@ from synth.fem.material import Pia, Tissue
 from synth.fem.pulse import BREATH_HZ, HEART_HZ, Pulse
 from synth.fem.tool_gesture import Drive, Gesture, ToolContact
 from synth.job import schema
-from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, Contact, InstrumentSection
+from synth.job.mechanics_sections import CLEAR_MM, DRIVEN_SIZES_MM, Contact, InstrumentSection, name_of
 from synth.job.microscope import BLUR_WIDTH_PX
 from synth.job.schema import Family, FemSection, Job, LightSection, RenderSection
 from synth.render import instrument
@@ -29,7 +30,9 @@ from synth.render.camera.camera_sensor import CameraSensor
 from synth.render.camera.colour_processing import CAMERAS
 from synth.render.finish_maps import RING
 from synth.render.idle import IdleInstrument
+from synth.render.instrument import OwnMesh
 from synth.render.randomized.surroundings import Randomization
+from synth.sequence.job_instruments import read_job_instruments
 
 Random = np.random.Generator
 Range = tuple[float, float]
@@ -136,7 +139,7 @@ def draw_gestures(
 
     Raises UserError if not all instruments fit into the opening, or not in their places.
     """
-    given, (fewest, most) = fem.instrument_list, fem.instruments
+    given, (fewest, most), meshes = fem.instrument_list, fem.instruments, read_job_instruments(fem)
     drawn = max(int(others.integers(fewest, most + 1)), len(given))
     sight, least = lens / np.linalg.norm(lens), np.cos(np.radians(_END_ON_DEG))
     # Each time all anew: the shaft of one may be in the way of the next. At last fewer, if the job allows it.
@@ -157,7 +160,8 @@ def draw_gestures(
                 clear = max(opening_mm - CLEAR_MM, longest) if given else opening_mm
                 fits = trial.reach_mm <= min(clear, opening_mm) + 1e-9
                 hides = trial.shaft @ sight > least and trial.instrument != "none"
-                if fits and not hides and all(_are_apart(trial, other) for other in placed_gestures.values()):
+                apart = (_are_apart(trial, other, meshes) for other in placed_gestures.values())
+                if fits and not hides and all(apart):
                     placed_gestures[k] = trial
                     break
             else:
@@ -191,7 +195,7 @@ def draw_gesture(
     choices = fem.choices(given)
     kind = drawn if drawn in choices else list(choices)[int(further.integers(len(choices)))]
     tools = choices[kind]
-    tool = str(further.choice(list(tools), p=list(tools.values())))
+    tool = name_of(list(tools)[int(further.choice(len(tools), p=list(tools.values())))])
     footprint = _uniform(rng, wanted.footprint_mm)
     unit_mn = young_kpa * footprint**2  # the force of P = 1
     load = _uniform(rng, wanted.load) if wanted.force_mn is None else _uniform(rng, wanted.force_mn) / unit_mn
@@ -251,9 +255,10 @@ def draw_driven_gesture(
     kinds = [kind for kind in fem.gestures if kind in choices] or list(choices)
     kind = kinds[int(rng.integers(len(kinds)))]
     tools = choices[kind]
-    tool = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
-    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[tool])
-    if tool in _ROUND:
+    chosen = list(tools)[int(rng.choice(len(tools), p=list(tools.values())))]
+    tool, sized = name_of(chosen), chosen if isinstance(chosen, str) else "none"
+    length, width = (_uniform(rng, ends) for ends in DRIVEN_SIZES_MM[sized])
+    if sized in _ROUND:
         width = length
     elif kind in ("push", "tap"):
         length = min(length, _TIP_LENGTH * width)  # it presses with its end
@@ -308,19 +313,24 @@ def draw_driven_gesture(
     )
 
 
-def _are_apart(gesture: Gesture, other: Gesture) -> bool:
+def _are_apart(gesture: Gesture, other: Gesture, meshes: Mapping[str, OwnMesh]) -> bool:
     """Whether two gestures' contacts and instruments are apart, on their whole ways over level tissue."""
     if tool_gesture.clearance(gesture, other) < 0:
         return False
-    (here, wide), (there, broad) = _rings(gesture), _rings(other)
+    (here, wide), (there, broad) = (
+        _rings(acting, meshes.get(acting.instrument)) for acting in (gesture, other)
+    )
     gap = np.linalg.norm(here[:, None] - there[None], axis=2) - wide[:, None] - broad[None]
     return float(gap.min(initial=np.inf)) >= _APART_MM
 
 
 @lru_cache(maxsize=64)
-def _rings(gesture: Gesture) -> tuple[Floats, Floats]:
+def _rings(gesture: Gesture, mesh: OwnMesh | None = None) -> tuple[Floats, Floats]:
     """Middles (N, 3) mm and radii (N,) mm of the instrument's rings before, at the start and at the end."""
-    parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
+    if mesh is None:
+        parts, _ = instrument.shape_of(gesture.instrument, gesture.footprint_mm)
+    else:
+        parts = (mesh.outline,)
     shapes = [np.zeros((0, 3))]
     for slid, away in product((-0.5, 0.5) if any(gesture.path_mm) else (0.0,), (0.0, gesture.hover_mm)):
         place = gesture.point_mm + slid * np.asarray(gesture.path_mm)

@@ -265,10 +265,15 @@ class _Values(NamedTuple):
                 f"{made[0]:g} x "
                 f"{made[1]:g}, but the pictures are {size[0]} x {size[1]}"
             )
-        K = K.copy()
-        K[:2, 2] = (K[:2, 2] - corner + 0.5) / binned - 0.5
-        K[[0, 1], [0, 1]] /= binned
-        return K, shown
+        return crop_matrix(K, corner, binned), shown
+
+
+def crop_matrix(K: Floats, corner: Floats, binned: Floats) -> Floats:
+    """The camera matrix (3, 3) px of a region of the sensor from a corner (x, y) px, binned (x, y)."""
+    K = K.copy()
+    K[:2, 2] = (K[:2, 2] - corner + 0.5) / binned - 0.5
+    K[[0, 1], [0, 1]] /= binned
+    return K
 
 
 def _load(path: Path) -> tuple[_Values, _Values, bool]:

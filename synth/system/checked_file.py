@@ -27,6 +27,7 @@ from synth.errors import Caution, UserError, as_user_error, first_line
 from synth.system.resources import refuse_excess
 
 LARGEST_MESH, LARGEST_PICTURE, LARGEST_YAML = 1 << 30, 512 << 20, 200_000  # bytes
+LARGEST_INSTRUMENT = 64 << 20  # bytes of a mesh that is posed in every frame
 LARGEST_PIXELS = 40_000_000  # of a still image or a frame of a video
 _LARGEST_ARRAYS = 64 << 30
 _LARGEST_HEAD = 10_000  # bytes of an array's header, NumPy's own limit

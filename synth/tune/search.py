@@ -231,6 +231,8 @@ def write_job(tuned: Tuned, source: str, overrides: Sequence[str], out: Path) ->
         job = reader.load_job(source, overrides).model_dump(mode="json")
         paths = {f"{section}.{name}": job[section][name] for section, name in identity.FILES}
         keys = {key: path for key, path in paths.items() if path is not None}
+        if identity.find_meshes(job):
+            keys |= {f"fem.{name}": job["fem"][name] for name in ("instrument", "instrument_list")}
     changes = differences(tuned.best.settings, tuned.own.settings)
     config.change(f"{key}={json.dumps(value)}" for key, value in (keys | dict(changes)).items())
     head = "".join(f"# {line}".rstrip() + "\n" for line in lines(tuned))

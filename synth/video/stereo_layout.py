@@ -31,6 +31,8 @@ _STEP, _DARK = 1.5, 2.0  # least step between halves over those nearby; less of 
 # Mixed: least shares and shifts of the pictures of every second pixel; their least correlation and detail;
 # largest motion from picture to picture over the shift of two fields.
 _SURE, _FOUND, _FLAT, _FIELDS = np.array([0.35, 2.0]), 0.7, 0.3, 1.5
+_FINEST = {"rows": (0.5, 0.0), "columns": (0.0, 0.5), "checkerboard": (0.5, 0.5)}  # cycles a pixel, y and x
+_NEAR, _REPLICA = 0.1, 0.2  # pairs of photographs in turn have 0.5 and more of the power, stripes up to 0.11
 _REPEATS = 0.9  # correlation of a block with its own surroundings from which it is periodic
 _AGAIN, _ASIDE = 0.6, 1.0  # in turn: largest change to the next but one over that to the next; disparity [px]
 
@@ -82,12 +84,27 @@ def _mixed_layout(rgb: Pixels) -> str:
     apart = [bool(np.prod(_shift(first, other) >= _SURE)) for other in (right, below, across)]
     for name, pattern in (("rows", [0, 1, 1]), ("columns", [1, 0, 1]), ("checkerboard", [1, 1, 0])):
         if apart == pattern:
-            return name
+            return name if _finest_power(green, _FINEST[name]) > _REPLICA else ""
     red, same, blue = (_smooth(rgb[..., k], 4.0) for k in range(3))
     by_colour = [
         bool(np.prod(_shift(one, other) >= _SURE)) for one, other in ((red, same), (red, blue), (same, blue))
     ]
     return "anaglyph" if by_colour == [True, True, False] else ""
+
+
+def _finest_power(channel: Array, place: tuple[float, float]) -> float:
+    """Power of a channel (H, W) near a frequency (y, x) in cycles a pixel, over all that is far from both it
+    and 0.
+
+    Every second pixel of another camera repeats the difference of the cameras' pictures, which is mostly
+    coarse, at the finest frequency. Stripes of a few pixels, which beat with every second pixel, are between.
+    """
+    grey = channel.astype(np.float32) - float(channel.mean())
+    window = np.outer(np.hanning(grey.shape[0]), np.hanning(grey.shape[1]))
+    power = np.abs(np.fft.fft2(grey * window)) ** 2
+    y, x = np.abs(np.fft.fftfreq(grey.shape[0]))[:, None], np.abs(np.fft.fftfreq(grey.shape[1]))
+    coarse, finest = np.hypot(y, x) < _NEAR, np.hypot(y - place[0], x - place[1]) < _NEAR
+    return float(power[finest].sum() / max(power[~coarse & ~finest].sum(), 1e-9))
 
 
 def _smooth(channel: Array, coarse: float = 3.0) -> Array:

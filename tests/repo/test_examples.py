@@ -8,6 +8,7 @@ import cv2
 import dataset as dataset_recipe
 import numpy as np
 import own_flow
+import own_instrument
 import own_law
 import own_method
 import pytest
@@ -18,6 +19,7 @@ from sources import ROOT
 import synth
 from synth.checks.verify import verify_dataset
 from synth.dataset.store import Dataset
+from synth.render.camera.camera import project
 
 pytestmark = pytest.mark.slow
 
@@ -56,6 +58,19 @@ def test_rendering_a_frame() -> None:
     half = render_frame.push(0.15)
     assert np.linalg.norm(half.force, axis=1).max() == pytest.approx(found["force_mn"] / 2, rel=1e-6)
     assert half.motion.displacement[half.strongest].min() > scene.motion.displacement[scene.strongest].min()
+
+
+def test_an_instrument_of_ones_own(tmp_path: Path) -> None:
+    scene = own_instrument.press(tmp_path)
+    frame = scene.frame(scene.strongest)
+    assert scene.scenario.gestures[0].instrument == "hook.stl"
+    tip = scene.motion.tip[scene.strongest].mean(axis=0)
+    assert np.hypot(*tip[:2]) == pytest.approx(0, abs=0.6)  # in the middle of the opening
+    row, column = np.argwhere(frame.tool).T
+    end = project(frame.camera, tip[None])[0]
+    assert np.hypot(column - end[0], row - end[1]).min() < 4
+    assert 0.01 < frame.tool.mean() < 0.2
+    assert np.linalg.norm(scene.force, axis=1).max() > 0.5
 
 
 def test_a_block_of_liver_under_two_lamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ wrong factor of 1000 is outside of them and a tissue, at any rate that is filmed
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +33,18 @@ _LOADED, _GIVES_LESS = (
     0.05,
 )  # share of the largest load; of the compliance under it, tissue stiffens by less
 _PULLS = 0.5  # cosine between a load and the outward direction above which it pulls
+_ONE_WAY, _NORMAL = 0.9, 0.9  # of a press: its total over its parts' sum; cosine to the surface's normal
+_AROUND, _LEAST_NODES = (
+    1.5,
+    12,
+)  # radii of the contact, and nodes there, whose motion along the surface is seen
+_SPREADS, _MIRRORED = 0.04, 0.5  # that motion over one radius, over the depth; determinant over a mirror's
 _OUT_OF_LINE, _NEAR = 0.5, 0.35  # of the length of edges: a node off its neighbours; on another's place
 _MOST_NAMED = 4
+_LEAST_STATES, _PATH_NODES, _WORST_STATES = 6, 300, 8  # of a path; nodes, and bends of it, that are compared
+# Of a path's bends at two states, what is left when they change places; and least share of all bends that
+# goes: they were exchanged.
+_SMOOTHER, _ROUGHER = 0.45, 0.3
 
 
 def find_permutations(
@@ -77,6 +87,41 @@ def find_permutations(
     why = "their numbers have to stay the same"
     return [
         f"nodes {which} change places in state {states[0]}{where}{more}: {why}; the motion there is false"
+    ]
+
+
+def find_exchanged_states(displacement: Map, time: Floats) -> list[str]:
+    """A doubt on two states (S, N, 3) at rising times (S,) s that lie on a smooth path only if they change
+    places."""
+    count = len(displacement)
+    if count < _LEAST_STATES:
+        return []
+    nodes = np.linspace(0, displacement.shape[1] - 1, min(displacement.shape[1], _PATH_NODES)).astype(int)
+    path = np.asarray(displacement[:, nodes], np.float64).reshape(count, -1)
+
+    def bends(order: Ints, places: Ints) -> Floats:
+        before, here, after = (path[order[places + step]] for step in (-1, 0, 1))
+        left, right = time[places] - time[places - 1], time[places + 1] - time[places]
+        bend = (after - here) / right[:, None] - (here - before) / left[:, None]
+        return np.asarray(np.linalg.norm(bend, axis=1))
+
+    plain, inner = np.arange(count), np.arange(1, count - 1)
+    rough = bends(plain, inner)
+    worst = inner[np.argsort(-rough, kind="stable")[:_WORST_STATES]]
+    chosen = np.unique(np.clip(worst[:, None] + [-1, 0, 1], 1, count - 1))
+    best, share, pair = np.inf, 1.0, (0, 0)
+    for i, j in combinations(chosen.tolist(), 2):
+        near = np.unique(np.clip([i - 1, i, i + 1, j - 1, j, j + 1], 1, count - 2))
+        order = plain.copy()
+        order[[i, j]] = j, i
+        before, after = float(rough[near - 1].sum()), float(bends(order, near).sum())
+        if after - before < best:
+            best, share, pair = after - before, after / max(before, 1e-30), (i, j)
+    if not (share < _SMOOTHER and best < -_ROUGHER * rough.sum()):
+        return []
+    first, second = pair
+    return [
+        f"states {first} and {second} may have changed places: the motion is smooth if they are exchanged"
     ]
 
 
@@ -147,6 +192,41 @@ def find_load_doubts(
                 f"force: {borne[state]:.3g} mN in state {state} move the tissue hardly at all; {why}"
             )
     return doubts
+
+
+def find_mirror_doubt(points: Floats, faces: Ints, displacement: Map, force: Map) -> list[str]:
+    """A doubt on a motion that is mirrored along the surface, as by an axis of the other sign.
+
+    Under a press along the normal, tissue moves towards the contact from all sides, or away on all sides: the
+    gradient of the motion along the surface has a positive determinant, and mirrored a negative one. Tissue
+    that hardly moves along the surface doesn't tell. Arguments as of `find_load_doubts`.
+    """
+    k = int(np.linalg.norm(force, axis=2).sum(axis=1).argmax())
+    f, u = np.asarray(force[k], np.float64), np.asarray(displacement[k], np.float64)
+    size, total = np.linalg.norm(f, axis=1), f.sum(axis=0)
+    if not size.sum() > 0 or not np.linalg.norm(total) > _ONE_WAY * size.sum():
+        return []
+    centre, radius = (size[:, None] * points).sum(axis=0) / size.sum(), contact_radius(points, faces, f)
+    loaded = size > 0.1 * size.max()
+    normal = np.cross(*np.moveaxis(np.diff(points[faces], axis=1), 1, 0))[loaded[faces].any(axis=1)].sum(
+        axis=0
+    )
+    along = total / np.linalg.norm(total)
+    if abs(along @ normal) < _NORMAL * np.linalg.norm(normal):
+        return []
+    near = np.linalg.norm(points - centre, axis=1) < _AROUND * radius
+    if near.sum() < _LEAST_NODES:
+        return []
+    level = np.linalg.svd(along[None])[2][1:]  # two axes of the surface
+    place = np.column_stack([(points[near] - centre) @ level.T, np.ones(near.sum())])
+    gradient = np.linalg.lstsq(place, u[near] @ level.T, rcond=None)[0][:2]
+    strain, deep = float(np.sqrt((gradient**2).sum() / 2)), float(np.abs(u[near] @ along).max())
+    if strain * radius < _SPREADS * deep or np.linalg.det(gradient) > -_MIRRORED * strain**2:
+        return []
+    return [
+        "motion: tissue moves towards the contact along one axis and away from it along the other: is an "
+        "axis of the displacement mirrored?"
+    ]
 
 
 def find_pull_doubt(force: Map, out: Floats) -> list[str]:

@@ -72,7 +72,7 @@ def doubt_load(series: MeshSeries, young_kpa: float | None) -> list[str]:
     if series.force is None or any(caution.startswith("nodes") for caution in series.cautions):
         return []  # nor of false motion
     motion = series.points, series.faces, series.displacement, series.force
-    return plausibility.find_load_doubts(*motion, young_kpa)
+    return plausibility.find_load_doubts(*motion, young_kpa) + plausibility.find_mirror_doubt(*motion)
 
 
 def read_series(

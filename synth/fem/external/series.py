@@ -170,6 +170,7 @@ def assemble(
     none = np.zeros((len(time), 0, 3))  # instruments
     cautions = plausibility.find_permutations(points, surface.faces, displacement, nodes, files)
     cautions += plausibility.find_speed_doubts(displacement, time)
+    cautions += plausibility.find_exchanged_states(displacement, time)
     about = scale, tuple(fields), timed, None, tuple(cautions)
     series = MeshSeries(points, surface.faces, time, displacement, none, none, *about)
     if force is None:

@@ -67,6 +67,8 @@ class Footage:
     depth: RightVideo | DepthVideo | None = None  # right camera or depth camera, if any
     findings: tuple[Finding, ...] = ()  # on the tissue mask, if it was found
     may_pulsate: bool = True  # False: no heart or breath moves the tissue, none is searched
+    # (H, W) where an instrument is expected in a frame, if instruments are detected; None: unknown.
+    expected: Callable[[int, Size], Mask | None] | None = None
 
 
 class Decoder:

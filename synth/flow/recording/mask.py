@@ -19,9 +19,16 @@ _MOST = 0.4  # share of the tissue: more of it is taken for tissue that looks li
 class MaskFrame:
     """Masks what hides the tissue."""
 
-    def __init__(self, rest: RestFrame, kind: str, tool: Callable[[int, Size], Mask | None] | None) -> None:
-        """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected."""
-        self._rest, self._kind, self._tool = rest, kind, tool
+    def __init__(
+        self,
+        rest: RestFrame,
+        kind: str,
+        tool: Callable[[int, Size], Mask | None] | None,
+        expected: Callable[[int, Size], Mask | None] | None = None,
+    ) -> None:
+        """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected;
+        `expected`: where, see `Footage`."""
+        self._rest, self._kind, self._tool, self._expected = rest, kind, tool, expected
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """The frame with its masks; it is not trusted if its picture shows nothing that could be tracked."""
@@ -30,6 +37,7 @@ class MaskFrame:
         if self._kind != "none":
             found = segment(self._rest.rgb, frame.rgb)
             if self._tool is None:
+                found = self._weigh(found, frame)
                 masked, tool = _plausible(found, self._rest.tissue), found.objects
             else:
                 given = self._tool(frame.index, self._rest.size)
@@ -40,6 +48,16 @@ class MaskFrame:
         if frame.camera is not None:
             masked = masked | frame.camera.outside(masked.shape)
         return replace(frame, masked=masked, tool=tool, trusted=trusted)
+
+    def _weigh(self, found: Segmentation, frame: FrameMotion) -> Segmentation:
+        """The classes of a frame, instruments more likely where they are expected."""
+        there = None if self._expected is None else self._expected(frame.index, self._rest.size)
+        if there is None:
+            return found
+        there = shrink_mask(there, self._rest.shrink, 0)
+        if frame.camera is not None:
+            there = frame.camera.undo(there.astype(np.uint8) * 255) > 127
+        return found.expect(there)
 
 
 def mask_right(rest: Pixels, rgb: Pixels, kind: str, tissue: Mask) -> Mask:

@@ -129,19 +129,17 @@ class VideoFaults:
         if damaged:
             self._damaged.append(time_s)
         self._first += [rgb] * (len(self._first) < stereo_layout.PICTURES)
-        one = rgb[::_STRIDE, ::_STRIDE]
+        one, coarse = rgb[::_STRIDE, ::_STRIDE], _coarse(rgb)
         if one.shape == self._last.shape:
             change = cv2.absdiff(one, self._last).mean(axis=2)
             parts = cv2.resize(change, (8, 6), interpolation=cv2.INTER_AREA)
             self._numbers.append(index)
             self._times.append(time_s)
             self._changes.append((float(change.mean()), float(parts.min()), float(np.median(parts))))
-            coarse = _coarse(rgb)
             moved = np.abs(coarse - self._last_coarse).mean(axis=2)
             median = float(np.median(cv2.resize(moved, (8, 6), interpolation=cv2.INTER_AREA)))
             self._coarse.append((float(moved.mean()), median))
-            self._last_coarse = coarse
-        self._last = one
+        self._last, self._last_coarse = one, coarse  # of another size in a stream that changes its mode
 
     def add_tracked(self, time_s: float, rgb: Pixels, small: Pixels) -> None:
         """Adds a picture that is tracked, and the same downsampled."""

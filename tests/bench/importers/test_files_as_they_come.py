@@ -100,6 +100,18 @@ def test_one_camera_is_not_taken_for_two() -> None:
         assert find_layout(9 * [picture.astype(np.uint8)]) == ""
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_drawn_stripes_are_not_taken_for_two_cameras(seed: int) -> None:
+    """Of 3 to 9 pixels a period, which beat with every second pixel."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:192, :256]
+    turn, period = rng.choice([0, np.pi / 4, np.pi / 2, rng.uniform(0, np.pi)]), rng.uniform(3, 9)
+    wave = np.sin(2 * np.pi * (x * np.cos(turn) + y * np.sin(turn)) / period)
+    wave = np.sign(wave) if seed % 2 else wave
+    drawn = 128 + 80 * wave[..., None] + rng.normal(0, 3, (192, 256, 3))
+    assert find_layout(3 * [np.clip(drawn, 0, 255).astype(np.uint8)]) == ""
+
+
 FRAMES = [np.roll(LEFT[:240, :320], 6 * k, 1) for k in range(8)]
 
 

@@ -237,6 +237,22 @@ def test_dicom_of_frames_and_of_a_video(tmp_path: Path) -> None:
     assert found.times_s == pytest.approx(np.arange(COUNT) / FPS, abs=1e-4)
 
 
+def test_dicom_of_a_video_of_inverted_grey(tmp_path: Path) -> None:
+    pytest.importorskip("pydicom")
+    with av.open(str(tmp_path / "v.ts"), "w") as out:
+        stream = out.add_stream("libx264", rate=FPS, options={"crf": "4", "bf": "0"})
+        stream.height, stream.width, stream.pix_fmt = 96, 128, "yuv420p"
+        for rgb in PICTURES:
+            negative = np.repeat(255 - rgb[..., 1:2], 3, axis=2)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(negative, format="rgb24")))
+        out.mux(stream.encode(None))
+    about = {"PhotometricInterpretation": "MONOCHROME1", "SamplesPerPixel": 1}
+    data = (tmp_path / "v.ts").read_bytes()
+    source = dicom(tmp_path / "c.dcm", "1.2.840.10008.1.2.4.102", data, **about)
+    shown = np.stack(list(importer_registry.read_source(source).pictures()))[..., 1].astype(int)
+    assert np.abs(shown - np.stack(PICTURES)[..., 1]).mean() < 4
+
+
 @pytest.mark.parametrize("stored", [8, 12])
 def test_dicom_of_inverted_grey(stored: int, tmp_path: Path) -> None:
     pytest.importorskip("pydicom")

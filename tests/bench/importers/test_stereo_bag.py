@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.cli import app
 from bench.importers import importer_registry
-from bench.importers.rosbag import _depth, partners
+from bench.importers.rosbag import _depth, _read_lens, partners
 from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
 from synth.flow.stereo.calibration import read_rig
@@ -92,6 +92,35 @@ def write_bag(
                 wrench = kind["geometry_msgs/msg/Wrench"](*parts)
                 put(topic, "geometry_msgs/msg/WrenchStamped", 1 + k / FPS / 10, wrench)
     return path
+
+
+@pytest.mark.parametrize(
+    ("sensor", "corner", "part", "binned"),
+    [((640, 400), (80, 20), (320, 180), (1, 1)), ((640, 360), (0, 0), (0, 0), (2, 2)),
+     ((1280, 720), (100, 60), (640, 360), (2, 2)), ((640, 180), (0, 0), (0, 0), (2, 1))],
+)  # fmt: skip
+@pytest.mark.parametrize("name", ["image_raw", "image_rect_color"])
+def test_a_region_of_the_sensor_and_binning_are_heeded(
+    sensor: tuple[int, int],
+    corner: tuple[int, int],
+    part: tuple[int, int],
+    binned: tuple[int, int],
+    name: str,
+) -> None:
+    """A point of the scene is where the sensor's pixel that shows it went."""
+    area = SimpleNamespace(x_offset=corner[0], y_offset=corner[1], width=part[0], height=part[1])
+    P = np.column_stack([K, [-FOCAL * 0.004, 0, 0]])
+    given = {"k": K.ravel(), "d": np.zeros(5), "r": np.eye(3).ravel(), "p": P.ravel()}
+    about = {"width": sensor[0], "height": sensor[1], "distortion_model": "plumb_bob", "roi": area}
+    info = SimpleNamespace(**given, **about, binning_x=binned[0], binning_y=binned[1])
+    lens = _read_lens("camera_info", info, f"/cam/{name}", SIZE)
+    point = np.array([0.02, -0.01, 1.0])
+    pixel = (K @ point)[:2]  # centres of the sensor's pixels are whole numbers
+    at = (pixel - corner + 0.5) / binned - 0.5
+    np.testing.assert_allclose((lens.K @ point)[:2], at, atol=1e-9)
+    assert lens.shift_mm == pytest.approx(-4)
+    with pytest.raises(UserError, match=r"binning|calibrated"):
+        _read_lens("camera_info", info, f"/cam/{name}", sensor)
 
 
 def test_stereo_pictures_and_calibration_equal_the_bags(tmp_path: Path) -> None:

@@ -231,6 +231,9 @@ def test_the_rate_in_a_head(head: str, hertz: float, tmp_path: Path) -> None:
         "Sampling rate: 2 ms",
         "Sampling rate: 1e999",
         "Sampling rate: 1,00 0,00.5",
+        "Sampling rate: 500,500",
+        "Sampling rate: 250,500 Hz",
+        "Sampling rate: 500,1000",
     ],
 )
 def test_a_rate_that_cannot_be_told_is_refused(head: str, tmp_path: Path) -> None:

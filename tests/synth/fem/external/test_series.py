@@ -16,10 +16,12 @@ import pressed_block
 import pytest
 import trimesh
 from pressed_block import STATES, STEP_S, solve, write
+from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 from synth.arrays import Floats, Ints
 from synth.errors import UserError
+from synth.fem.external import plausibility
 from synth.fem.external.plausibility import contact_radius, is_rigid
 from synth.fem.external.read_series import doubt_load, read_series
 from synth.fem.external.series import MeshSeries, Units
@@ -323,6 +325,47 @@ def test_what_is_unlikely_of_tissue_is_said(what: str, tmp_path: Path) -> None:
     doubts = no_doubts(made(tmp_path))
     assert len([one for one in doubts if re.search(named, one)]) == 1
     assert not any("\n" in one for one in doubts)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+@pytest.mark.parametrize(
+    ("axis", "sideways", "doubts"), [(None, 0.1, 0), (0, 0.1, 1), (1, -0.1, 1), (0, 0.005, 0)]
+)
+def test_a_mirrored_motion_under_a_press_is_doubted(
+    axis: int | None, sideways: float, doubts: int, turn: float
+) -> None:
+    """Of a dimple under which tissue moves towards its middle by a share of the distance."""
+    side = np.linspace(-15, 15, 31)
+    flat = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.zeros(961)], axis=1)
+    dent = np.exp(-(flat**2).sum(axis=1) / 32)[:, None]
+    u = -dent * (sideways * flat + [0, 0, 2.0])
+    load = np.maximum(1 - (flat**2).sum(axis=1) / 25, 0)[:, None] * [0, 0, -1.0]
+    if axis is not None:
+        u[:, axis] *= -1
+    tilt = Rotation.from_euler("xyz", [turn, turn, turn]).as_matrix()
+    points, u, load = flat @ tilt.T, u @ tilt.T, load @ tilt.T
+    faces = Delaunay(flat[:, :2]).simplices
+    found = plausibility.find_mirror_doubt(points, faces, np.stack([0 * u, u]), np.stack([0 * u, load]))
+    assert len(found) == doubts
+
+
+def press(states: int) -> tuple[Floats, Floats]:
+    """Displacement (S, N, 3) of a press that grows, moves sideways, holds and ends, and its times [s]."""
+    time = np.linspace(0, 1, states)
+    size = np.interp(time, [0.1, 0.4, 0.6, 0.9], [0, 1, 1, 0])
+    size = size**2 * (3 - 2 * size)
+    aside = np.roll(solve().u, 1, axis=1)
+    return size[:, None, None] * (solve().u + 0.3 * time[:, None, None] * aside), time
+
+
+@pytest.mark.parametrize("states", [12, 20, 40])
+def test_two_states_that_changed_places_are_named(states: int) -> None:
+    u, time = press(states)
+    assert plausibility.find_exchanged_states(u, time) == []
+    one, other = states // 5, states // 2
+    u[[one, other]] = u[[other, one]]
+    (doubt,) = plausibility.find_exchanged_states(u, time)
+    assert f"states {one} and {other} " in doubt
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -66,3 +66,13 @@ def test_black_bars_and_inverted_masks_are_detected() -> None:
     assert is_inside_out(~tissue)
     assert not is_inside_out(tissue)
     assert not is_inside_out(np.ones_like(tissue))
+
+
+def test_a_stream_that_changes_its_size_is_followed() -> None:
+    """A recorder that switches its mode: pictures of one size after the other, there and back."""
+    small = _video()
+    large = np.pad(small, ((0, 0), (0, 24), (0, 32), (0, 0)))
+    faults = VideoFaults(small[0], small[0], np.ones(small.shape[1:3], bool))
+    for k, picture in enumerate([*small[1:5], *large[5:8], *small[8:]], 1):
+        faults.add_decoded(k, k / 10, picture)
+    assert faults.repeats() == ({}, {})
