@@ -68,13 +68,15 @@ def measure(
     fit: int = 375,
     epochs: int = 96,
     seeds: int = 1,
+    kinds: str = ",".join(KINDS),
     device: str = "cpu",
 ) -> dict[str, Any]:
     """Share of the sim-to-real gap closed by training on recovered flow, and by fitted noise.
 
     `dataset`: of which `fit` sequences are used, a fifth of them held out; `unseen`, `clinical`: only tested
     on; `recordings`: folder of `foreign.recordings`, likewise; `work`: folder of intermediate results, from
-    which an interrupted run continues; `seeds`: networks a training; `device`: that trains.
+    which an interrupted run continues; `seeds`: networks a training; `kinds`: of `KINDS`, I and R among them;
+    `device`: that trains.
     """
     tiny = preset("tiny", epochs=epochs)
     arch = changed(tiny.arch, output="vector", relative=True)
@@ -96,10 +98,13 @@ def measure(
         "foreign": [foreign(folder, settings.grid) for folder in folders],
     }
     tests = {f"{place}, {flow}": (part, flow) for place, part in tested.items() for flow in FLOWS}
-    trained: dict[str, list[Errors]] = {kind: [] for kind in KINDS}
+    chosen = kinds.split(",")
+    if not {"I", "R"} <= {*chosen} <= {*KINDS}:
+        raise UserError(f"kinds {kinds!r}: I and R, and any of {', '.join(KINDS[2:])}")
+    trained: dict[str, list[Errors]] = {kind: [] for kind in chosen}
     curve: dict[str, list[list[float]]] = {}
     for seed in range(seeds):
-        for kind in KINDS:
+        for kind in chosen:
             seeded = changed(settings, seed=seed, input=_INPUTS[kind])
             made = errors(kind, clips, split, seeded, tests, work, device)
             trained[kind].append(made["errors"])
@@ -231,7 +236,7 @@ def summary(trained: Mapping[str, Sequence[Errors]], force: Mapping[str, Sequenc
         kind: {test: np.mean([run[test] for run in runs], axis=0) for test in runs[0]}
         for kind, runs in trained.items()
     }
-    absolute[NONE] = {test: np.array(force[test.split(",")[0]]) for test in absolute[KINDS[0]]}
+    absolute[NONE] = {test: np.array(force[test.split(",")[0]]) for test in absolute["I"]}
     share = {
         kind: {test: values / np.array(force[test.split(",")[0]]) for test, values in tests.items()}
         for kind, tests in absolute.items()
@@ -239,13 +244,16 @@ def summary(trained: Mapping[str, Sequence[Errors]], force: Mapping[str, Sequenc
     places = {}
     for place in force:
         ideal = share["I"][f"{place}, ideal"]
-        recovered = {kind: share[kind][f"{place}, recovered"] for kind in KINDS}
+        recovered = {kind: share[kind][f"{place}, recovered"] for kind in trained}
         gap = recovered["I"] - ideal
         places[place] = {
             "opened": float(recovered["I"].mean() / ideal.mean()),
-            "closed": {kind: closed(gap, recovered["I"] - recovered[kind]) for kind in KINDS[1:]},
-            "noise_less_real": difference(recovered["R"], recovered["N"]),
+            "closed": {
+                kind: closed(gap, recovered["I"] - recovered[kind]) for kind in trained if kind != "I"
+            },
         }
+        if "N" in trained:
+            places[place]["noise_less_real"] = difference(recovered["R"], recovered["N"])
     spread, spread_mn = (
         {kind: {test: mean_of(values) for test, values in tests.items()} for kind, tests in part.items()}
         for part in (share, absolute)
@@ -320,24 +328,29 @@ def fit_noise(clips: Sequence[Clip]) -> Noise:
 
 def page(found: Mapping[str, Any]) -> report.Page:
     """The curve of the trainings, errors by place, and the tables."""
+    kinds = [kind for kind in KINDS if kind in found["errors"]]
     bars = {
         name: {
             f"{kind} on {flow} flow": found["errors"][kind][f"{place}, {flow}"]
-            for kind, flow in (("I", "ideal"), *((kind, "recovered") for kind in KINDS))
+            for kind, flow in (("I", "ideal"), *((kind, "recovered") for kind in kinds))
         }
         for place, name in PLACES.items()
     }
     words = []
     for place, name in PLACES.items():
         at_place = found["places"][place]
-        low, high = (100 * end for end in at_place["noise_less_real"][1:])
         words.append(
             f"- *{name.capitalize()}*: on recovered flow the network trained on ideal flow errs "
             f"{at_place['opened']:.2g} times as much as on ideal flow; training on recovered flow closes "
-            f"{_closed(at_place['closed']['R'])} of that gap, with fitted noise "
-            f"{_closed(at_place['closed']['N'])} (with noise the error is {low:.2g} to {high:.2g} percentage "
-            "points larger)."
+            f"{_closed(at_place['closed']['R'])} of that gap"
         )
+        if "N" in kinds:
+            low, high = (100 * end for end in at_place["noise_less_real"][1:])
+            words[-1] += (
+                f", with fitted noise {_closed(at_place['closed']['N'])} (then the error is {low:.2g} to "
+                f"{high:.2g} percentage points larger)"
+            )
+        words[-1] += "."
     tables = []
     for heading, errors, factor in (
         ("Errors as shares of the mean force", found["errors"], 100.0),
@@ -356,7 +369,7 @@ def page(found: Mapping[str, Any]) -> report.Page:
     shares = [
         {"training": kind}
         | {name: _closed(found["places"][place]["closed"][kind]) for place, name in PLACES.items()}
-        for kind in KINDS[1:]
+        for kind in kinds[1:]
     ]
     count = ", ".join(f"{number} {name}" for name, number in found["sequences"].items())
     return report.Page(
