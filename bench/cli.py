@@ -155,6 +155,8 @@ def init(
     from bench.checks.protocol import as_markdown
     from bench.recording.meta import commented
 
+    if tissue and protocol:
+        raise UserError("--tissue only proposes tissue.png; leave out --protocol")
     if tissue:
         from bench.recording.propose_tissue import propose_tissue
 

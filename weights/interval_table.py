@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,6 +37,7 @@ from synth.dataset.store import Dataset
 from synth.dataset.store import Sequence as Stored
 from synth.engine.run import render_job
 from synth.errors import UserError
+from synth.flow.estimator import name_backend
 from synth.flow.recording.decode import RecordingFlowSettings
 from synth.job import reader
 from synth.job.schema import Job
@@ -261,9 +262,7 @@ def fit_table(examples: Sequence[Example], networks: Mapping[str, str]) -> Inter
     reached |= {make: pool([e for e in examples if e.make == make]) for make in table.makes}
     reached["all"] = pool(examples)
     reached |= {make: pool(some) for make in BEYOND if (some := [e for e in beyond if e.make == make])}
-    return IntervalTable(
-        table.features, table.by_cameras, table.makes, table.networks, _find_gains(examples, rows), reached
-    )
+    return replace(table, stating=_find_gains(examples, rows), reached=reached)
 
 
 def _fit(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTable:
@@ -274,7 +273,15 @@ def _fit(examples: Sequence[Example], networks: Mapping[str, str]) -> IntervalTa
             by_cameras[cameras] = _fit_model(some)
     makes = sorted({one.make for one in examples})
     count = {make: len({one.recording for one in examples if one.make == make}) for make in makes}
-    return IntervalTable(tuple(force_interval.NAMES), by_cameras, count, dict(networks), {}, {})
+    return IntervalTable(
+        features=tuple(force_interval.NAMES),
+        by_cameras=by_cameras,
+        makes=count,
+        networks=dict(networks),
+        flow=name_backend(RecordingFlowSettings().backend),
+        stating={},
+        reached={},
+    )
 
 
 def _fit_model(examples: Sequence[Example]) -> CameraModel:

@@ -95,7 +95,7 @@ class Fusion:
         leading = np.array([estimate.force_mn for estimate in fused])
         self.video = VideoEstimates(leading, by_network, by_physics, spread, motion_mm, cameras, stated)
         table = read_table()
-        self._reason = table.find_reason(self.video, network)
+        self._reason = table.find_reason(self.video, network, scene.recovered_by)
         if self._reason:
             return list(fused)
         ends = table.bound(self.video, scene.young_uncertainty)

@@ -319,18 +319,18 @@ def find_gains(
     rows, unsolved = [(0.0, 1.0, 1.0)], 0
     for frame, motion in large[::-2][: TISSUES.solved]:
         size = float(np.linalg.norm(infer(weights, frame).force.mean))
+        if size == 0:
+            continue
         ends = TISSUES.unsolved
+        opening_mm = min(float(radius), large_motion.OPEN_MM)
         try:
-            if size > 0:
-                opening_mm = min(float(radius), large_motion.OPEN_MM)
-                forces = [
-                    large_motion.reaction(motion, tissue, opening_mm, a) for a in sorted(set(scene.alpha))
-                ]
-                sizes = [float(np.linalg.norm(force)) / size for force in forces]
-                ends = min(sizes), max(sizes)
+            forces = [
+                large_motion.reaction(motion, tissue, opening_mm, alpha) for alpha in sorted(set(scene.alpha))
+            ]
+            sizes = [float(np.linalg.norm(force)) / size for force in forces]
+            ends = min(sizes), max(sizes)
         except ExcessiveLoad:
-            pass
-        unsolved += ends == TISSUES.unsolved
+            unsolved += 1
         rows.append((size, *ends))
     size_mn, low, high = np.array(sorted(rows)).T
     return Gains(size_mn, low, high, unsolved)

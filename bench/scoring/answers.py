@@ -63,7 +63,8 @@ def find_gains(result: Result, size: float, low: float, high: float) -> tuple[st
         ends = [math.sqrt(max((side - size) ** 2 - common**2, 0.0)) for side in (low, high)]
         widths["E without its uncertainty"] = sum(ends)
     better = sorted((new, name) for name, new in widths.items() if new < (1 - _WORTH) * width)
-    return tuple(f"{name}: {_number(width)} to {_number(new)} mN wide" for new, name in better)
+    unit = "mN" if result.absolute else "mN per kPa"
+    return tuple(f"{name}: {_number(width)} to {_number(new)} {unit} wide" for new, name in better)
 
 
 def _known(result: Result) -> dict[str, bool]:

@@ -36,7 +36,7 @@ def report_recordings(recordings: Sequence[Path], out: Path, command: str) -> li
         try:
             result = score(folder, out=out / name)
         except UserError as error:
-            rows.append({"recording": name, "why": str(error)})
+            rows.append({"recording": name, "why": str(error), "report": False})
             continue
         trees.append(as_json(result))
         rows.append(describe_row(result))
@@ -48,7 +48,7 @@ def report_recordings(recordings: Sequence[Path], out: Path, command: str) -> li
 def describe_row(result: Result) -> Tree:
     """A scored recording's row: largest force and its interval [mN], scores over the peak, findings."""
     main = result.methods[result.main]
-    row: Tree = {"recording": result.recording, "why": result.refused}
+    row: Tree = {"recording": result.recording, "why": result.refused, "report": True}
     row["findings"] = [f"{one.cause}: {one.message}" for one in result.findings]
     if result.refused or not np.isfinite(main.size_mn).any():
         return row

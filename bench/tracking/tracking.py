@@ -167,10 +167,11 @@ def _describe(
     out.doubt = [Finding("warning", part, note) for part in leading for note in doubt.get(part, ())]
     for name, method in methods.items():
         warnings = getattr(method, "warnings", ())
-        own = (*(() if name in leading else doubt[name]), *getattr(method, "notes", ()), *warnings)
-        out.notes += [f"{name}: {note}" for note in own]
-        # Doubts on a method that does not lead, or not alone, are in the interval of the one that does.
-        out.findings += [Finding("warning", name, one) for one in warnings if name == pictured]
+        notes = [*(() if name in leading else doubt[name]), *getattr(method, "notes", ())]
+        notes += [] if name == pictured or name in leading else warnings
+        out.notes += [f"{name}: {note}" for note in notes]
+        if name == pictured or name in leading:
+            out.findings += [Finding("warning", name, warning) for warning in warnings]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:

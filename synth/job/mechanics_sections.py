@@ -15,6 +15,7 @@ from pydantic import (
     FiniteFloat,
     Tag,
     ValidationInfo,
+    field_serializer,
     model_validator,
 )
 
@@ -280,6 +281,11 @@ class FemSection(Section):
     """Prony terms [lost share of the stiffness, time in s], one or two: E is then the instantaneous
     modulus."""
 
+    @field_serializer("contact")
+    def _dump_contact(self, contact: tuple[Contact, ...]) -> str | list[str]:
+        """A single kind as before there were two, so that older jobs keep their identity."""
+        return contact[0] if len(contact) == 1 else list(contact)
+
     @model_validator(mode="after")
     def _contacts_are_loaded_or_driven(self) -> FemSection:
         named = [(f"instrument_list[{k}].", one) for k, one in enumerate(self.instrument_list)]
@@ -291,9 +297,14 @@ class FemSection(Section):
             return self
         if self.time == "dynamic":
             raise ValueError("contact: driven needs time: quasi-static")
-        if self.contact == ("driven",) and "gestures" in self.model_fields_set and "slide" in self.gestures:
+        slides = "gestures" in self.model_fields_set and "slide" in self.gestures
+        mixed = "loaded" in self.contact
+        if slides and (not mixed or {*self.gestures} == {"slide"}):
             raise ValueError("gestures: a driven contact holds the tissue and doesn't slide; remove slide")
-        if len({*self.contact}) > 1:
+        for at, instrument in named:
+            if instrument.gesture == "slide":
+                raise ValueError(f"{at}gesture: a driven contact holds the tissue and doesn't slide")
+        if mixed:
             if self.travel_mm is None:
                 raise ValueError("travel_mm: driven contacts next to loaded ones need it")
             return self
@@ -305,8 +316,6 @@ class FemSection(Section):
         for at, one in named:
             if not (one.travel_mm or one.force_mn or general) or one.load is not None:
                 raise ValueError(f"{at}travel_mm: a driven contact needs travel_mm or force_mn")
-            if one.gesture == "slide":
-                raise ValueError(f"{at}gesture: a driven contact holds the tissue and doesn't slide")
         return self
 
     @model_validator(mode="after")
@@ -357,7 +366,7 @@ class FemSection(Section):
                 shares = {name: float(named.count(name)) for name in named if name in takes}
             total = sum(shares.values())
             found[kind] = {name: share / total for name, share in shares.items() if share}
-        if self.contact == ("driven",):
+        if "loaded" not in self.contact:
             found.pop("slide", None)
         return {kind: shares for kind, shares in found.items() if shares}
 
@@ -374,10 +383,20 @@ class FemSection(Section):
         return drawn + [(f"instrument_list[{k}]: ", self.load_range(one)) for k, one in enumerate(given)]
 
     def of_contact(self, contact: Contact) -> FemSection:
-        """The section of the sequences with one kind of contact; `force_mn` is then of loaded ones, if driven
-        ones have `travel_mm`."""
-        force = self.force_mn if contact == "loaded" or self.travel_mm is None else None
-        return self.model_copy(update={"contact": (contact,), "force_mn": force})
+        """The section of the sequences with one kind of contact.
+
+        Of both kinds, forces and loads are of loaded contacts and ways of driven ones, also in
+        `instrument_list`.
+        """
+        changes: dict[str, Any] = {"contact": (contact,)}
+        if len({*self.contact}) > 1:
+            left_out = ("travel_mm",) if contact == "loaded" else ("force_mn", "load")
+            kept = {key: None for key in left_out}
+            listed = tuple(instrument.model_copy(update=kept) for instrument in self.instrument_list)
+            changes |= {"instrument_list": listed}
+            if contact == "driven":
+                changes |= {"force_mn": None}
+        return self.model_copy(update=changes)
 
     @property
     def chosen_law(self) -> tuple[str, str]:

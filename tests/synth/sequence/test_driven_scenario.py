@@ -142,3 +142,38 @@ def test_a_job_with_both_contacts_draws_each_in_half_of_the_sequences() -> None:
 def test_driven_contacts_next_to_loaded_ones_need_their_way() -> None:
     with pytest.raises(ValidationError):
         FemSection.model_validate({"contact": ["loaded", "driven"], "force_mn": 3})
+
+
+def test_one_kind_of_contact_is_stored_as_its_name() -> None:
+    """As by versions that knew one kind only: a dataset that they began is still that job's."""
+    one = FemSection.model_validate({"contact": "driven", "travel_mm": 1})
+    both = FemSection.model_validate({"contact": ["loaded", "driven"], "travel_mm": 1})
+    for mode in ("python", "json"):
+        assert one.model_dump(mode=mode)["contact"] == "driven"
+        assert FemSection().model_dump(mode=mode)["contact"] == "loaded"
+        assert both.model_dump(mode=mode)["contact"] == ["loaded", "driven"]
+    assert FemSection.model_validate(both.model_dump()).contact == ("loaded", "driven")
+
+
+@pytest.mark.parametrize(
+    "fem",
+    [
+        {"contact": ["loaded", "driven"], "gestures": ["slide"]},
+        {"contact": ["driven", "driven"], "gestures": ["slide", "push"]},
+        {"contact": ["loaded", "driven"], "instrument_list": [{"gesture": "slide"}]},
+    ],
+)
+def test_no_driven_contact_slides(fem: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        FemSection.model_validate({"travel_mm": 1, **fem})
+
+
+def test_of_both_kinds_forces_are_of_loaded_contacts_and_ways_of_driven_ones() -> None:
+    listed = [{"force_mn": 2, "footprint_mm": 4}, {"travel_mm": 1}]
+    both = FemSection.model_validate(
+        {"contact": ["loaded", "driven"], "travel_mm": 2, "instrument_list": listed}
+    )
+    driven, loaded = both.of_contact("driven"), both.of_contact("loaded")
+    assert [tool.force_mn for tool in driven.instrument_list] == [None, None]
+    assert [tool.travel_mm for tool in driven.instrument_list] == [None, (1, 1)]
+    assert loaded.instrument_list[0].force_mn == (2, 2)
