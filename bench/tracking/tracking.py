@@ -169,8 +169,9 @@ def _describe(
         warnings = getattr(method, "warnings", ())
         own = (*(() if name in leading else doubt[name]), *getattr(method, "notes", ()), *warnings)
         out.notes += [f"{name}: {note}" for note in own]
-        # Doubts on a method that does not lead, or not alone, are in the interval of the one that does.
-        out.findings += [Finding("warning", name, one) for one in warnings if name == pictured]
+        # A network's doubts are in the interval of the fusion that leads, the range of physics is not.
+        if name == pictured or name in leading[1:]:
+            out.findings += [Finding("warning", name, warning) for warning in warnings]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)
     if out.stereo is not None:
