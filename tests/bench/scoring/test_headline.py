@@ -135,8 +135,9 @@ class Bounded(Bump):
 
 
 def test_the_range_of_the_physics_in_a_fusion_is_a_finding(make: Maker) -> None:
+    folder = make(frames=4)
     for network, physics in ((Bump(), Bounded()), (Bounded(), Bump())):
-        result = run(make(frames=4), fusion=Fusion("network", "bump"), network=network, bump=physics)
+        result = run(folder, fusion=Fusion("network", "bump"), network=network, bump=physics)
         stated = [finding.message for finding in result.findings if finding.message in Bounded.warnings]
         assert len(stated) == isinstance(physics, Bounded)
 
