@@ -184,7 +184,7 @@ class Physics:
             return []
         why = "with one camera" if len(self._weights.own_mm) == 2 else "and no equilibrium is found"
         what = "the surface is bent beyond the range of the linear inverse"
-        return [f"physics: {what}, {why}: its largest forces are out of range, their intervals wide"]
+        return [f"{what}, {why}: its largest forces are out of range, their intervals wide"]
 
     def _estimate(self, frame: Observation, picture: bool) -> ForceEstimate:
         assert self._scene is not None

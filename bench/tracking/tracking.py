@@ -168,9 +168,10 @@ def _describe(
     for name, method in methods.items():
         warnings = getattr(method, "warnings", ())
         notes = [*(() if name in leading else doubt[name]), *getattr(method, "notes", ())]
-        notes += [] if name == pictured or name in leading else warnings
-        out.notes += [f"{name}: {note}" for note in notes]
-        if name == pictured or name in leading:
+        # A network's doubts are in the interval of the fusion that leads, the range of physics is not.
+        is_finding = name == pictured or name in leading[1:]
+        out.notes += [f"{name}: {note}" for note in (notes if is_finding else [*notes, *warnings])]
+        if is_finding:
             out.findings += [Finding("warning", name, warning) for warning in warnings]
     if video.peak_bytes:
         out.timings["flow_peak_rss_mb"] = round(video.peak_bytes / 1e6, 1)

@@ -128,6 +128,20 @@ def test_an_interval_has_a_level_for_motion_as_in_training(motion: str, make: Ma
         assert render_report(result).count(note) == 1
 
 
+class Bounded(Bump):
+    """A method whose estimates are out of its range."""
+
+    warnings = ("beyond the range",)
+
+
+def test_the_range_of_the_physics_in_a_fusion_is_a_finding(make: Maker) -> None:
+    folder = make(frames=4)
+    for network, physics in ((Bump(), Bounded()), (Bounded(), Bump())):
+        result = run(folder, fusion=Fusion("network", "bump"), network=network, bump=physics)
+        stated = [finding.message for finding in result.findings if finding.message in Bounded.warnings]
+        assert len(stated) == isinstance(physics, Bounded)
+
+
 def test_ambiguous_clocks_are_refused_and_scored_at_the_stated_offset(make: Maker) -> None:
     # Presses every two seconds fit equally at -2, 0 and 2 s.
     about = {"sync": {"method": "correlate", "calibration_s": [3.0, 9.0], "search_s": 2.5}}
