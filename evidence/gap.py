@@ -18,11 +18,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from bench.recording.recording_folder import open_recording
-from bench.recording.recording_scale import find_scale
 from bench.tracking.tracking import track_recording
 from evidence import report, result_cache, result_status, training
-from evidence.bootstrap import difference, mean_of
 from evidence.foreign.recordings import TRUTH
+from evidence.paired_means import difference, mean_of
 from evidence.pooled import FOLDERS
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
@@ -127,7 +126,7 @@ def foreign(folder: Path, grid: Grid) -> Clip:
     recording = open_recording(folder)
     with np.load(folder / TRUTH) as stored:
         flow, force = stored["flow_px"], stored["force_mn"]
-    young, scale = recording.meta.young_kpa or np.nan, find_scale(recording.meta, folder).mm_per_px
+    young, scale = recording.meta.young_kpa or np.nan, recording.scale.mm_per_px
     found: dict[int, tuple[Map, Map]] = {}
 
     def add(frame: FrameMotion) -> None:

@@ -26,7 +26,7 @@ from bench.methods.force_interval import CameraModel, IntervalTable, VideoEstima
 from bench.methods.method_interface import Method
 from bench.methods.network import Model
 from bench.methods.physics import Physics
-from bench.recording import recording_scale, recording_writer
+from bench.recording import recording_writer
 from bench.recording.from_sequence import export_recording
 from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
@@ -206,7 +206,7 @@ def _score(work: Path, source: Path, make: str, stated: Tree | None, cameras: in
     fusion = Fusion(MAIN, PHYSICS)
     methods: dict[str, Method] = {FUSION: fusion, MAIN: Model(choose_model(cameras == 2)), PHYSICS: Physics()}
     recording = open_recording(folder)
-    scale = recording_scale.find_scale(recording.meta, folder)
+    scale = recording.scale
     arrays: dict[str, Any] = {"make": make, "recording": source.name}
     try:
         result = evaluate_recording(recording, methods, FUSION, scale, RecordingFlowSettings(), {})

@@ -11,7 +11,6 @@ import numpy as np
 
 from bench.checks.judgement import judge
 from bench.checks.protocol import check_protocol
-from bench.recording import recording_scale
 from bench.recording.recording_folder import Recording, open_recording
 from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.arrays import Mask
@@ -40,7 +39,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
         return [Finding("error", "recording", str(error))]
     mm_per_px, failed = 0.0, list[Finding]()
     with suppress(UserError):  # `check_scale` reports it
-        mm_per_px = recording_scale.find_scale(recording.meta, recording.folder).mm_per_px
+        mm_per_px = recording.scale.mm_per_px
     try:
         tracked = _track_some(recording, mm_per_px or 1.0, picture)
     except UserError as error:
@@ -52,7 +51,7 @@ def check_recording(folder: Path, phantom: bool = False, picture: Path | None = 
 def _track_some(recording: Recording, mm_per_px: float, picture: Path | None) -> TrackedRecording:
     """Decodes every picture, and tracks a few as `bench score` does. UserError: as `track_recording`."""
     first = recording.meta.rest_frame
-    numbers = [number for number in recording.numbers() or range(_TRIED) if number >= first] or [first]
+    numbers = [number for number in recording.numbers or range(_TRIED) if number >= first] or [first]
     only = frozenset(numbers[k] for k in np.linspace(0, len(numbers) - 1, _TRIED).astype(int))
     settings, frames = RecordingFlowSettings(rate_hz=None, pulse=False), list[FrameMotion]()
     tracked = track_recording(recording, {}, mm_per_px, settings, only=only, each=frames.append)

@@ -6,7 +6,6 @@ from contextlib import suppress
 
 import numpy as np
 
-from bench.recording import recording_scale
 from bench.recording.recording_folder import Recording
 from bench.tracking.tracking import TrackedRecording
 from synth.errors import UserError
@@ -84,7 +83,7 @@ def check_stiffness(recording: Recording) -> list[Finding]:
 def check_scale(recording: Recording) -> list[Finding]:
     """Findings on the stated or calibrated scale."""
     try:
-        found = recording_scale.find_scale(recording.meta, recording.folder)
+        found = recording.scale
     except UserError as error:
         return [Finding("error", "scale", str(error))]
     message = f"{found.mm_per_px:.4g} mm/px ± {100 * found.uncertainty:.2g}% ({found.source})"

@@ -22,8 +22,9 @@ _MOST_MN = 1e12  # larger forces are errors
 class Plugged:
     """A method of another package or script; its errors become one line that names it."""
 
-    def __init__(self, method: Any, label: str) -> None:
-        self._method, self._label = method, label
+    def __init__(self, method: Any, label: str, source: str = "") -> None:
+        """`label`: for messages; `source`: package and version of a plug-in."""
+        self._method, self._label, self.source = method, label, source
         if isinstance(method, Revising):  # set only then, so that this is one too
             self.revise = self._revise
 
@@ -71,10 +72,5 @@ def list_installed() -> dict[str, Method]:
         method, label = METHODS.load(name), METHODS.label(name)
         if not callable(method):
             raise UserError(f"{label}: not a method, it can't be called")
-        methods[name] = Plugged(method, label)
+        methods[name] = Plugged(method, label, METHODS.source(name))
     return methods
-
-
-def sources() -> dict[str, str]:
-    """Package and version of each plug-in's method."""
-    return {name: METHODS.source(name) for name in METHODS.names()}

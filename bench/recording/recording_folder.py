@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
@@ -25,6 +26,7 @@ import numpy as np
 
 from bench.recording import meta, sensor_table
 from bench.recording.meta import Meta
+from bench.recording.recording_scale import PixelScale, find_scale
 from synth.arrays import Floats, Mask
 from synth.errors import UserError
 from synth.job.types import Section
@@ -69,6 +71,7 @@ class Recording:
     right: Video = field(default_factory=dict)  # right camera; empty: none
     right_frame: Mapping[int, int] = field(default_factory=dict)  # frame of each picture, where known
     depths: Mapping[int, Path] = field(default_factory=dict)  # depth pictures by frame; empty: none
+    numbers: Collection[int] = ()  # of the frames, in order; empty if the video's length is unknown
 
     @property
     def has_stereo(self) -> bool:
@@ -79,9 +82,10 @@ class Recording:
     def name(self) -> str:
         return self.folder.resolve().name
 
-    def numbers(self) -> Collection[int]:
-        """Frame numbers in order; empty if the video's length is unknown. UserError: unreadable."""
-        return _numbers(self.footage)
+    @cached_property
+    def scale(self) -> PixelScale:
+        """Millimetres per pixel at the tissue, found once. UserError: as of `find_scale`."""
+        return find_scale(self.meta, self.folder, self.frames)
 
     def frames(self) -> Iterator[Picture]:
         """Upright frames; times from frames.csv, else the video, else `fps`. UserError: unreadable."""
@@ -105,7 +109,7 @@ class Recording:
         """The source of the tool masks, in words."""
         if not self.masks:
             return "no masks/, no mask.png: the tool is detected in each picture"
-        count = len(self.masks.by_frame.keys() & set(self.numbers() or self.masks.by_frame))
+        count = len(self.masks.by_frame.keys() & set(self.numbers or self.masks.by_frame))
         if count >= frames:
             return f"masks/ has all {frames} frames"
         others = "mask.png is used for" if self.masks.default else "no tool is assumed in"
@@ -126,7 +130,7 @@ class Recording:
         if masks is None:
             return replace(self, region=region)
         notes = list(self.notes)
-        masks = masks.of_frames(self.numbers(), notes)
+        masks = masks.of_frames(self.numbers, notes)
         return replace(self, masks=masks, region=region, notes=tuple(notes))
 
 
@@ -181,7 +185,19 @@ def open_recording(folder: Path, phantom: bool = False) -> Recording:
     by_frame = {depth_frame[number]: path for number, path in depths.items()}
     none = MaskFiles({}, None)
     found = Recording(
-        folder, about, footage, times, force, none, tissue, tuple(notes), None, right, right_frame, by_frame
+        folder,
+        about,
+        footage,
+        times,
+        force,
+        none,
+        tissue,
+        tuple(notes),
+        None,
+        right,
+        right_frame,
+        by_frame,
+        frames,
     )
     return found.within(MaskFiles.find(folder / "masks", folder), None)
 

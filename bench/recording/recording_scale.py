@@ -6,6 +6,7 @@ elastic body F = E a² g(u/a), so force is proportional to the scale's square: 5
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,10 +14,10 @@ import cv2
 import numpy as np
 
 from bench.recording.meta import Meta, ScaleCalibration
-from bench.recording.recording_folder import open_recording
 from synth.errors import UserError
 from synth.video import read_video as video
 from synth.video.pixel_scale import ASSUMED_WIDTH_MM, pixel_mm
+from synth.video.read_video import Picture
 
 _UNKNOWN = 0.99  # relative uncertainty of an unknown scale
 _STATED = 0.02  # relative uncertainty of a stated scale, unless given
@@ -33,11 +34,14 @@ class PixelScale:
     source: str
 
 
-def find_scale(meta: Meta, folder: Path) -> PixelScale:
-    """The recording's scale, stated or calibrated by `meta.yaml`. UserError for no checkerboard found, points
-    that coincide, or, for an unknown scale, no picture."""
+def find_scale(meta: Meta, folder: Path, pictures: Callable[[], Iterator[Picture]]) -> PixelScale:
+    """The scale that `meta.yaml` states or calibrates by a file of the folder; `Recording.scale` is this.
+
+    `pictures`: of the video, whose width is assumed in mm if the scale is unknown. UserError: no checkerboard
+    found, points that coincide, or no picture.
+    """
     if meta.scale_mm_per_px == "unknown":
-        wide = next(iter(open_recording(folder).frames())).rgb.shape[1]
+        wide = next(pictures()).rgb.shape[1]
         source = f"unknown: the picture is assumed to be {ASSUMED_WIDTH_MM:g} mm wide"
         found = PixelScale(pixel_mm("unknown", wide), _UNKNOWN, source)
     elif meta.scale_mm_per_px is not None:

@@ -8,13 +8,13 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
-from bench.methods import comparison, method_plugins
+from bench.methods import comparison
 from bench.methods.comparison import FUSION, MAIN, PHYSICS
 from bench.methods.force_fusion import Fusion
 from bench.methods.method_interface import Method
+from bench.methods.method_plugins import Plugged
 from bench.methods.network import Model
 from bench.methods.physics import Physics
-from bench.recording import recording_scale
 from bench.recording.recording_folder import Recording, open_recording
 from bench.scoring import score_report
 from bench.scoring.evaluate_recording import evaluate_recording
@@ -71,7 +71,7 @@ def score(
     if not isinstance(recording, Recording):
         recording = open_recording(Path(recording))
     model = _choose_model(model, methods or {}, recording.has_stereo)
-    frames = len(recording.numbers()) or None
+    frames = len(recording.numbers) or None
     bar: AbstractContextManager[Progress]
     bar = counting(f"scoring {recording.name}", frames) if progress else nullcontext(lambda done: None)
     with ExitStack() as stack:
@@ -83,7 +83,7 @@ def score(
             flow = stack.enter_context(open_flow_process())
         network = None if model is None else Model(model)
         chosen = _choose_methods(network, model, methods or {}, baselines)
-        scale, main = recording_scale.find_scale(recording.meta, recording.folder), next(iter(chosen))
+        scale, main = recording.scale, next(iter(chosen))
         about = _describe(chosen)
         with bar as done:
             result = evaluate_recording(recording, chosen, main, scale, used, about, done, flow)
@@ -109,7 +109,7 @@ def _choose_methods(
     """All methods by name, in the table's order; the result is about the first."""
     chosen: dict[str, Method] = {} if network is None else {MAIN: network}
     for name, one in own.items():
-        chosen[name] = one if isinstance(one, Model) else method_plugins.Plugged(one, f"method {name}")
+        chosen[name] = one if isinstance(one, Model) else Plugged(one, f"method {name}")
     if baselines:
         simple = comparison.simpler_methods()
         chosen |= {name: one for name, one in simple.items() if name not in chosen}
@@ -127,7 +127,8 @@ def _describe(chosen: Mapping[str, Method]) -> dict[str, Any]:
         about[FUSION] = {"hash": f"{main.identity} and physics", "origin": main.origin}
     described: dict[str, Any] = {} if main is None else {"model": main.described()}
     described["networks"] = about
-    if sources := {name: where for name, where in method_plugins.sources().items() if name in chosen}:
+    sources = {name: one.source for name, one in chosen.items() if isinstance(one, Plugged) and one.source}
+    if sources:
         described["plug_ins"] = sources
     return described
 

@@ -15,7 +15,6 @@ from bench.methods.force_interval import VideoEstimates
 from bench.methods.method_interface import ForceEstimate, Method, MethodContext, Revising
 from bench.recording.footage import as_footage
 from bench.recording.recording_folder import Recording
-from bench.recording.right_pictures import RightPictures, StereoQuality
 from bench.sensor.alignment import align_sensor
 from bench.tracking.contact_free import ContactFreeSearch
 from synth.arrays import Floats, Map, Mask, Pixels
@@ -27,8 +26,8 @@ from synth.flow.recording.finding import Finding
 from synth.flow.recording.flow import LocalFlow
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, TrackingSummary
 from synth.flow.recording.harmonic_fit import Span
-from synth.flow.recording.video_pass import VideoPass
-from synth.flow.recording.video_track import FrameWatcher, VideoTrack, track_video
+from synth.flow.recording.right_pictures import PairQuality
+from synth.flow.recording.video_track import VideoTrack, track_video
 from synth.system.stopwatch import Stopwatch
 
 A = TypeVar("A", bound=np.generic)
@@ -75,7 +74,7 @@ class TrackedRecording:
     decoded: list[tuple[int, float | None]] = field(default_factory=list)  # number, time [s] of every picture
     rest_s: float | None = None  # time of the rest frame
     scale_mm_per_px: float = 1.0  # of the recording's own pixels
-    stereo: StereoQuality | None = None  # of the right or depth camera; None: none, or not used
+    stereo: PairQuality | None = None  # of the right or depth camera; None: none, or not used
     turning: SurfaceMotion | None = None  # motion of the tissue over `sensor.turn_s`, if given
     evidence: VideoEstimates | None = None  # from which the interval of the leading fusion is computed
     stated: tuple[bool, ...] = (False,) * 4  # tissue, instruments, membrane, rest or ex vivo
@@ -105,14 +104,8 @@ def track_recording(
     watch, about = Stopwatch(), recording.meta
     settings = replace(settings, pulse=settings.pulse and about.pulse.remove)
     footage, free_s = replace(as_footage(recording, scale_mm_per_px), only=only), about.pulse.free_s
-    pictures: list[RightPictures] = []  # of both cameras, of the last pass
-
-    def watch_frames(video: VideoPass) -> FrameWatcher:
-        pictures[:] = [RightPictures(video)]
-        return pictures[0].add
-
     with track_video(
-        footage, settings, free_s, flow=flow, watch=watch, progress=progress, watch_frames=watch_frames
+        footage, settings, free_s, flow=flow, watch=watch, progress=progress, compare_cameras=True
     ) as track:
         video = track.video
         mm_per_px = scale_mm_per_px * video.rest.shrink
@@ -134,7 +127,8 @@ def track_recording(
     found_s = free.find()
     forces.finish(recording, found_s)
     out = forces.out
-    out.stereo, out.turning = pictures[0].quality, turning if turning.time_s else None
+    out.stereo = None if track.pair is None else track.pair.quality
+    out.turning = turning if turning.time_s else None
     out.scale_mm_per_px = scale_mm_per_px
     _describe(out, track, recording, methods, pictured)
     if found_s:

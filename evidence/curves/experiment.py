@@ -17,8 +17,8 @@ from matplotlib.axes import Axes
 from sklearn.decomposition import TruncatedSVD
 
 from evidence import report, result_cache, result_status, training
-from evidence.bootstrap import mean_of
 from evidence.curves import models
+from evidence.paired_means import mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.data.grid import Grid

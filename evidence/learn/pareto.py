@@ -15,8 +15,8 @@ import torch
 from matplotlib.axes import Axes
 
 from evidence import report, result_status
-from evidence.bootstrap import difference, mean_of
 from evidence.learn.runs import base_settings, by_sequence, carry_out
+from evidence.paired_means import difference, mean_of
 from evidence.study import Study
 from learn.checkpoint import ModelCard
 from learn.data.clips import load_clips

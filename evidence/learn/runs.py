@@ -11,7 +11,7 @@ import typer
 
 from evidence import report, result_status, training
 from evidence import result_cache as stored
-from evidence.bootstrap import difference, mean_of
+from evidence.paired_means import difference, mean_of
 from evidence.study import Study
 from learn.data.clips import Clip, load_clips
 from learn.evaluation.evaluate import evaluate

@@ -19,7 +19,7 @@ from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodCon
 from bench.methods.network import Model
 from bench.methods.physics import Physics
 from evidence import report, result_cache, result_status
-from evidence.bootstrap import mean_of
+from evidence.paired_means import mean_of
 from evidence.pooled import PRETRAINED
 from evidence.study import Study
 from learn.inference.shipped_networks import find_model

@@ -17,9 +17,9 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
-from synth.geometry.craniotomy import Attachment, Craniotomy
 from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
 from synth.geometry.skin import skin
+from synth.geometry.skull import Attachment, Craniotomy
 from synth.geometry.triangles import Shape, side_areas
 from synth.system import checked_file
 

@@ -15,7 +15,7 @@ from synth.errors import UserError, as_user_error
 from synth.fem.motion import TimeScheme
 from synth.flow.stereo.calibration import read_rig
 from synth.flow.stereo.rig import Rectified, StereoRig
-from synth.geometry.craniotomy import Attachment, Craniotomy
+from synth.geometry.skull import Attachment, Craniotomy
 from synth.job.reader import as_job
 from synth.job.schema import AnatomySection, FemSection, Job, RenderSection
 from synth.render.camera import camera as cameras

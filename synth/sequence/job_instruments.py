@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from synth.job.schema import FemSection
 from synth.render.instrument import OwnMesh
-from synth.render.own_instrument import PlacedFile, read_own_mesh
+from synth.render.instrument_file import PlacedFile, read_own_mesh
 
 
 def read_job_instruments(fem: FemSection) -> Mapping[str, OwnMesh]:

@@ -19,7 +19,7 @@ from synth.flow import track
 from synth.flow.estimator import Estimator
 from synth.flow.track import Track
 from synth.geometry.brain_surface import Brain, load_brain, place_brain
-from synth.geometry.craniotomy import Attachment, Craniotomy
+from synth.geometry.skull import Attachment, Craniotomy
 from synth.geometry.triangles import Shape
 from synth.job.schema import Job
 from synth.render.anatomy.surface import CortexSurface, Relief, grow, resize

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.methods.method_interface import ForceEstimate, FrameMotion, Method, MethodContext
-from bench.recording import recording_scale, recording_writer
+from bench.recording import recording_writer
 from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
@@ -95,5 +95,5 @@ def scored(folder: Path, methods: Mapping[str, Method] | None = None, **settings
     chosen = dict(methods or {"bump": Bump()})
     flow = settings.pop("flow_here", None)
     chosen_settings = RecordingFlowSettings(**({"shrink": 1, "rate_hz": None} | settings))
-    scale = recording_scale.find_scale(recording.meta, folder)
+    scale = recording.scale
     return evaluate_recording(recording, chosen, next(iter(chosen)), scale, chosen_settings, {}, flow=flow)

@@ -11,7 +11,7 @@ from warped_cortex import inverse
 
 from bench.methods.compliance import TO_CAMERA, ElasticBlock, picture
 from bench.methods.method_interface import Method
-from bench.recording import recording_scale, recording_writer
+from bench.recording import recording_writer
 from bench.recording.recording_folder import open_recording
 from bench.scoring.evaluate_recording import evaluate_recording
 from bench.scoring.result import Result
@@ -101,6 +101,6 @@ def record(
 def score(folder: Path, methods: Mapping[str, Method], backend: str) -> Result:
     """Scores of all frames of the recording."""
     opened = open_recording(folder)
-    scale = recording_scale.find_scale(opened.meta, folder)
+    scale = opened.scale
     settings = RecordingFlowSettings(backend, shrink=1, rate_hz=None)
     return evaluate_recording(opened, methods, next(iter(methods)), scale, settings, {})

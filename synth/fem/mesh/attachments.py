@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from synth.arrays import Floats, Ints, Mask
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope, scatter, shape
-from synth.geometry.craniotomy import Attachment
+from synth.geometry.skull import Attachment
 
 FIRM_PER_MM = 2.0  # springs of skull, dura and attachments, in E per mm: 10 times as stiff as the tissue
 

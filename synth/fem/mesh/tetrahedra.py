@@ -20,7 +20,7 @@ from synth.fem.mesh.lattice_stuffing import stuff
 from synth.fem.mesh.mesh_relief import HeightMap, raise_top
 from synth.fem.mesh.refine import edges_of, refine
 from synth.geometry.brain_surface import Brain
-from synth.geometry.craniotomy import Attachment
+from synth.geometry.skull import Attachment
 
 Contact = tuple[float, float, float]
 """World x, y of a contact's centre and its radius, mm."""

@@ -34,6 +34,7 @@ from synth.flow.recording.finding import Finding, first_fault
 from synth.flow.recording.flow import LocalFlow
 from synth.flow.recording.frame_motion import FrameMotion, Size
 from synth.flow.recording.harmonic_fit import Span
+from synth.flow.recording.right_pictures import RightPictures
 from synth.flow.recording.video_pass import VideoPass
 from synth.flow.stereo.stereo_track import Moved
 from synth.system.stopwatch import Stopwatch
@@ -42,8 +43,6 @@ _KEPT_BITS = 12
 """Of the mantissa: a motion is kept to 1.2e-4 of itself, which its noise exceeds a hundred times."""
 _ROUNDED = ("flow", "confidence")
 _FLAGS = ("masked", "tool")
-
-FrameWatcher = Callable[[FrameMotion], None]
 
 
 class FrameFile:
@@ -113,6 +112,8 @@ class VideoTrack:
     search: PulseSearch | None
     """Search for heart and breath; None: not requested."""
     kept: FrameFile
+    pair: RightPictures | None
+    """Comparison of the pictures of both cameras; None: not requested."""
 
     @property
     def removed(self) -> PulseEstimate | None:
@@ -148,36 +149,35 @@ def track_video(
     flow: LocalFlow | None = None,
     watch: Stopwatch | None = None,
     progress: Callable[[int], None] = lambda done: None,
-    watch_frames: Callable[[VideoPass], FrameWatcher] | None = None,
+    compare_cameras: bool = False,
 ) -> VideoTrack:
     """Tracks a video from its rest frame on.
 
     Tissue that is not given is found before, in a few frames. `free_s`: spans known to be without contact
-    [s]; `watch_frames`: called with each pass; what it returns is called with the frames of that pass while
-    they are tracked, with the right camera's pictures and the pulse. Other arguments and errors as for
-    `VideoPass`.
+    [s]; `compare_cameras`: whether the pictures of a right camera are compared with the left ones. Other
+    arguments and errors as for `VideoPass`.
     """
     flow, watch = flow or LocalFlow(), watch or Stopwatch()
     if footage.tissue is None:
         footage = _with_tissue(footage, settings, watch)
     first = VideoPass(footage, settings, flow=flow, watch=watch, progress=progress)
-    kept = _keep(first, watch_frames)
+    kept, pair = _keep(first, compare_cameras)
     search = first.search(free_s)
     if search is None or search.camera is None:
-        return VideoTrack(first, search, kept)
+        return VideoTrack(first, search, kept, pair)
     kept.close()
     second = VideoPass(footage, settings, search.camera, flow=flow, watch=watch, progress=progress)
-    return VideoTrack(second, search, _keep(second, watch_frames))
+    return VideoTrack(second, search, *_keep(second, compare_cameras))
 
 
-def _keep(video: VideoPass, watch_frames: Callable[[VideoPass], FrameWatcher] | None) -> FrameFile:
-    kept, watcher = FrameFile(), None if watch_frames is None else watch_frames(video)
+def _keep(video: VideoPass, compare_cameras: bool) -> tuple[FrameFile, RightPictures | None]:
+    kept, pair = FrameFile(), RightPictures(video) if compare_cameras else None
     for frame in video.frames():
-        if watcher is not None:
-            watcher(frame)
+        if pair is not None:  # here: the right camera's pictures aren't kept
+            pair.add(frame)
         with video.watch.stage("store"):
             kept.add(frame)
-    return kept
+    return kept, pair
 
 
 def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:

@@ -132,7 +132,7 @@ def test_frames_are_counted_if_the_container_does_not_state_their_number(tmp_pat
                 packet.stream = stream
                 copy.mux(packet)
     (folder / "video.mp4").unlink()
-    assert list(open_recording(folder).numbers()) == list(range(9))
+    assert list(open_recording(folder).numbers) == list(range(9))
 
 
 def test_a_written_meta_is_read_back_as_the_defaults(tmp_path: Path) -> None:

@@ -15,10 +15,10 @@ from bench.checks.judgement import judge
 from bench.methods.method_interface import ForceEstimate, FrameMotion, MethodContext
 from bench.recording import recording_writer
 from bench.recording.recording_folder import open_recording
-from bench.recording.right_pictures import StereoQuality
-from bench.recording.stereo_timing import find_lag
 from bench.tracking.tracking import TrackedRecording, track_recording
 from synth.flow.recording.decode import RecordingFlowSettings
+from synth.flow.recording.right_pictures import PairQuality
+from synth.flow.recording.stereo_timing import find_lag
 from synth.flow.stereo.stereo_track import Moved
 from tests.synth.flow.test_stereo import AWAY, BASE, COLUMNS, FOCAL, K_RIGHT, ROWS, K, source
 
@@ -134,7 +134,7 @@ def test_breathing_along_the_optical_axis_is_removed_from_depth(make: Make, seco
     assert still[deepest, 60, 80, 2] == pytest.approx(truth[deepest, 60, 80], rel=0.15)
 
 
-PAIR = StereoQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
+PAIR = PairQuality(BASE, 0.1, AWAY / FOCAL, 0.01)
 FAULTS: dict[str, float] = {"copied": True, "frozen": 3, "tool_behind_px": 2.0, "lag_s": -0.1}
 FAULTS |= {"epipolar_px": 3.0, "last_rows_px": 1.8}
 
@@ -143,7 +143,7 @@ FAULTS |= {"epipolar_px": 3.0, "last_rows_px": 1.8}
 def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: str) -> None:
     recording = open_recording(make("right"))
 
-    def severities(quality: StereoQuality) -> set[str]:
+    def severities(quality: PairQuality) -> set[str]:
         tracked = TrackedRecording(stereo=quality, scale_mm_per_px=AWAY / FOCAL)
         return {one.severity for one in judge(recording, tracked) if one.cause == "stereo"}
 
@@ -154,7 +154,7 @@ def test_pictures_that_are_no_pair_are_an_error(make: Make, fault: str) -> None:
 
 
 def test_a_baseline_in_metres_is_reported(make: Make) -> None:
-    quality = StereoQuality(0.024, 0.1, 0.05e-3, 0.01)
+    quality = PairQuality(0.024, 0.1, 0.05e-3, 0.01)
     tracked = TrackedRecording(stereo=quality, scale_mm_per_px=0.05)
     (found,) = camera_pair.check_scale(open_recording(make("right")), tracked)
     assert found.severity == "error"

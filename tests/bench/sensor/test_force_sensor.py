@@ -94,7 +94,9 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
 
     def find(columns: int, rows: int) -> recording_scale.PixelScale:
         board = {"checkerboard": "board.png", "corners": [columns, rows], "square_mm": 2.0}
-        return recording_scale.find_scale(Meta.model_validate({"calibration": board}), tmp_path)
+        return recording_scale.find_scale(
+            Meta.model_validate({"calibration": board}), tmp_path, lambda: iter(())
+        )
 
     found = find(7, 5)
     assert found.mm_per_px == pytest.approx(2.0 / square, rel=0.005)
@@ -105,6 +107,6 @@ def test_checkerboard_scale(tmp_path: Path) -> None:
 
 def test_scale_bar() -> None:
     about = Meta.model_validate({"calibration": {"bar_px": [[10, 10], [110, 10]], "bar_mm": 5}})
-    found = recording_scale.find_scale(about, Path())
+    found = recording_scale.find_scale(about, Path(), lambda: iter(()))
     assert found.mm_per_px == pytest.approx(0.05)
     assert found.uncertainty == pytest.approx(np.sqrt(2) / 100)

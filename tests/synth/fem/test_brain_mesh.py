@@ -17,7 +17,7 @@ from synth.cli import app
 from synth.errors import UserError
 from synth.fem.mesh.element import bary_slope
 from synth.geometry import brain_surface
-from synth.geometry.craniotomy import Craniotomy
+from synth.geometry.skull import Craniotomy
 from synth.job import schema
 from synth.sequence.fem_mechanics import build_volume
 from synth.sequence.simulation import simulate

@@ -14,7 +14,7 @@ from synth.fem.mesh import attachments, tetrahedra
 from synth.fem.mesh.tetrahedra import Tets, boundary
 from synth.fem.motion import Clock, march_in_time, nodal_mass
 from synth.fem.system import assemble
-from synth.geometry.craniotomy import Attachment
+from synth.geometry.skull import Attachment
 from synth.job import schema
 
 FALX = Attachment(point=(14, 0, -20), normal=(1, 0, 0), radius_mm=18, thickness_mm=6)

@@ -19,7 +19,7 @@ from synth.render.camera.camera import project
 from synth.render.finish import Finish
 from synth.render.finish_maps import unfold, wrap
 from synth.render.instrument import Part, place
-from synth.render.own_instrument import outline_mesh, place_mesh
+from synth.render.instrument_file import outline_mesh, place_mesh
 from synth.render.scene import SceneState
 from synth.sequence.draw import draw_scenario
 from synth.sequence.job_instruments import read_job_instruments

@@ -17,7 +17,7 @@ from synth.checks.verify import verify_dataset
 from synth.dataset.store import Dataset
 from synth.fem.pulse import Pulse
 from synth.geometry.brain_surface import load_brain, read_brain
-from synth.geometry.craniotomy import Craniotomy
+from synth.geometry.skull import Craniotomy
 from synth.render.camera import camera as cameras
 from synth.sequence.rest_scene import RestScene, draw_craniotomy
 

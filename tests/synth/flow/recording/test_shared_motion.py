@@ -1,6 +1,6 @@
 """Camera motion where tissue fills the picture, separated from contacts and pulsation of analytic motion."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -127,20 +127,20 @@ def test_pulsation_is_not_taken_for_camera_motion() -> None:
 
 def test_the_bump_of_a_recording_is_removed_in_a_second_pass() -> None:
     shift = np.where(np.arange(12) > 4, 5.0, 0.0)
-    passes: list[tuple[VideoPass, list[float]]] = []
 
-    def watch(video: VideoPass) -> Callable[[FrameMotion], None]:
-        passes.append((video, []))
-        return lambda frame: passes[-1][1].append(float(np.median(frame.flow, axis=(0, 1))[1]))
+    def vertical(frames: Iterable[FrameMotion]) -> list[float]:
+        return [float(np.median(frame.flow, axis=(0, 1))[1]) for frame in frames]
 
-    with track_video(footage(shift), SETTINGS, watch_frames=watch) as track:
-        kept = [np.median(frame.flow, axis=(0, 1))[1] for frame in track.frames()]
-    (first, before), (second, after) = passes
+    first = VideoPass(footage(shift), SETTINGS)
+    before = vertical(first.frames())
+    with track_video(footage(shift), SETTINGS) as track:
+        kept, second = vertical(track.frames()), track.video
+    assert track.search is not None
+    after = vertical(VideoPass(footage(shift), SETTINGS, track.search.camera).frames())
     assert before[-1] == pytest.approx(5, abs=0.1)
     assert np.abs(after).max() < 0.05
     np.testing.assert_allclose(kept, after, atol=1e-3)
     assert [[one.cause for one in video.findings].count("camera") for video in (first, second)] == [0, 1]
-    assert track.video is second
 
 
 def test_a_pulsating_video_is_decoded_and_its_flow_computed_once() -> None:

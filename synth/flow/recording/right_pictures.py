@@ -1,4 +1,4 @@
-"""Measurements on the right camera's pictures over a tracked video, for `bench check` and the report."""
+"""Measurements on the right camera's pictures over a tracked video: do they belong to the left ones?"""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from bench.recording.stereo_timing import StereoTiming
 from synth.arrays import Mask, Pixels
 from synth.errors import UserError
 from synth.flow import image
-from synth.flow.recording import stereo_motion
 from synth.flow.recording.frame_motion import FrameMotion
-from synth.flow.recording.stereo_motion import RightCamera
+from synth.flow.recording.stereo_motion import RightCamera, StereoQuality
+from synth.flow.recording.stereo_timing import StereoTiming
 from synth.flow.recording.video_pass import VideoPass
 from synth.flow.stereo import rest
 from synth.flow.stereo.rig import Rectified
@@ -26,7 +25,7 @@ _NEAR = np.ones((25, 25), np.uint8)
 
 
 @dataclass(frozen=True)
-class StereoQuality(stereo_motion.StereoQuality):
+class PairQuality(StereoQuality):
     """Quality of the right or depth camera, and whether the pictures belong together."""
 
     copied: bool = False  # whether the right pictures are copies of the left ones
@@ -80,18 +79,18 @@ class RightPictures:
             self._largest, self._tool = int(tool.sum()), (tool, left, right)
 
     @property
-    def quality(self) -> StereoQuality | None:
+    def quality(self) -> PairQuality | None:
         """The quality over all frames; None: no such camera, or the rest frame could not be used."""
         camera = self._video.stereo
         found = None if camera is None else camera.quality
         if found is None:
             return None
         if self._timing is None or not isinstance(camera, RightCamera) or camera.stereo is None:
-            return StereoQuality(**vars(found))
+            return PairQuality(**vars(found))
         numbers = found.baseline_mm, found.epipolar_px, found.mm_per_px, found.noise_mm
         pair = self._copied, self._frozen, self._tool_behind_px(camera.stereo.rectified)
         rows, moved = self._last_rows_px(camera.stereo.rectified), tuple(camera.describe())
-        return StereoQuality(*numbers, *pair, *self._timing.find_lag_s(), rows, self._sharpness, moved)
+        return PairQuality(*numbers, *pair, *self._timing.find_lag_s(), rows, self._sharpness, moved)
 
     def _last_rows_px(self, rectified: Rectified) -> float:
         if self._last is None:
