@@ -218,11 +218,11 @@ def intervals(title: str, unit: str, rows: Mapping[str, Sequence[float]]) -> str
 
 def interval_charts(*parts: tuple[str, str, Mapping[str, Sequence[float]]]) -> str:
     """Charts as of `intervals`, one below the other."""
-    draws = [partial(draw_intervals, title=title, unit=unit, rows=rows) for title, unit, rows in parts]
+    draws = [partial(_draw_intervals, title=title, unit=unit, rows=rows) for title, unit, rows in parts]
     return chart(*draws, heights=[70.0 + 19 * len(rows) for _, _, rows in parts], width=960)
 
 
-def draw_intervals(axes: Axes, title: str, unit: str, rows: Mapping[str, Sequence[float]]) -> None:
+def _draw_intervals(axes: Axes, title: str, unit: str, rows: Mapping[str, Sequence[float]]) -> None:
     """Means and the ends of their intervals, a line for each name, which states them."""
     places = np.arange(len(rows))
     for place, (mean, *ends) in zip(places, rows.values(), strict=True):
