@@ -57,7 +57,8 @@ def normals(shape: Shape) -> Floats:
 
     Summed in the order of the faces: the renderer's own sum over threads is not reproducible.
     """
-    total = _weigh_by_area(np.ascontiguousarray(shape.vertices, np.float64), as_constant(shape.faces))
+    vertices = np.ascontiguousarray(shape.vertices, np.float64)
+    total = _weigh_by_area(as_constant(vertices), as_constant(shape.faces))
     length = lengths(total)[:, None]
     flat = length[:, 0] < 1e-12
     total[flat] = [0.0, 0.0, 1.0]
@@ -65,10 +66,10 @@ def normals(shape: Shape) -> Floats:
     return np.asarray(total / length)
 
 
-@argument_types("f8[:,::1], Array(i4, 2, 'C', readonly=True)")
+@argument_types("Array(f8, 2, 'C', readonly=True), Array(i4, 2, 'C', readonly=True)")
 @compiled
 def _weigh_by_area(vertices: Floats, faces: Indices) -> Floats:
-    total = np.zeros_like(vertices)
+    total = np.zeros(vertices.shape)
     # One corner after the other, to round like a sum over all first corners, all second and all third.
     for corner in range(3):
         for f in range(len(faces)):

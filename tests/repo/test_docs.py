@@ -31,7 +31,7 @@ PAGES = [
 ]
 PLUG_INS = ("flow", "law", "method")
 _TOP = "synth|learn|bench|evidence|weights|tests|examples"
-OURS = re.compile(rf"(?<![\w./@-])(?:{_TOP})/[\w/]+(?:\.[a-z0-9]+)*")
+OURS = re.compile(rf"(?<![\w./@-])(?:{_TOP})/[\w/]+(?:-\w+)*(?:\.[a-z0-9]+)*")
 
 
 def blocks(page: Path, language: str) -> Iterator[tuple[str, str]]:
