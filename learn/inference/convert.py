@@ -66,7 +66,7 @@ def to_onnx(
     """The file's bytes, for batches of any size, and its largest difference from PyTorch.
 
     The difference is in units of the 99.9th percentile, or of the largest output if that is more. `gain`:
-    factor on the output; `tolerance`: of the difference, `TOLERANCE` if None. UserError if it is above that, or
+    factor on the output; `tolerance`: of the difference, `TOLERANCE` if None. UserError if it is above, or
     the network can't be written.
     """
     module = Portable(network.cpu(), card, gain).eval()
