@@ -24,18 +24,19 @@ _PIXELS, _DIRECTIONS, _QUANTILES = 6000, 48, 100
 _LOW, _HIGH = 0.4, 1.2  # 1 plus the off-diagonal elements of published cameras' matrices
 _CURVE = 0.3  # largest change of a level of a tone curve
 _KNOWN, _NEUTRAL = 0.1, 0.3  # weights of the priors for plain colours, and for equal curves of the channels
-_INSET_PX, _ANATOMIES = 9, 2
+_INSET_PX, _ANATOMIES = 9, 3
 _USUAL = CameraSensor()
 
 _TRIED: dict[str, tuple[tuple[float, ...], Callable[[float], dict[str, float]]]] = {
     "vignette": ((0.0, 0.2, 0.4, 0.6, 0.8), lambda share: {"vignette": share}),
-    "noise": (
-        (0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0),
-        lambda k: {"full_well": _USUAL.full_well / k**2, "read_noise": _USUAL.read_noise / k},
-    ),
     "sharpness": (
         (4.0, 2.0, 1.0, 0.5, 0.0, -0.7, -1.5),
         lambda px: {"blur": max(px, 0.0), "sharpening": _USUAL.sharpening + max(-px, 0.0)},
+    ),
+    # After sharpness: fine texture that the lens blurs would be taken for noise.
+    "noise": (
+        (0.3, 0.6, 1.0, 1.7, 3.0, 5.0, 8.0),
+        lambda k: {"full_well": _USUAL.full_well / k**2, "read_noise": _USUAL.read_noise / k},
     ),
 }
 """By statistic: values to try, in the order in which it rises, and the sensor's keys for a value."""
@@ -61,7 +62,7 @@ class TissueFrame(NamedTuple):
 def fit_camera(given: Photograph) -> dict[str, Any]:
     """Sections of a job with the photograph's family and camera.
 
-    Frames of that family are recorded with rising vignette, noise and blur, of which those are chosen that
+    Frames of that family are recorded with rising vignette, blur and noise, of which those are chosen that
     reproduce the photograph's statistics. Colours are fitted to the signal of that camera.
     """
     theirs, video = measure(given.rgb, given.usable), given.rgb[given.usable] / 255
@@ -91,10 +92,10 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
-    """A frame of a default job without instruments: the anatomy, view and light of sequence `index`."""
+    """A frame of a default job without instruments and scenery: the anatomy, view and light of sequence `index`."""
     field = width * mm_per_px
     anatomy = {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}
-    view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8]}
+    view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "scenery": []}
     drawn = {"appearance": {"families": [family]}, "fem": {"instrument": "none"}}
     scene = at_rest(Job.model_validate({"anatomy": anatomy, "render": view, **drawn}), index)
     nowhere = np.zeros((2, 3))
