@@ -92,7 +92,7 @@ def fit_camera(given: Photograph) -> dict[str, Any]:
 
 
 def render(family: Family, width: int, mm_per_px: float, index: int) -> TissueFrame:
-    """A frame of a default job, without instruments or scenery: anatomy, view and light of sequence `index`."""
+    """A frame of a default job without instruments or scenery: anatomy, view, light of sequence `index`."""
     field = width * mm_per_px
     anatomy = {"vertices": 8000, "craniotomy": {"radius_mm": 0.56 * field}}
     view = {"size": [width, width * 3 // 4], "field_mm": field, "tilt_deg": [0, 8], "scenery": []}
