@@ -43,7 +43,7 @@ OF_VIDEO = ("overall disagreement", "overall spread", "shape", "motion")
 _SIZE, _APART, _SPREAD, _SHAPE, _MOTION_MM = 0.05, 0.03, 0.02, 0.02, 0.005
 _LARGEST = 0.98  # quantile over the frames that is the largest: without outliers
 _BEYOND = 0.15  # share of a feature's range by which a video may lie outside it
-_NORMAL = 1.645  # 95% quantile of the normal distribution
+NORMAL = 1.645  # 95% quantile of the normal distribution: half of the 90% interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class IntervalTable:
         """Lower and upper ends (T,) mN. `gain`: relative standard deviation of every force, from E."""
         model, size = self.by_cameras[video.cameras], np.linalg.norm(video.leading_mn, axis=1)
         half = video.largest_mn * model.error.predict(describe(video))
-        common = _NORMAL * gain * size
+        common = NORMAL * gain * size
         low = size - np.hypot(model.below * half, common)
         return np.maximum(low, 0.0), size + np.hypot(model.above * half, common)
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.methods.force_interval import LEVEL, read_table
+from bench.methods.force_interval import LEVEL, NORMAL, read_table
 from bench.scoring.result import Result
 
 _SHOWN = 2  # findings on the first screen
 _WORDS = 14  # of each
 _WORTH = 0.02  # least change of the interval that is said, as a share of its width
-_E_NORMAL = 1.645  # half of the 90% interval in standard deviations
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def find_gains(result: Result, size: float, low: float, high: float) -> tuple[st
         missing = [name for name, known in _known(result).items() if not known]
         widths[f"stating {', '.join(missing)}"] = width * stating["statements"] ** (1 - video.stated)
     if young := result.settings["meta"].get("young_uncertainty", 0.0):
-        common = _E_NORMAL * young * size
+        common = NORMAL * young * size
         ends = [math.sqrt(max((side - size) ** 2 - common**2, 0.0)) for side in (low, high)]
         widths["E without its uncertainty"] = sum(ends)
     better = sorted((new, name) for name, new in widths.items() if new < (1 - _WORTH) * width)

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, select_autoescape
 from rich.markup import escape
 from rich.table import Table
 
@@ -31,8 +31,8 @@ _NARROW = ("mae_mn", "mae_of_peak", "r", "shape_error", "r2", "bias_mn", "false_
 """Columns that fit into the 80 of a terminal, and those of the report's first table."""
 
 
-def render_report(result: Result, title: str = "") -> str:
-    """The page as text; `title`: its heading, by default with the recording's name."""
+def load_template(name: str) -> Template:
+    """A page's template in this package: escaped, and strict about names."""
     environment = Environment(
         loader=PackageLoader("bench.scoring", "."),
         autoescape=select_autoescape(default_for_string=True, default=True),
@@ -41,6 +41,11 @@ def render_report(result: Result, title: str = "") -> str:
         lstrip_blocks=True,
     )
     environment.filters["shown"] = shown
+    return environment.get_template(name)
+
+
+def render_report(result: Result, title: str = "") -> str:
+    """The page as text; `title`: its heading, by default with the recording's name."""
     main = result.methods[result.main]
     figures = {"force": charts.draw_force(result), "methods": charts.draw_force(result, others=True)}
     if np.isfinite(main.force_mn).any(axis=0).all():
@@ -50,7 +55,7 @@ def render_report(result: Result, title: str = "") -> str:
     lower = {n: m for n, m in result.methods.items() if m.scores.get("mae_mn", math.inf) < mae}
     in_hindsight = [n for n, m in lower.items() if m.gain and m.gain.source == "hindsight"]
     better = [n for n in lower if n not in in_hindsight]
-    return environment.get_template("report.html.jinja").render(
+    return load_template("report.html.jinja").render(
         title=title or f"Force from video: {result.recording}",
         result=result,
         main=main,

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from bench.scoring import pool
 from bench.scoring.force_metrics import METRICS
 from bench.scoring.result import Result, as_json
 from bench.scoring.score import score
+from bench.scoring.score_report import load_template
 from synth.errors import UserError
 from synth.system.checked_file import write_whole
 
@@ -76,13 +76,6 @@ def _pool(trees: Sequence[Tree], out: Path, command: str) -> Tree | None:
 
 def render_session(rows: Sequence[Mapping[str, Any]], pooled: Mapping[str, Any] | None) -> str:
     """The page as text."""
-    environment = Environment(
-        loader=PackageLoader("bench.scoring", "."),
-        autoescape=select_autoescape(default_for_string=True, default=True),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     scores = {} if pooled is None else pooled["methods"][pooled["main"]]["scores"]
     means = {METRICS[key].heading: (scores[key], METRICS[key].digits) for key in _POOLED if key in scores}
-    return environment.get_template("session.html.jinja").render(rows=rows, means=means, pooled=pooled)
+    return load_template("session.html.jinja").render(rows=rows, means=means, pooled=pooled)

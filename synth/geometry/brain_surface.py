@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 import warnings
 import zlib
@@ -17,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
-from synth.geometry.mesh_file import SUFFIXES, check_surface, read_mesh
+from synth.geometry.mesh_file import SUFFIXES, read_mesh, read_surface
 from synth.geometry.skin import skin
 from synth.geometry.skull import Attachment, Craniotomy
 from synth.geometry.triangles import Shape, side_areas
@@ -192,7 +191,6 @@ def _read(path: Path) -> tuple[Floats, Ints]:
         known = f"{', '.join(_KINDS)}, nor a surface of FreeSurfer's such as lh.pial"
         hint = "gunzip unpacks it" if kind == "gz" else "3D Slicer converts most others"
         raise UserError(f"anatomy.mesh: {path.name} is none of {known}; {hint}")
-    import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     stated = re.search(_STATED, data[:4096])
     space, offset = stated[1].decode() if stated else "", np.zeros(3)
@@ -205,10 +203,7 @@ def _read(path: Path) -> tuple[Floats, Ints]:
             if space and not re.fullmatch("[RL][AP][SI]", space):
                 raise ValueError(f"it states the space {space}; RAS or LPS is needed")
         else:
-            # From bytes, trimesh can't open further files that are named in this one.
-            held = io.BytesIO(check_surface(data, kind))
-            mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
-            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            vertices, faces = read_surface(data, kind, in_order=False)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise ValueError("a face refers to a missing point")
     except ModuleNotFoundError as error:

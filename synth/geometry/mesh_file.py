@@ -123,16 +123,17 @@ def read_mesh(data: bytes) -> MeshFile:
     return _read_legacy(data) if data.startswith(b"# vtk DataFile") else _read_xml(data)
 
 
-def read_surface(data: bytes, suffix: str) -> tuple[Floats, Ints]:
-    """Points (N, 3) and triangles (F, 3) of an .obj, .ply or .glb in the file's order, by trimesh.
+def read_surface(data: bytes, suffix: str, *, in_order: bool = True) -> tuple[Floats, Ints]:
+    """Points (N, 3) and triangles (F, 3) of a surface in a format that trimesh reads.
 
-    Files that it names (materials, pictures) are not opened. Raises what trimesh raises for what is none.
+    Files that it names (materials, pictures) are not opened. `in_order`: points are in the file's order.
+    Raises what trimesh raises for what is none.
     """
-    import trimesh  # here, as it is slow to import
+    import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     data = check_surface(data, suffix)
-    given = {"force": "mesh", "process": False, "maintain_order": True, "skip_materials": True}
-    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, **given)
+    given = {"maintain_order": True, "skip_materials": True} if in_order else {}
+    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, force="mesh", process=False, **given)
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 

@@ -37,11 +37,9 @@ class Instruments(Protocol):
     def glow(self, posed: Shape) -> Floats:
         """Radiance (V, 3) of the surroundings that a mirror in its place shows the camera at rest."""
 
-    def film(self, posed: Shape, surface: Floats) -> Floats:
-        """Height (V,) mm of the liquid that climbs to the mesh from a tissue's vertices (V, 3) mm."""
-
-    def shade(self, posed: Shape, surface: Floats) -> Floats:
-        """Share (V,) of light that scatters to a tissue's vertices (V, 3) mm past the mesh in its place."""
+    def touch(self, posed: Shape, surface: Floats) -> tuple[Floats, Floats]:
+        """At a tissue's vertices (V, 3) mm the height (V,) mm of the liquid that climbs to the mesh in its
+        place, and the share (V,) of light that scatters to them past it."""
 
 
 @dataclass(frozen=True)

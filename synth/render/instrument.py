@@ -83,7 +83,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class OwnMesh:
-    """An instrument of one's own; see `own_instrument`."""
+    """An instrument of one's own; see `instrument_file`."""
 
     part: Part
     half: float  # half the width of its tip, mm
@@ -130,17 +130,12 @@ class InstrumentMesh:
     def glow(self, posed: Shape) -> Floats:
         return reflection.glow(posed, self.alpha, self.theatre)
 
-    def film(self, posed: Shape, surface: Floats) -> Floats:
+    def touch(self, posed: Shape, surface: Floats) -> tuple[Floats, Floats]:
         near, away = _near(posed, surface)
-        height = np.zeros(len(surface))
+        height, share = np.zeros(len(surface)), np.ones(len(surface))
         height[near] = _CLIMB_MM * np.exp(-np.maximum(away - _TOUCH_MM, 0) / _REACH_MM)
-        return height
-
-    def shade(self, posed: Shape, surface: Floats) -> Floats:
-        near, away = _near(posed, surface)
-        share = np.ones(len(surface))
         share[near] = 1 - _SHADE * np.exp(-((away / _SHADE_MM) ** 2))
-        return share
+        return height, share
 
 
 def _near(posed: Shape, surface: Floats) -> tuple[Indices, Floats]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,7 +12,7 @@ import numpy as np
 
 from synth.arrays import Floats, Ints
 from synth.errors import Caution, UserError, as_user_error, first_line
-from synth.geometry.mesh_file import check_surface
+from synth.geometry.mesh_file import read_surface
 from synth.render.finish_maps import RING
 from synth.render.instrument import OwnMesh, Part
 from synth.system import checked_file
@@ -96,10 +95,7 @@ def read_triangles(path: Path) -> tuple[Floats, Ints]:
     import trimesh  # here, as it is slow to import and most jobs have no mesh
 
     try:
-        # From bytes, trimesh can't open further files that are named in this one.
-        held = io.BytesIO(check_surface(data, kind))
-        mesh = trimesh.load(held, file_type=kind, force="mesh", process=False)
-        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        vertices, faces = read_surface(data, kind, in_order=False)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
             raise ValueError("a face refers to a missing point")
     except Exception as error:  # readers of formats raise anything

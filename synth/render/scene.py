@@ -53,6 +53,16 @@ class SceneState:
     """Of the lamps, relative to the rest frame."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A state with its instruments in their place, and what they do to the tissue that they touch."""
+
+    state: SceneState
+    posed: Shape
+    film: Floats | None = None  # (V,) mm of liquid; None without instruments, as the next
+    share: Floats | None = None  # (V,) of the light that they leave it
+
+
 @dataclass(frozen=True)
 class RenderedFrame:
     """One frame and its ground truth. Optional fields that the renderer was not asked for are None."""
@@ -160,12 +170,12 @@ class Renderer:
         the next frame, for the flow to it.
         """
         camera = state.camera or self.camera
-        radiance, *others = self._gathered(shutter or (state,), seed)
+        placed = self._place(state)
+        radiance, *others = self._gather([self._place(shot) for shot in shutter] or [placed], seed)
         faces = self.content.tissue.faces
-        shapes = (Shape(state.vertices, faces), self._static, self._posed(state))
+        shapes = (Shape(state.vertices, faces), self._static, placed.posed)
         own = truth.trace_frame(camera, self.rest, *shapes)
-        shade = self._contact(state, shapes[-1])
-        radiance = self._shaded(radiance, own.hits, shade)
+        radiance = self._shade(radiance, own.hits, placed.share)
         extra: dict[str, Any] = {}
         if "flow_next" in self._extra:
             there = after or state
@@ -183,7 +193,7 @@ class Renderer:
         extra |= self._shading(own.hits, shapes, "")
         if self._right_of is not None and self._right_rest is not None:
             other = truth.trace_frame(self._right_of(camera), self._right_rest, *shapes)
-            picture = self.develop(self._shaded(others[0], other.hits, shade), seed + 1)
+            picture = self.develop(self._shade(others[0], other.hits, placed.share), seed + 1)
             extra |= {"rgb_right": picture, "flow_right": other.flow, "visible_right": other.visible}
             extra |= {"depth_right": other.depth, "tool_right": other.tool, "motion": own.motion}
             extra |= self._shading(other.hits, shapes, "_right")
@@ -216,10 +226,14 @@ class Renderer:
 
     def stage(self, state: SceneState, spp: int, integrator: str = "direct") -> Stage:
         """A Mitsuba stage of a state: bodies `tissue`, `metal`, and `static0` onwards."""
-        bodies = {"tissue": replace(self.content.tissue, vertices=state.vertices, film=self._film(state))}
+        return self._set_stage(self._place(state), spp, integrator)
+
+    def _set_stage(self, placed: _Placed, spp: int, integrator: str = "direct") -> Stage:
+        vertices = placed.state.vertices
+        bodies = {"tissue": replace(self.content.tissue, vertices=vertices, film=placed.film)}
         wet = (body for body in self.content.static if isinstance(body.material, Wet))
         bodies |= {f"static{k}": body for k, body in enumerate(wet)}
-        shape, glow = self._metal(state)
+        shape, glow = self._metal(placed.posed)
         textures = [(body.uv, metal.maps) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
             textures.insert(0, (instruments.uv, instruments.maps))
@@ -229,9 +243,12 @@ class Renderer:
 
     def move(self, stage: Stage, state: SceneState) -> None:
         """Moves a stage to another state."""
-        stage.move("tissue", state.vertices, film=self._film(state))
+        self._move(stage, self._place(state))
+
+    def _move(self, stage: Stage, placed: _Placed) -> None:
+        stage.move("tissue", placed.state.vertices, film=placed.film)
         if self.content.instruments is not None:
-            shape, glow = self._metal(state)
+            shape, glow = self._metal(placed.posed)
             stage.move("metal", shape.vertices, glow=glow)
 
     def develop(self, radiance: Map, seed: int) -> Pixels:
@@ -256,17 +273,13 @@ class Renderer:
             found[name] = number[hits.face].reshape(size)  # the last one is that of no hit, face -1
         return found
 
-    def _film(self, state: SceneState) -> Floats | None:
-        instruments = self.content.instruments
-        return None if instruments is None else instruments.film(self._posed(state), state.vertices)
+    def _place(self, state: SceneState) -> _Placed:
+        posed, instruments = self._posed(state), self.content.instruments
+        if instruments is None:
+            return _Placed(state, posed)
+        return _Placed(state, posed, *instruments.touch(posed, state.vertices))
 
-    def _contact(self, state: SceneState, posed: Shape) -> Floats | None:
-        """Share (V,) of light that instruments leave the tissue's vertices near them; None: all of it."""
-        if self.content.instruments is None:
-            return None
-        return self.content.instruments.shade(posed, state.vertices)
-
-    def _shaded(self, radiance: Map, hits: truth.Hits, shade: Floats | None) -> Map:
+    def _shade(self, radiance: Map, hits: truth.Hits, shade: Floats | None) -> Map:
         """The radiance (H, W, 3) less the light that contacts take from the tissue.
 
         Light that would have come to there by scattering in tissue and between tissue and steel, of which the
@@ -283,14 +296,15 @@ class Renderer:
         shaded[near] *= share.astype(np.float32)
         return shaded.reshape(radiance.shape)
 
-    def _gathered(self, states: Sequence[SceneState], seed: int) -> list[Map]:
+    def _gather(self, every: Sequence[_Placed], seed: int) -> list[Map]:
         """Mean radiance over some states, in the camera and in the right one if there is one."""
         shots: list[list[Map]] = []
-        for k, state in enumerate(states):
+        for k, placed in enumerate(every):
+            state = placed.state
             if self._stage is None:
-                self._stage = self.stage(state, self._spp)
+                self._stage = self._set_stage(placed, self._spp)
             else:
-                self.move(self._stage, state)
+                self._move(self._stage, placed)
             cameras = [state.camera or self.camera]
             if self._right_of is not None:
                 cameras.append(self._right_of(cameras[0]))
@@ -303,11 +317,10 @@ class Renderer:
     def _spot(self, camera: Camera) -> Map:
         return light.spot(camera, self.camera, self.content.spot)
 
-    def _metal(self, state: SceneState) -> tuple[Shape, Floats]:
+    def _metal(self, posed: Shape) -> tuple[Shape, Floats]:
         """All metal as one mesh, instruments first, and the surroundings (V, 3) that it mirrors."""
         parts = [(body.shape, metal.glow) for body, metal in self._static_metal]
         if (instruments := self.content.instruments) is not None:
-            posed = self._posed(state)
             parts.insert(0, (posed, instruments.glow(posed)))
         return joined(*(shape for shape, _ in parts)), np.concatenate([glow for _, glow in parts])
 

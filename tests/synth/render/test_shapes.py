@@ -241,7 +241,7 @@ def test_tissue_is_darker_where_an_instrument_touches_it() -> None:
     x, y = (plane.ravel() for plane in np.meshgrid(axis, axis))
     for high, least, most in ((0.0, 0.4, 0.7), (5.0, 0.999, 1.0)):
         posed = made.pose(TIPS * [1, 1, 0] + [0, 0, high], SHAFTS)
-        share = made.shade(posed, np.column_stack([x, y, 0 * x]))
+        _, share = made.touch(posed, np.column_stack([x, y, 0 * x]))
         assert least <= share.min() <= most
         assert share[np.hypot(x, y - 0.5) > 5].min() > 0.9
 
