@@ -1,14 +1,16 @@
 """Training losses: squared error, R², and a penalty on off-target force.
 
-`unit` and `spread` are constants of the training data: the target's 99.9th percentile, against which a force
-is low, and its root mean square over tissue cells, by which errors are divided so that the squared-error and
-the R² term are of similar size. (In the published code R² takes nearly all of the gradient.)
+`unit`, `total` and `spread` are constants of the training data: the 99.9th percentiles of the target and of
+its sum over a frame, against which a cell's and a frame's force are low, and the target's root mean square
+over tissue cells, by which errors are divided so that the squared-error and the R² term are of similar size.
+(In the published code R² takes nearly all of the gradient.)
 
-Off-target force is force on contact-free tissue. Heraoui et al. weight its squared error more (`antighost`),
-but the gradient of a square fades with the false force, so small ones remain. `off-target` adds a linear
-penalty: with squared error alone, where the conditional mean is q (in units of `spread`) on tissue that is
-free with probability p, the minimum is at q − p·OFF_TARGET/2, at least 0. It costs R² on weak presses, whose
-forces are of its size; R² by frame makes up for that, as it divides an error by its own frame's force.
+Off-target force is force on contact-free tissue. Heraoui et al. weight its squared error more, in frames of
+a low mean force (`antighost-frame`); `antighost` does so in cells of a low force, in any frame. The gradient
+of a square fades with the false force, so small ones remain. `off-target` adds a linear penalty: with squared
+error alone, where the conditional mean is q (in units of `spread`) on tissue that is free with probability p,
+the minimum is at q − p·OFF_TARGET/2, at least 0. It costs R² on weak presses, whose forces are of its size;
+R² by frame makes up for that, as it divides an error by its own frame's force.
 """
 
 from __future__ import annotations
@@ -22,8 +24,9 @@ from synth.errors import UserError
 if TYPE_CHECKING:  # settings name a loss without PyTorch: only methods of tensors are used below
     from torch import Tensor
 
-FALSE_POSITIVE = 3.0  # `antighost`: weight of squared over-prediction of a low force (Heraoui et al.: 3)
-LOW = 0.05  # `antighost`: a low force is under this share of `unit` (Heraoui et al. compare the frame's mean)
+FALSE_POSITIVE = 3.0  # weight of squared over-prediction of a low force (Heraoui et al.)
+LOW = 0.05  # `antighost`: a cell's force is low under this share of `unit`
+LOW_FRAME = 0.025  # `antighost-frame`: a frame's, under this share of `total` (theirs: 0.05 of 2 N)
 OFF_TARGET = 8.0  # `off-target`: weight of the mean off-target force density, in units of `spread`
 FREE = 0.01  # `off-target`: tissue is contact-free where its true density is under this share of `unit`
 RAMP = (0.25, 0.75)
@@ -40,6 +43,7 @@ class Frames:
     mask: Tensor  # (B, 1, N, N) 0/1
     unit: float  # mN/mm²
     spread: float  # mN/mm²
+    total: float  # mN/mm², of a sum over cells
     progress: float = 1.0  # point 0..1 of the run
 
     def square_errors(self) -> Tensor:
@@ -65,10 +69,19 @@ def mse_frame(frames: Frames) -> Tensor:
 
 
 def antighost(frames: Frames) -> Tensor:
-    """Name and loss of Heraoui et al.: squared error, weighted more where a low force is over-predicted, and
-    three tenths of 1 − R² of the batch."""
-    true = _length(frames.target)
-    over_predicted = (true < LOW * frames.unit) & (_length(frames.prediction.detach()) > true)
+    """Squared error, weighted more where the low force of a cell is over-predicted, and three tenths of the
+    batch's 1 − R²."""
+    return _weigh_over_predicted(frames, _length(frames.target) < LOW * frames.unit)
+
+
+def antighost_frame(frames: Frames) -> Tensor:
+    """As `antighost`, for all cells of a frame whose total force is low: equation 4 of Heraoui et al."""
+    total = (_length(frames.target) * frames.mask).sum((1, 2, 3), keepdim=True)
+    return _weigh_over_predicted(frames, total < LOW_FRAME * frames.total)
+
+
+def _weigh_over_predicted(frames: Frames, low: Tensor) -> Tensor:
+    over_predicted = low & (_length(frames.prediction.detach()) > _length(frames.target))
     weighed = frames.square_errors() * (1 + (FALSE_POSITIVE - 1) * over_predicted)
     error = frames.mean(weighed, frames.prediction.shape[1])
     return 0.7 * error + 0.3 * measure_unexplained(
@@ -97,6 +110,7 @@ LOSSES = {
     "mse": Loss(mse),
     "mse-frame": Loss(mse_frame),
     "antighost": Loss(antighost),
+    "antighost-frame": Loss(antighost_frame),
     "off-target": Loss(off_target, RAMP[1]),
 }
 """All losses by their names in the settings of a training."""
@@ -114,6 +128,7 @@ def loss(
     name: str,
     unit: float,
     spread: float,
+    total: float,
     progress: float = 1.0,
 ) -> Tensor:
     """The loss of a name over all masked cells of a batch; arguments as of `Frames`.
@@ -122,7 +137,7 @@ def loss(
     """
     if mask.sum() == 0:
         raise UserError("a batch has no tissue cell: check the tissue masks")
-    return LOSSES[name].of(Frames(prediction, target, mask, unit, spread, progress))
+    return LOSSES[name].of(Frames(prediction, target, mask, unit, spread, total, progress))
 
 
 def measure_unexplained(

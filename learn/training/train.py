@@ -205,7 +205,8 @@ def _epoch(
         with torch.set_grad_enabled(solve is None):
             predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
-        about = settings.loss, scales.target, scales.spread, progress
+        total = scales.force / settings.grid.pitch_mm**2
+        about = settings.loss, scales.target, scales.spread, total, progress
         error = loss(predicted, batch.target, batch.mask, *about)
         if i % CHECK_EVERY == 0:
             _finite(float(error.detach()), epoch)

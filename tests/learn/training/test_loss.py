@@ -26,19 +26,26 @@ SQUARED, R2 = 0.2925 / 3, 0.2925 / 0.635
         ("mse-frame", 0.5 * SQUARED, 0.5 * R2, 0.0),
         # Three times the weight in the first cell alone: low, over-predicted.
         ("antighost", 0.7 * (3 * 0.04 + 0.0025 + 0.25) / 3, 0.3 * R2, 0.0),
+        # The frame's force, 2.1, is low against 100 × 0.025: the first cell alone is over-predicted.
+        ("antighost-frame", 0.7 * (3 * 0.04 + 0.0025 + 0.25) / 3, 0.3 * R2, 0.0),
         # The first cell alone is free (under 0.04).
         ("off-target", 0.5 * SQUARED, 0.5 * R2, 8 * 0.4 / 3 / 2.0),
     ],
 )
 def test_terms_by_hand(kind: str, error: float, r2: float, off_target: float) -> None:
-    found = float(loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0))
+    found = float(loss(PREDICTED, TRUE, MASK, kind, unit=4.0, spread=2.0, total=100.0))
     assert found == pytest.approx(error + r2 + off_target, rel=1e-5)
-    assert torch.isfinite(loss(PREDICTED, 0 * TRUE, MASK, kind, 4.0, 2.0)), "a batch at rest"
+    assert torch.isfinite(loss(PREDICTED, 0 * TRUE, MASK, kind, 4.0, 2.0, 100.0)), "a batch at rest"
+
+
+def test_a_frame_of_much_force_is_not_weighted() -> None:
+    found = float(loss(PREDICTED, TRUE, MASK, "antighost-frame", unit=4.0, spread=2.0, total=80.0))
+    assert found == pytest.approx(0.7 * SQUARED + 0.3 * R2, rel=1e-5)
 
 
 def test_the_off_target_penalty_grows_from_a_quarter_to_three_quarters_of_the_run() -> None:
     off_target = [
-        float(loss(PREDICTED, TRUE, MASK, "off-target", 4.0, 2.0, at)) - 0.5 * (SQUARED + R2)
+        float(loss(PREDICTED, TRUE, MASK, "off-target", 4.0, 2.0, 100.0, at)) - 0.5 * (SQUARED + R2)
         for at in (0.2, 0.5, 0.75, 1.0)
     ]
     assert off_target == pytest.approx([0, off_target[3] / 2, off_target[3], off_target[3]], abs=1e-5)
@@ -77,5 +84,5 @@ def test_r2_by_frame_weighs_weak_and_strong_frames_equally() -> None:
 def test_the_length_of_a_zero_vector_has_a_gradient() -> None:
     predicted = torch.zeros(1, 3, 1, 2, requires_grad=True)
     true, ones = torch.zeros(1, 3, 1, 2), torch.ones(1, 1, 1, 2)
-    loss(predicted, true, ones, "off-target", 4.0, 1.0).backward()
+    loss(predicted, true, ones, "off-target", 4.0, 1.0, 100.0).backward()
     assert torch.isfinite(predicted.grad).all()
