@@ -85,7 +85,10 @@ class ModelCard:
         by = " and ".join(self.motion) or ("true" if exact else "")
         trained = f"was trained on {by} motion" if by else "does not state the motion that it was trained on"
         given = f", and this is by {recovered_by}" if recovered_by else ""
-        return [f"the network {trained}{given}: forces may be off, its intervals are not calibrated"]
+        return [
+            f"the network {trained}{given}: forces may be off, its intervals are not calibrated; "
+            "train it again on a dataset of this version, or give a pretrained network by --model"
+        ]
 
     @property
     def used(self) -> set[str]:

@@ -205,9 +205,17 @@ def _epoch(
         with torch.set_grad_enabled(solve is None):
             predicted = forward(net, batch, settings, scales)
         progress = (epoch + i / batches) / settings.epochs
-        total = scales.force / settings.grid.pitch_mm**2
-        about = settings.loss, scales.target, scales.spread, total, progress
-        error = loss(predicted, batch.target, batch.mask, *about)
+        largest = scales.force / settings.grid.pitch_mm**2
+        error = loss(
+            predicted,
+            batch.target,
+            batch.mask,
+            settings.loss,
+            scales.target,
+            scales.spread,
+            largest,
+            progress,
+        )
         if i % CHECK_EVERY == 0:
             _finite(float(error.detach()), epoch)
         if solve is None:
@@ -258,13 +266,16 @@ def select_score(net: torch.nn.Module, frames: FrameDataset, scales: Scales) -> 
     """R² and RMSE over all tissue cells and components, on the input kind's last source, and the gain that
     corrects the underestimate of force by noise and the penalty on off-target force."""
     net.eval()
-    sums, forces = np.zeros(7), np.zeros(7)
+    sums, forces = np.zeros(7), list[tuple[Floats, Floats]]()
     for c in range(len(frames.clips)):
+        true, predicted = list[Floats](), list[Floats]()
         for here in frames.sequential(c, frames.sources[-1]):
             inside = here.mask.bool().expand_as(here.target)
             pair = here.target, forward(net, here, frames.settings, scales)
-            sums = sums + moments(*(one[inside].cpu().numpy() for one in pair))
-            forces = forces + moments(*((one * inside).sum((2, 3)).cpu().numpy() for one in pair))
+            sums = sums + moments(*(maps[inside].cpu().numpy() for maps in pair))
+            for totals, maps in zip((true, predicted), pair, strict=True):
+                totals.append((maps * inside).sum((2, 3)).cpu().double().numpy())
+        forces.append((np.concatenate(true), np.concatenate(predicted)))
     result = agreement(sums)
     return {
         "select_r2": result["r2"] if math.isfinite(result["r2"]) else -math.inf,
@@ -273,12 +284,27 @@ def select_score(net: torch.nn.Module, frames: FrameDataset, scales: Scales) -> 
     }
 
 
-def _gain(forces: Floats, anatomies: int) -> float:
-    """Slope through the origin of true on predicted force, within `_GAINS`; 1 for too few anatomies."""
-    pp, tp = forces[4:6]
-    if anatomies < _GAIN_ANATOMIES or not tp > 0:
+def _gain(forces: Sequence[tuple[Floats, Floats]], anatomies: int) -> float:
+    """The factor on predicted forces with the least mean absolute error over each sequence's mean force,
+    within `_GAINS`; 1 for too few anatomies.
+
+    `forces`: true and predicted ones, each (T, C), of each sequence. A least-squares slope would be set by
+    the strongest sequence alone, as loads span decades.
+    """
+    ratios, weights = [], []
+    for true, predicted in forces:
+        size, mean = np.linalg.norm(predicted, axis=1), np.linalg.norm(true, axis=1).sum()
+        told = size > 0
+        if mean > 0 and told.any():
+            ratios.append(((true * predicted).sum(1)[told]) / size[told] ** 2)
+            weights.append(size[told] / mean)
+    if anatomies < _GAIN_ANATOMIES or not ratios:
         return 1.0
-    return min(max(float(tp / pp), _GAINS[0]), _GAINS[1])
+    ratio, weight = np.concatenate(ratios), np.concatenate(weights)
+    order = np.argsort(ratio)
+    reached = np.cumsum(weight[order])
+    median = float(ratio[order][np.searchsorted(reached, reached[-1] / 2)])
+    return min(max(median, _GAINS[0]), _GAINS[1])
 
 
 def _open(out: Path, card: ModelCard) -> dict[str, Any] | None:
