@@ -41,6 +41,9 @@ _PRODUCTS, _LIGHTS, _LUMINANCE = len(PRODUCTS), len(LIGHTS), LIGHTS.index("lumin
 _MULTIPLE = 8  # cells: the levels of the network need multiples of it on both sides
 _LEAST = 0.02  # added to squared gradients per pixel, so that steps of windows without contrast vanish
 _FARTHEST_PX = 2.0  # limit of a linearised step
+# Limit of the flow that the network is told. It was trained on motions of a few px: told of more, it doubts
+# what is right (docs/results/flow/large_motion).
+_TOLD_PX = np.float32(8)
 _LEAST_RESIDUAL = 1e-3  # mean square, in squared local deviations
 _OFFSET = np.float32(8)  # grey levels added before ratios are taken: the black of a sensor is not zero
 _TWELVE, _QUARTER = np.float32(12), np.float32(0.25)
@@ -124,7 +127,8 @@ def describe(
     light = 0.5 * np.log1p(lights[:, _LUMINANCE]) - 2
     steps = np.stack([_steps(products, side) for side in _WINDOWS], 1).reshape(-1, *m.shape)
     left = np.minimum(products[PRODUCTS.index("r r")] / (CELL * CELL * area), 4)
-    rows = [m, visible, usable, left, *steps, *change, *light, agreed, 0.25 * u, 0.25 * v]
+    told = _QUARTER * _TOLD_PX / np.maximum(np.hypot(u, v), _TOLD_PX)
+    rows = [m, visible, usable, left, *steps, *change, *light, agreed, told * u, told * v]
     return np.stack(rows).astype(np.float32)
 
 
