@@ -69,6 +69,8 @@ class Footage:
     may_pulsate: bool = True  # False: no heart or breath moves the tissue, none is searched
     # (H, W) where an instrument is expected in a frame, if instruments are detected; None: unknown.
     expected: Callable[[int, Size], Mask | None] | None = None
+    # Any size: tissue in the rest frame that looks like an instrument; None: `track_video` looks for it.
+    lookalikes: Mask | None = None
 
 
 class Decoder:

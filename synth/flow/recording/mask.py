@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from synth.arrays import Mask, Pixels
+from synth.flow.lookalike import Lookalikes
 from synth.flow.recording.frame_motion import FrameMotion, RestFrame, Size
 from synth.flow.recording.picture_faults import find_fault
 from synth.flow.segmentation import Segmentation, segment
@@ -25,10 +27,14 @@ class MaskFrame:
         kind: str,
         tool: Callable[[int, Size], Mask | None] | None,
         expected: Callable[[int, Size], Mask | None] | None = None,
+        lookalikes: Mask | None = None,
     ) -> None:
         """`kind`: one of `MASKS`; `tool`: the given instrument masks, see `Footage`; None: detected;
-        `expected`: where, see `Footage`."""
+        `expected`: where, see `Footage`; `lookalikes`: likewise."""
         self._rest, self._kind, self._tool, self._expected = rest, kind, tool, expected
+        self._lookalikes: Lookalikes | None = None
+        if lookalikes is not None and lookalikes.any():
+            self._lookalikes = Lookalikes(rest.rgb, _resized(lookalikes, rest.tissue.shape))
 
     def process(self, frame: FrameMotion) -> FrameMotion:
         """The frame with its masks; it is not trusted if its picture shows nothing that could be tracked."""
@@ -37,6 +43,8 @@ class MaskFrame:
         if self._kind != "none":
             found = segment(self._rest.rgb, frame.rgb)
             if self._tool is None:
+                if self._lookalikes is not None:
+                    found = self._lookalikes.remove(found, frame.rgb)
                 found = self._weigh(found, frame)
                 masked, tool = _plausible(found, self._rest.tissue), found.objects
             else:
@@ -63,6 +71,11 @@ class MaskFrame:
 def mask_right(rest: Pixels, rgb: Pixels, kind: str, tissue: Mask) -> Mask:
     """Mask (H, W) of what hides the tissue in a picture of the right camera, given its rest picture."""
     return np.zeros(tissue.shape, bool) if kind == "none" else _plausible(segment(rest, rgb), tissue)
+
+
+def _resized(mask: Mask, size: tuple[int, ...]) -> Mask:
+    wide = cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(wide > 0)
 
 
 def _plausible(found: Segmentation, tissue: Mask) -> Mask:

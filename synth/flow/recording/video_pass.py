@@ -86,7 +86,8 @@ class VideoPass:
         self.rest = rest = self.decoder.rest
         self.peak_bytes = 0  # memory of the flow process
         self._backend, self._flow, self._pace = settings.backend, flow or LocalFlow(), pace
-        self._mask = MaskFrame(rest, settings.masks, footage.tool, footage.expected)
+        given = footage.tool, footage.expected, footage.lookalikes
+        self._mask = MaskFrame(rest, settings.masks, *given)
         self._first = self._mask.process(replace(self.decoder.first, is_rest=True))
         self.summary.rest_masked = self._first.hidden if self._first.hidden.any() else None
         self._register = None if rest.fault else RegisterCamera(rest, self._first, path)

@@ -26,7 +26,8 @@ from numcodecs import BitRound, Blosc
 
 from synth.arrays import Array, Mask
 from synth.errors import UserError
-from synth.flow.recording.decode import Footage, RecordingFlowSettings
+from synth.flow.lookalike import LookalikeSearch
+from synth.flow.recording.decode import Decoder, Footage, RecordingFlowSettings
 from synth.flow.recording.detrend import Detrend
 from synth.flow.recording.find_pulse import PulseEstimate, PulseSearch
 from synth.flow.recording.find_tissue import TissueSearch, choose_frames
@@ -158,6 +159,8 @@ def track_video(
     arguments and errors as for `VideoPass`.
     """
     flow, watch = flow or LocalFlow(), watch or Stopwatch()
+    if footage.tool is None and footage.lookalikes is None and settings.masks != "none":
+        footage = _with_lookalikes(footage, settings, watch)
     if footage.tissue is None:
         footage = _with_tissue(footage, settings, watch)
     first = VideoPass(footage, settings, flow=flow, watch=watch, progress=progress)
@@ -178,6 +181,23 @@ def _keep(video: VideoPass, compare_cameras: bool) -> tuple[FrameFile, RightPict
         with video.watch.stage("store"):
             kept.add(frame)
     return kept, pair
+
+
+def _with_lookalikes(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:
+    """The footage with the tissue that looks like an instrument in its rest frame, by a few of its frames."""
+    bare, plain = replace(footage, depth=None), replace(settings, rate_hz=None)
+    decoder = Decoder(bare, plain, watch, lambda done: None)
+    search = LookalikeSearch(decoder.rest.rgb, decoder.rest.tissue)
+    if decoder.rest.fault or not search.regions:
+        return footage
+    with watch.stage("decode"):
+        few = replace(bare, only=choose_frames(bare))
+    decoder = Decoder(few, plain, watch, lambda done: None)
+    with watch.stage("mask"):
+        for number, picture in enumerate(decoder.frames()):
+            if number % 2 == 0:
+                search.add(decoder.process(picture).rgb)
+        return replace(footage, lookalikes=search.find())
 
 
 def _with_tissue(footage: Footage, settings: RecordingFlowSettings, watch: Stopwatch) -> Footage:

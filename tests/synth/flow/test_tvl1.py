@@ -196,21 +196,28 @@ def test_features_hold_the_remaining_step_and_mirroring_changes_vectors_only() -
     np.testing.assert_allclose(signs * mirrored[..., ::-1], features, atol=0.02)
 
 
-def test_a_sure_correction_is_ignored_where_pictures_agree_and_used_where_nothing_is_visible(
+def test_a_sure_correction_is_ignored_where_pictures_agree_and_smooth_where_nothing_is_visible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    wrong = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
-    monkeypatch.setattr(correction, "predict", lambda weights, features: wrong)
+    missing = np.repeat(np.float32([0.5, 0.5, -5, -5]), 32 * 24).reshape(4, 32, 24)
+    monkeypatch.setattr(correction, "predict", lambda weights, features: missing)
     features, still = _described(mirrored=False, x=0, y=0), np.zeros((104, 88, 2), np.float32)
+    variance = np.exp(-5)
     flow, deviation = correction.correct(features, still)
     assert np.abs(flow).max() < 0.02
-    hidden = features.copy()
-    hidden[correction.FEATURES.index("visible in both")] = 0
-    flow, hidden_deviation = correction.correct(hidden, still)
-    variance = np.exp(-5)
-    np.testing.assert_allclose(flow, 0.5 * 0.25 / (0.25 + variance), rtol=1e-4)
-    np.testing.assert_allclose(hidden_deviation, np.sqrt(variance), rtol=0.02)
     np.testing.assert_allclose(deviation, np.sqrt(0.5**2 + variance), rtol=0.02)  # either may be wrong
+    known = [index for index, name in enumerate(correction.FEATURES) if name.endswith("known")]
+    blank = features.copy()
+    blank[known] = 0  # no contrast: the pictures say nothing
+    missing[:, 10:14, 9:13] = [[[9.0]], [[-9.0]], [[-5]], [[-5]]]
+    shown, _ = correction.correct(blank, still)
+    share = 0.25 / (0.25 + variance)
+    np.testing.assert_allclose(shown[:24, :24], 0.5 * share**2, rtol=1e-3)
+    assert np.abs(shown[48:50, 44:46]).min() > 5
+    blank[correction.FEATURES.index("visible in both"), 8:16, 7:15] = 0
+    hidden, hidden_deviation = correction.correct(blank, still)
+    np.testing.assert_allclose(hidden[20:80, 20:70], 0.5 * share**2, rtol=1e-3)
+    assert hidden_deviation[48, 44] > 5  # what the network says there is withheld
 
 
 def test_correction_lowers_the_error_on_pictures_that_are_not_rendered() -> None:
