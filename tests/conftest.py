@@ -1,5 +1,6 @@
 """For every test: one thread a process; what is named below is slow; modules with slow tests come first."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import pytest
 # Numerical libraries read it when they are loaded, and so do the processes that tests start.
 os.environ["OMP_NUM_THREADS"] = "1"
 pytest_plugins = ["clip_fixtures"]
+
+# Modules stay: nothing is gained by searching them for garbage, while they are imported or later.
+gc.disable()
 
 HOME = Path(__file__).parent
 SLOW = (
@@ -39,3 +43,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # A module is one process's: if a long one were the last, the other process would wait for it.
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()

@@ -280,8 +280,8 @@ def weigh_tissues(
             known[tissue] = evidence(tissue) + logs[tissue]
         return known[tissue]
 
-    for covered in (False, True):
-        if group := [each for each in candidates if (each.membrane > 0) is covered]:
+    for part in (False, True):
+        if group := [each for each in candidates if (each.membrane > 0) is part]:
             find_largest(group, posterior_log)
     tissues = list(known)
     score = [known[tissue] for tissue in tissues]
@@ -295,9 +295,8 @@ def weigh_tissues(
         score.append(score[best] + evidence(tissues[-1], posterior.load_basis_alone) - first)
     weight = np.maximum(softmax(score), TISSUES.unlikely)
     # The interval is to hold the most likely tissue with and without a membrane, and each Poisson's ratio.
-    parts = [
-        [k for k in range(len(known)) if (tissues[k].membrane > 0) is covered] for covered in (False, True)
-    ]
+    covered = [tissue.membrane > 0 for tissue in known]
+    parts = [[k for k in range(len(known)) if covered[k] is part] for part in (False, True)]
     used = {max(part, key=lambda k: score[k]) for part in parts if part} | {*range(len(known), len(tissues))}
     order = sorted(used, key=lambda k: -weight[k])
     weight = weight[order] / weight[order].sum()
